@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 
 HOST = "127.0.0.1"
 
@@ -124,7 +124,7 @@ def read_ping_address(file: Path) -> str:
 
     Raise `HearthlogError` if the file cannot be read or has no valid URL.
     """
-    data = read_whole(file, "file of a ping address", _LONGEST, HearthlogError)
+    data = read_limited(file, "file of a ping address", _LONGEST, HearthlogError)
     url = data.decode("utf-8-sig", "replace").strip()
     if not is_ping_address(url):
         raise HearthlogError(

@@ -48,7 +48,7 @@ def support_bundle(folder: Path) -> Iterator[tuple[str, bytes]]:
         If the folder does not exist.
     """
     yield "machine.json", _json(_machine())
-    states = [state for state in examine_live(folder) if _may_be_told(state.subject)]
+    states = [state for state in examine_live(folder) if _is_shareable(state.subject)]
     yield "live.json", _json([state._asdict() for state in states])
     logs: list[Path] = []
     with suppress(LogError):
@@ -136,7 +136,7 @@ def _health(columns: Columns, node: str) -> Iterator[dict[str, Any]]:
                 "time": time,
                 "subject": subject,
                 "level": state[0],
-                "text": state[1] if _may_be_told(subject) else "",
+                "text": state[1] if _is_shareable(subject) else "",
                 "values": _values(status),
             }
 
@@ -145,7 +145,7 @@ def _values(status: Mapping[str, Any]) -> dict[str, str]:
     return {pair["key"]: pair["value"] for pair in status["values"] if pair["key"] in _VALUES}
 
 
-def _may_be_told(subject: str) -> bool:
+def _is_shareable(subject: str) -> bool:
     return subject.rpartition(" ")[2] not in _OF_SOUND
 
 

@@ -166,7 +166,7 @@ def _check_session(
     models = open_models(settings, list(sources), None, stack)
     session = RecordingSession(settings, sources, models)
     if not likely_network(settings.embedding):  # a network that loads will provide the embeddings
-        session.say_lacking_embeddings()
+        session.report_missing_embeddings()
 
 
 @dataclass
@@ -279,7 +279,7 @@ def _record(  # noqa: PLR0913, PLR0917
         )
         _report_starters(models, embedder, why)
         session = RecordingSession(settings, sources, models, lock, state, embedder)
-        session.say_lacking_embeddings()
+        session.report_missing_embeddings()
         manager = ServiceManager(sources)
         try:
             if joins_blocks:

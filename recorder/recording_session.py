@@ -282,7 +282,7 @@ class RecordingSession:
         self._now = 0  # time of the last event
         self.summary = RecordingSummary(self._log.finished)
 
-    def say_lacking_embeddings(self) -> None:
+    def report_missing_embeddings(self) -> None:
         """Print which models do not get the embeddings that they need."""
         for name, stream in self._streams.items():
             for labelling, (model, classifier) in stream.models.in_use.items():

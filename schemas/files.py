@@ -115,7 +115,7 @@ _IS_UTF_16 = "no UTF-8: it is UTF-16"
 _DEEPEST = 100  # parts of a dotted key: the parser's time grows with the cube of their number
 
 
-def read_whole(path: Path, what: str, limit: int, error: type[HearthlogError]) -> bytes:
+def read_limited(path: Path, what: str, limit: int, error: type[HearthlogError]) -> bytes:
     """Read a regular local file, or a file of a store.
 
     Parameters
@@ -156,7 +156,7 @@ def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, A
         Of the type `error`, if the file does not exist, is larger than 1 MB, cannot be read, is
         nested too deeply, or is not TOML in UTF-8.
     """
-    data = read_whole(path, what, _TOML_LIMIT, error)
+    data = read_limited(path, what, _TOML_LIMIT, error)
     content: dict[str, Any] = {}
     try:
         text = data.decode("utf-8-sig")  # editors of Windows write a byte order mark

@@ -87,11 +87,11 @@ def test_what_was_not_told_to_all_is_there_after_the_next_start(tmp_path):
     outbox = Outbox(tmp_path / "box", ["a", "b"], pytest.fail)
     outbox.put([ring(1), ring(2, due=9), ring(1)])
     assert outbox.waiting_for("a", 8) == [ring(1)]
-    outbox.note_told("a", ring(1))
+    outbox.record_delivery("a", ring(1))
     again = Outbox(tmp_path / "box", ["a", "b"], pytest.fail)
     assert again.waiting_for("a", 10) == [ring(2, due=9)]
     assert again.waiting_for("b", 10) == [ring(1), ring(2, due=9)]
-    again.note_told("b", ring(1))
+    again.record_delivery("b", ring(1))
     assert [path.name for path in (tmp_path / "box").iterdir()] == [f"{ring(2).id}.json"]
     # Told meanwhile; evaluated once more, for the bridge had no time to remember.
     again.put([ring(1)])
@@ -331,7 +331,7 @@ def test_what_waits_for_a_wrong_line_alone_is_dropped_after_a_day(tmp_path):
     outbox = Outbox(tmp_path, ["a", UNREAD], pytest.fail)
     outbox.put([old, recent])
     for each in (old, recent):
-        outbox.note_told("a", each)
+        outbox.record_delivery("a", each)
     outbox.put([])
     outbox.set_targets(["b"], now)
     assert outbox.waiting_for("b", now) == [recent]
@@ -436,7 +436,7 @@ def test_the_password_of_an_address_is_in_no_line_and_no_file(tmp_path):
     delivery = Delivery(outbox, targets, "home", UTC, said.append)
     wait_for(lambda: said)
     delivery.close()
-    outbox.note_told(targets[0].name, ring(1))
+    outbox.record_delivery(targets[0].name, ring(1))
     (kept,) = (tmp_path / "box").iterdir()
     assert "hush" not in kept.read_text() + "".join(said)
 

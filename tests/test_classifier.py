@@ -13,7 +13,7 @@ from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
 from hearthlog.analyzer.training.calibration import softmax
-from hearthlog.analyzer.training.learned_inputs import in_whole_steps, rounded
+from hearthlog.analyzer.training.learned_inputs import rounded, rounded_to_steps
 from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier
@@ -61,7 +61,7 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
         class_weight="balanced",
         decision_function_shape="ovo",
     )
-    fitted = make_pipeline(in_whole_steps(StandardScaler(), PAPER.steps), machine).fit(
+    fitted = make_pipeline(rounded_to_steps(StandardScaler(), PAPER.steps), machine).fit(
         rounded(statistics(data)).astype(np.float64), data.target
     )
     learned = LearnedSvm(fitted, unseen(classes)[:0], PAPER.steps)

@@ -33,9 +33,9 @@ from hearthlog.analyzer.gate.paired_labels import (
 )
 from hearthlog.analyzer.gate.promotion_check import Verdict, clearly_better, damages, find_champion
 from hearthlog.analyzer.gate.recent_time import (
-    KnownSound,
     LogSpan,
     RecentLog,
+    ReferenceSound,
     choose,
     minutes_a_day,
     recent_logs,
@@ -644,7 +644,8 @@ def test_right_is_said_of_sounds_and_a_model_is_wrong_about_a_class_that_it_lack
     names = ["silence", "speech", "dog"]
     known = [("silence", 0), ("speech", 10), ("cat", 20), ("dog", 30)]
     sounds = [
-        KnownSound(i * 50_000_000, (i + 10) * 50_000_000, name, True, "mic") for name, i in known
+        ReferenceSound(i * 50_000_000, (i + 10) * 50_000_000, name, True, "mic")
+        for name, i in known
     ]
     outcomes = list(_outcomes(sounds, frames, names))
     assert _right(one for one in outcomes if one.label != "silence") == (3, 1, 2, 1, 0)

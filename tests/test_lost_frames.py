@@ -29,7 +29,7 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import LOG_DAMAGED, encode_gap, nanoseconds
 from hearthlog.schemas.messages.topics import Topic, topics_of
-from hearthlog.schemas.salvage.recover import NothingWholeError, recover_in_place, recover_log
+from hearthlog.schemas.salvage.recover import NothingIntactError, recover_in_place, recover_log
 
 START = 1_772_348_400 * NANOSECONDS  # a full hour
 NAME = "home_20260301T070000Z.mcap"
@@ -417,7 +417,7 @@ def test_whatever_was_damaged_the_doctor_finds_no_error_in_what_was_recovered(lo
     for _ in range(5):
         try:
             path = recover(damage(log.read_bytes(), rng))
-        except NothingWholeError:
+        except NothingIntactError:
             continue
         if not len(features(path)[0]):
             continue

@@ -32,7 +32,7 @@ from threadpoolctl import threadpool_limits
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.adaptation import adapt_model, base_classes, is_moved
 from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.learned_inputs import balanced, in_whole_steps, rounded
+from hearthlog.analyzer.training.learned_inputs import balanced, rounded, rounded_to_steps
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.train import method_named, train_model
 from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
@@ -122,7 +122,7 @@ def of_scikit_learn(name, inputs, target, rows):
         return of_both(boosted.fit(single, target, weight).decision_function(many))
     scaler = StandardScaler()
     if name in {"neighbours", "one-class"}:
-        scaler = in_whole_steps(scaler, method.steps)
+        scaler = rounded_to_steps(scaler, method.steps)
     scaled, rows = scaler.fit_transform(inputs), scaler.transform(rows)
     if name == "neighbours":
         nearest = KNeighborsClassifier(method.neighbours, algorithm="brute").fit(scaled, target)
@@ -148,7 +148,7 @@ def of_landmarks(method, scaler, inputs, target, rows):
     """Logarithms of the probabilities of scikit-learn, given the landmarks."""
     classes = len(set(target))
     landmarks = trained(LANDMARKS, classes).arrays["landmarks"].astype(np.float64)
-    scaler = in_whole_steps(scaler, method.steps)
+    scaler = rounded_to_steps(scaler, method.steps)
     scaled, landmarks, rows = (
         scaler.fit_transform(inputs),
         *map(scaler.transform, (landmarks, rows)),
@@ -165,7 +165,7 @@ def of_landmarks(method, scaler, inputs, target, rows):
 
 def of_support_vectors(method, inputs, target, rows):
     """Decisions of scikit-learn's pairs of classes, each class by its weakest."""
-    scaler = in_whole_steps(StandardScaler(), method.steps)
+    scaler = rounded_to_steps(StandardScaler(), method.steps)
     scaled, rows = scaler.fit_transform(inputs), scaler.transform(rows)
     machine = SVC(C=method.cost, gamma=method.gamma / 195, decision_function_shape="ovo")
     pairs = machine.fit(scaled, target, balanced(target, np.ones(len(target))))

@@ -21,8 +21,8 @@ from hearthlog.analyzer.review import review_list as asked
 from hearthlog.analyzer.review.candidates import (
     MINUTE,
     RecordedMinutes,
+    complete_minutes,
     draw_minutes,
-    whole_minutes,
 )
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.ranking import cover, sample, worth
@@ -99,7 +99,7 @@ def labelled(*spans):
 
 
 def test_a_minute_is_one_of_the_clock_that_is_labelled_from_start_to_end():
-    found = whole_minutes(
+    found = complete_minutes(
         labelled(
             (30, 200, "silence"),
             (200, 240, "speech"),

@@ -395,10 +395,10 @@ def test_the_last_whole_day_is_that_which_the_logs_reach_to_the_end_of(tmp_path)
     last = tmp_path / "2026/03/02/home_20260302T230000Z.mcap"
     start = midnight(DAY) + 47 * HOUR * NANOSECONDS
     one_segment(last, "/mic/segment", start, 1800, "speech")
-    assert find_home_logs([tmp_path]).last_whole_day(UTC) == DAY
+    assert find_home_logs([tmp_path]).last_complete_day(UTC) == DAY
     last.unlink()
     one_segment(last, "/mic/segment", start, 3570, "speech")
-    assert find_home_logs([tmp_path]).last_whole_day(UTC) == DAY + timedelta(days=1)
+    assert find_home_logs([tmp_path]).last_complete_day(UTC) == DAY + timedelta(days=1)
 
 
 # The page

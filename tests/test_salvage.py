@@ -32,7 +32,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.files import LocalFile
 from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.topics import Topic
-from hearthlog.schemas.salvage.recover import NothingWholeError, recover_log
+from hearthlog.schemas.salvage.recover import NothingIntactError, recover_log
 
 
 @pytest.fixture
@@ -151,7 +151,7 @@ def recover(tmp_path):
         source.write_bytes(data)
         try:
             recovery = recover_log(source, copy, "copy.mcap")
-        except NothingWholeError:
+        except NothingIntactError:
             return None
         reader = LogReader(copy)
         messages = [(m.topic, m.log_time, m.data) for m in reader.messages()]
@@ -733,7 +733,7 @@ def test_a_file_of_beginnings_is_not_read_again_and_again(tmp_path, monkeypatch)
         return data
 
     monkeypatch.setattr(LocalFile, "read", count)
-    with pytest.raises(NothingWholeError):
+    with pytest.raises(NothingIntactError):
         recover_log(source, tmp_path / "copy.mcap", "copy.mcap")
     assert passed < 100 * source.stat().st_size
 

@@ -26,7 +26,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.options import starter_of
-from hearthlog.tools.cli.record import _tell_of_network
+from hearthlog.tools.cli.record import _report_network
 
 _START = 1_772_348_400 * NANOSECONDS
 _HOUR = 3600 * NANOSECONDS
@@ -207,16 +207,16 @@ def test_the_doctor_names_the_network_that_a_model_wants(yamnet):
 
 
 def test_on_a_terminal_it_is_said_once_what_a_network_would_gain(tmp_path, capsys, monkeypatch):
-    _tell_of_network(Settings(model=Path("general")))
+    _report_network(Settings(model=Path("general")))
     assert "hearthlog models fetch yamnet (4 MB, once)\n" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "ai_edge_litert", None)
-    _tell_of_network(Settings(model=Path("general")))
+    _report_network(Settings(model=Path("general")))
     assert "it wants LiteRT, too; try: " in capsys.readouterr().err
-    _tell_of_network(Settings(model=NO_MODEL))
-    _tell_of_network(Settings(model=Path("home.safetensors")))
-    _tell_of_network(Settings(embedding="none"))
+    _report_network(Settings(model=NO_MODEL))
+    _report_network(Settings(model=Path("home.safetensors")))
+    _report_network(Settings(embedding="none"))
     path = tmp_path / "data" / "hearthlog" / "networks" / "yamnet.tflite"
     path.parent.mkdir(parents=True)
     path.touch()
-    _tell_of_network(Settings())
+    _report_network(Settings())
     assert capsys.readouterr().err == ""

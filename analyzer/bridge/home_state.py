@@ -46,7 +46,7 @@ class Health(NamedTuple):
     text: str
 
 
-class EnoughHeard(NamedTuple):
+class ListeningThreshold(NamedTuple):
     """Whether coverage is sufficient for a count of 0: today, and in the last night."""
 
     day: bool
@@ -149,7 +149,9 @@ class LiveMicrophone:
         spans = zip(starts, durations, strict=True)
         self.gaps += [(start, start + length) for start, length in spans if length > 0]
 
-    def counts(self, label: str, today: Today, known: EnoughHeard) -> tuple[int | None, int | None]:
+    def counts(
+        self, label: str, today: Today, known: ListeningThreshold
+    ) -> tuple[int | None, int | None]:
         """Count the events of a class that began since midnight, and those of the last night.
 
         Returns
@@ -161,12 +163,14 @@ class LiveMicrophone:
         night = sum(event.start < today.morning for event in self.events(label, today.night))
         return day if day or known.day else None, night if night or known.night else None
 
-    def known_of(self, today: Today) -> EnoughHeard:
+    def known_of(self, today: Today) -> ListeningThreshold:
         """Return whether coverage of the day and the night is sufficient for a count of 0."""
-        night = self._share_heard(today.night, min(today.morning, today.now))
-        return EnoughHeard(self._share_heard(today.midnight, today.now) > 0, night >= MOST)
+        night = self._listened_share(today.night, min(today.morning, today.now))
+        return ListeningThreshold(
+            self._listened_share(today.midnight, today.now) > 0, night >= MOST
+        )
 
-    def _share_heard(self, start: int, end: int) -> float:
+    def _listened_share(self, start: int, end: int) -> float:
         """Return the share of a time span, up to now, in which the microphone listened."""
         spans = [(start, self.since or end), *self.gaps]
         if not self.is_listening():

@@ -14,7 +14,7 @@ from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import replaced_file
 
@@ -146,7 +146,7 @@ def kept_until(path: Path, default: int) -> int:
 def _read(path: Path) -> _Kept | None:
     if not path.exists():
         return None
-    data = read_whole(path, "file of totals", _LIMIT, BridgeError)
+    data = read_limited(path, "file of totals", _LIMIT, BridgeError)
     try:
         return _Kept.model_validate_json(data)
     except ValidationError as error:

@@ -6,7 +6,7 @@ import secrets
 from pathlib import Path
 
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.new_files import create_file, private_folder, replaced_file
 
 
@@ -99,7 +99,7 @@ def read_token(file: Path) -> str:
     Raise `BridgeError` if the file cannot be used.
     """
     file = secret_path(file)
-    data = read_whole(file, "file of a token", 1 << 12, BridgeError)
+    data = read_limited(file, "file of a token", 1 << 12, BridgeError)
     token = data.decode("utf-8", errors="replace").strip()
     if not _FORM.fullmatch(token):
         raise BridgeError(

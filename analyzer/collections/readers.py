@@ -12,7 +12,7 @@ from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.recorder.sources.audio_files import files_below
 from hearthlog.recorder.sources.open_audio import is_audio
 from hearthlog.schemas.errors import listed
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 
 
 class CategorySpan(NamedTuple):
@@ -93,7 +93,7 @@ def read_json(path: Path) -> dict[str, object]:
     JSON.
     """
     try:
-        content = json.loads(read_whole(path, "file of the collection", _JSON_LIMIT, DataError))
+        content = json.loads(read_limited(path, "file of the collection", _JSON_LIMIT, DataError))
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: is not JSON ({str(error)[:100]})") from error
     if not isinstance(content, dict):

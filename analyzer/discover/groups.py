@@ -19,7 +19,7 @@ from hearthlog.analyzer.logs.spans import ranges
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.classifiers.model import MOST_VALUES
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64, read_sealed, write_sealed
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 from hearthlog.schemas.new_files import open_lock, replaced_file
@@ -438,7 +438,7 @@ def load_groups(path: Path) -> Groups | None:
     """
     if not path.exists():
         return None
-    data = read_whole(path, "file of groups", _LARGEST, DataError)
+    data = read_limited(path, "file of groups", _LARGEST, DataError)
     size = int.from_bytes(data[:8], "little")
     if size > _LARGEST_HEADER:
         raise DataError(f"{path}: is no file of groups (its header is too large)")

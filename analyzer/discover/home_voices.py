@@ -31,7 +31,7 @@ from hearthlog.analyzer.training.speakers import APART, is_voice
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Float32, Float64, Int64, read_sealed, write_sealed
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, time_text
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.new_files import replaced_file
@@ -89,7 +89,7 @@ def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoice
         np.empty(0, np.int64), VoiceEvidence(np.empty(0), np.empty((0, len(spread))))
     )
     while True:
-        of = _known_again(speech.voices, voices.evidence, spread)
+        of = _recognised(speech.voices, voices.evidence, spread)
         added = _with_new(voices, speech.voices.rows(of == NO_VOICE), spread)
         if len(added.numbers) == len(voices.numbers):
             break
@@ -102,7 +102,7 @@ def seconds_of(counts: Float64) -> Float64:
     return counts * (HOP_FRAMES * FRAME_SECONDS)
 
 
-def _known_again(evidence: VoiceEvidence, known: VoiceEvidence, spread: Float64) -> Int64:
+def _recognised(evidence: VoiceEvidence, known: VoiceEvidence, spread: Float64) -> Int64:
     """Return the likeliest existing voice of each row, if one voice is likelier than two."""
     best = np.zeros(len(evidence.counts))
     of = np.full(len(best), NO_VOICE)
@@ -188,7 +188,7 @@ def load_voices(path: Path) -> HomeVoices | None:
     """
     if not path.exists():
         return None
-    data = read_whole(path, "file of voices", _LARGEST, DataError)
+    data = read_limited(path, "file of voices", _LARGEST, DataError)
     size = int.from_bytes(data[:8], "little")
     if size > _LARGEST_HEADER:
         raise DataError(f"{path}: is no file of voices (its header is too large)")

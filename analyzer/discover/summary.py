@@ -16,7 +16,7 @@ from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import printable, shortened
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import NANOSECONDS, read_time, time_text
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.new_files import replaced_file
@@ -125,7 +125,7 @@ def load_summary(path: Path) -> GroupsSummary:
     """
     if not path.exists():
         raise DataError(f"{path}: no such summary of groups; `hearthlog discover` writes it")
-    data = read_whole(path, "summary of groups", _LARGEST, DataError)
+    data = read_limited(path, "summary of groups", _LARGEST, DataError)
     try:
         return GroupsSummary.model_validate_json(data)
     except ValidationError as error:

@@ -387,7 +387,7 @@ def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:
         missing = frames.first[0] - last[0] - 1 - frames.lost_before
         missing -= earlier.frames[microphone].lost_behind
         if missing and not _goes_on(frames, [each.frames[microphone] for each in files]):
-            _say_missing(microphone, earlier, file, missing)
+            _report_missing(microphone, earlier, file, missing)
 
 
 def _goes_on(frames: FrameSequence, others: Sequence[FrameSequence]) -> bool:
@@ -399,7 +399,9 @@ def _goes_on(frames: FrameSequence, others: Sequence[FrameSequence]) -> bool:
     return any(last[0] + 1 == number and abs(last[1] - time) < NANOSECONDS for last in ends)
 
 
-def _say_missing(microphone: str, previous: ExaminedFile, file: ExaminedFile, missing: int) -> None:
+def _report_missing(
+    microphone: str, previous: ExaminedFile, file: ExaminedFile, missing: int
+) -> None:
     frames, last = file.frames[microphone], previous.frames[microphone].last
     assert frames.first is not None
     assert last is not None

@@ -38,7 +38,7 @@ from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import Auxiliary
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.names import insist_taught
+from hearthlog.models.classifiers.names import require_trained
 from hearthlog.models.embedding.projection import (
     HOP_FRAMES,
     NO_EMBEDDINGS,
@@ -88,7 +88,7 @@ def evaluate_model(
     DataError
         If the classes of the model are not those of the scenario, or no clip has a segment.
     """
-    insist_taught(model)
+    require_trained(model)
     scenario = fitted(scenario, model)
     classifier = Classifier(model)
     features, embedder = classifier.feature_set, model_embedder(model)
@@ -354,7 +354,7 @@ def compare_models(
         feature sets, or there is no segment.
     """
     for model in (a, b):
-        insist_taught(model)
+        require_trained(model)
     check_features(a, b)
     check_classes(a, scenario)
     check_classes(b, scenario)

@@ -36,7 +36,7 @@ from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.mcap.records import HEAD, LIMIT, UINT32
 from hearthlog.schemas.messages.message_types import PACKAGE
 from hearthlog.schemas.new_files import new_file
-from hearthlog.schemas.salvage.whole_records import (
+from hearthlog.schemas.salvage.intact_records import (
     AttachmentHead,
     attachment_head,
     encode_attachment,

@@ -19,15 +19,15 @@ from hearthlog.analyzer.gate.paired_labels import (
     changes_of_labellings,
     changes_of_sample,
     joined_frames,
-    known_sounds,
     label_parts,
     learned_by,
+    reference_sounds,
     unlearned_sample,
 )
 from hearthlog.analyzer.gate.recent_time import (
-    KnownSound,
     LogSpan,
     RecentLog,
+    ReferenceSound,
     WeightedPart,
     left_alone,
     recorded_minutes,
@@ -135,7 +135,7 @@ def gather_evidence(
         If the feature set of the models, or a kind of classifier, is not installed.
     """
     losses: list[str] = []
-    known = known_sounds(logs, losses)
+    known = reference_sounds(logs, losses)
     learned = learned_by(before, after, known)
     chosen = unlearned_sample(logs, learned)
     unlearned = [[s for s in own if s.random or not _is_in(learned, s)] for _, own in known]
@@ -178,7 +178,7 @@ def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> P
     Raise `ModelError` as `gather_evidence`.
     """
     losses: list[str] = []
-    known = known_sounds(logs, losses)
+    known = reference_sounds(logs, losses)
     places = _places([(log, [sound for sound in own if sound.random]) for log, own in known])
     models = TwoModels(before, after)
     parts = [WeightedPart(part, 1.0) for part, _ in places]
@@ -201,15 +201,15 @@ def _taught(models: TwoModels, after: Model) -> frozenset[str]:
     return frozenset((of_home - elsewhere) & set(models.classes[models.before :]))
 
 
-def _is_in(spans: Spans, sound: KnownSound) -> bool:
+def _is_in(spans: Spans, sound: ReferenceSound) -> bool:
     return bool(rows_at(spans, np.array([(sound.start + sound.end) // 2]))[0] >= 0)
 
 
 def _places(
     known: KnownSounds, most: float = _REFERENCE_SECONDS
-) -> list[tuple[LogSpan, list[KnownSound]]]:
+) -> list[tuple[LogSpan, list[ReferenceSound]]]:
     """Merge nearby sounds, to label them at once; the latest ones."""
-    places: list[tuple[LogSpan, list[KnownSound]]] = []
+    places: list[tuple[LogSpan, list[ReferenceSound]]] = []
     by_microphone = (
         (log.path, name, [sound for sound in sounds if sound.microphone == name])
         for log, sounds in known
@@ -237,7 +237,7 @@ class _Outcome(NamedTuple):
 
 
 def _outcomes(
-    sounds: Sequence[KnownSound], frames: PairedFrames, classes: Sequence[str]
+    sounds: Sequence[ReferenceSound], frames: PairedFrames, classes: Sequence[str]
 ) -> Iterator[_Outcome]:
     """Yield the outcomes of two models for labelled known sounds; named as in `classes`.
 
@@ -321,7 +321,7 @@ def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> 
         names = f"{last.get('candidate', '')} with {last.get('model', '')}"
         raise DataError(f"nothing to compare {names} by yet: {error}") from error
     difference = compare_labellings(live, candidate)
-    known: list[KnownSound] = []
+    known: list[ReferenceSound] = []
     for place, log in enumerate(logs, 1):
         try:
             sounds = reference(log, logs[place:])
@@ -367,7 +367,7 @@ def _records(folders: Sequence[Path], losses: list[str]) -> Iterable[tuple[Path,
 
 
 def _right_on_trial(
-    sounds: Sequence[KnownSound], before: Labelling, after: Labelling
+    sounds: Sequence[ReferenceSound], before: Labelling, after: Labelling
 ) -> PairedAccuracy:
     """Count the sounds that a model labels correctly for most of the time that it labelled."""
     first, second = (_agrees(sounds, labels) for labels in (before, after))
@@ -382,7 +382,7 @@ def _right_on_trial(
     )
 
 
-def _agrees(sounds: Sequence[KnownSound], labels: Labelling) -> Bool:
+def _agrees(sounds: Sequence[ReferenceSound], labels: Labelling) -> Bool:
     agrees = np.zeros(len(sounds), bool)
     names = np.array([class_name(sound.label) for sound in sounds], object)
     for name in set(names):
@@ -392,12 +392,12 @@ def _agrees(sounds: Sequence[KnownSound], labels: Labelling) -> Bool:
     return agrees
 
 
-def _labelled(sounds: Sequence[KnownSound], labels: Labelling) -> Bool:
+def _labelled(sounds: Sequence[ReferenceSound], labels: Labelling) -> Bool:
     names = [class_name(sound.label) != UNKNOWN for sound in sounds]
     return _mostly(sounds, labels.starts, labels.ends) & np.array(names, bool)
 
 
-def _mostly(sounds: Sequence[KnownSound], starts: Int64, ends: Int64) -> Bool:
+def _mostly(sounds: Sequence[ReferenceSound], starts: Int64, ends: Int64) -> Bool:
     """Return whether spans cover more than half of each sound."""
     spans = joined(starts, ends)
     covered = [

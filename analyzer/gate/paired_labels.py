@@ -9,9 +9,9 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events, LabellingDifference
 from hearthlog.analyzer.gate.recent_time import (
-    KnownSound,
     LogSpan,
     RecentLog,
+    ReferenceSound,
     WeightedPart,
     choose,
     learned_time,
@@ -248,10 +248,10 @@ def time_words(minutes: float) -> str:
     return f"{hours} h {rest:02} min" if hours else f"{rest} min"
 
 
-KnownSounds = list[tuple[RecentLog, list[KnownSound]]]
+KnownSounds = list[tuple[RecentLog, list[ReferenceSound]]]
 
 
-def known_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSounds:
+def reference_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSounds:
     """Read the sounds of known label of each log."""
     known, paths = [], [log.path for log in logs]
     for place, log in enumerate(logs, 1):
@@ -350,7 +350,7 @@ def find_changed_time(
         If the feature set of the models, or a kind of classifier, is not installed.
     """
     losses: list[str] = []
-    learned = learned_by(before, after, known_sounds(logs, losses))
+    learned = learned_by(before, after, reference_sounds(logs, losses))
     models = TwoModels(before, after)
     parts = [
         one._replace(part=one.part._replace(microphone=microphone))

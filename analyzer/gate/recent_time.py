@@ -182,7 +182,7 @@ _REMAINS = 2 * NANOSECONDS  # a shorter rest next to a mark belongs to the marke
 _FOLLOWING = 3  # logs: a segment is in the one in which it ends
 
 
-class KnownSound(NamedTuple):
+class ReferenceSound(NamedTuple):
     """A sound of known label.
 
     Attributes
@@ -198,12 +198,12 @@ class KnownSound(NamedTuple):
     microphone: str
 
 
-def reference(log: Path, following: Sequence[Path] = ()) -> list[KnownSound]:
+def reference(log: Path, following: Sequence[Path] = ()) -> list[ReferenceSound]:
     """Return the sounds of known label of a log.
 
     Returns
     -------
-    list of KnownSound
+    list of ReferenceSound
         Of half a second or more, sorted by start; sounds of random time first.
 
     Raises
@@ -215,7 +215,7 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[KnownSound]:
     labellings = find_labellings(log, *following[:_FOLLOWING]) if drawn else Labellings([])
     inside = [sound for span in drawn for sound in _true(labellings, span, marks)]
     others = [
-        KnownSound(mark.start, mark.end, mark.label, random=False, microphone=mark.microphone)
+        ReferenceSound(mark.start, mark.end, mark.label, random=False, microphone=mark.microphone)
         for mark in marks
         if class_name(mark.label) != UNKNOWN  # the reviewer could not decide
         and not any(_inside(mark, span) for span in drawn)
@@ -223,15 +223,15 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[KnownSound]:
     return [sound for sound in [*inside, *others] if sound.end - sound.start >= _SHORTEST_SOUND]
 
 
-def left_alone(log: Path) -> list[KnownSound]:
+def left_alone(log: Path) -> list[ReferenceSound]:
     """Return the sounds of a log with confirmed labels: reviewed, not at random, and unmarked.
 
     Returns
     -------
-    list of KnownSound
+    list of ReferenceSound
         Of half a second or more, two seconds next to a mark; unreadable labels are skipped.
     """
-    sounds: list[KnownSound] = []
+    sounds: list[ReferenceSound] = []
     with suppress(DataError, LogError):
         marks = read_marks(log)
         spans = [span for span in read_reviewed(log) if span.chosen != RANDOM]
@@ -249,19 +249,19 @@ def left_alone(log: Path) -> list[KnownSound]:
     return sounds
 
 
-def _least(sound: KnownSound, edges: AbstractSet[int]) -> int:
+def _least(sound: ReferenceSound, edges: AbstractSet[int]) -> int:
     """Return the minimum length of a sound."""
     return _SHORTEST_SOUND if edges.isdisjoint((sound.start, sound.end)) else _REMAINS
 
 
 def _true(
     labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]
-) -> Iterator[KnownSound]:
+) -> Iterator[ReferenceSound]:
     """Yield the true labels of a reviewed span: the labelling, overlaid with the marks.
 
     Touching spans with one label are one sound, independent of the marks.
     """
-    parts: dict[str, list[KnownSound]] = {}
+    parts: dict[str, list[ReferenceSound]] = {}
     for part in _parts(labellings, span, marks):
         parts.setdefault(class_name(part.label), []).append(part)
     for same in parts.values():
@@ -272,8 +272,8 @@ def _true(
 
 def _parts(
     labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]
-) -> Iterator[KnownSound]:
-    known = partial(KnownSound, random=True, microphone=span.microphone)
+) -> Iterator[ReferenceSound]:
+    known = partial(ReferenceSound, random=True, microphone=span.microphone)
     own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
     for mark in own:
         if class_name(mark.label) != UNKNOWN:

@@ -183,7 +183,7 @@ def _parts(batch: pa.RecordBatch) -> list[pa.Array]:
     return [*parts, batch.column("microphones").flatten()]
 
 
-class KnownFiles:
+class IndexedFiles:
     """Index of catalogued files by name, with size and modification time."""
 
     def __init__(self, table: pa.Table) -> None:
@@ -352,7 +352,7 @@ class Catalog:
         self.folder = folder
         self.table = table
         self.unusable = unusable
-        self.files = KnownFiles(table)
+        self.files = IndexedFiles(table)
         self._plain = without_times(table)
 
     def __len__(self) -> int:

@@ -123,7 +123,7 @@ class HomeLogs:
             days.add(local_time(end - 1, zone).date())
         return sorted(days)
 
-    def last_whole_day(self, zone: tzinfo) -> date:
+    def last_complete_day(self, zone: tzinfo) -> date:
         """Return the last complete day, or the last day if none is complete.
 
         A day counts as complete if at most its last minute is missing.

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 
 # A spreadsheet evaluates such a text as a formula, unless it is a number. An apostrophe before
 # the text prevents that; existing apostrophes get one more, so that reading restores the text.
@@ -42,7 +42,7 @@ def read_text(path: Path, what: str, size_limit: int) -> str:
     DataError
         If the file is missing, unreadable, too large, or in another encoding.
     """
-    raw = read_whole(path, what, size_limit, DataError)
+    raw = read_limited(path, what, size_limit, DataError)
     wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
         return raw.decode("utf-16" if wide else "utf-8-sig")

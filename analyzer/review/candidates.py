@@ -184,7 +184,7 @@ class RecordedMinutes(NamedTuple):
     has_sound: Bool
 
 
-def whole_minutes(labelling: Labelling) -> RecordedMinutes:
+def complete_minutes(labelling: Labelling) -> RecordedMinutes:
     """Find the complete minutes of a labelling, and which have a sound."""
     if not len(labelling):
         return RecordedMinutes(np.empty(0, np.int64), np.empty(0, bool))

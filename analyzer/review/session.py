@@ -21,10 +21,10 @@ from hearthlog.analyzer.review.candidates import (
     MINUTE,
     ReviewedTime,
     changed_by,
+    complete_minutes,
     draw_minutes,
     hinted_spans,
     reviewed_time,
-    whole_minutes,
 )
 from hearthlog.analyzer.review.lanes import labelling_in_words
 from hearthlog.analyzer.review.marking import Marking
@@ -470,7 +470,7 @@ def _drawn(queue: str, side: NamedLabelling, done: ReviewedTime, wanted: int) ->
     """Draw minutes at random: all items of a random queue, some of a useful one."""
     if queue not in {USEFUL, RANDOM}:
         return NONE
-    there = whole_minutes(side.labelling)
+    there = complete_minutes(side.labelling)
     few = min(wanted // _MINUTE_EVERY, len(there.starts) // _MINUTES_LEFT)
     drawn = draw_minutes(there, wanted if queue == RANDOM else few, done.random, done.spans)
     return Spans(drawn, drawn + MINUTE)

@@ -501,7 +501,7 @@ def rarity(own: Float64, compared: Compared) -> float:
     length = len(own)
     others = sliding_window_view(compared.others, length, axis=0)
     score, scores = routine_scores(
-        _mean_of_known(own), _mean_of_known(np.moveaxis(others, -1, 0)), compared.figures
+        _mean_of_finite(own), _mean_of_finite(np.moveaxis(others, -1, 0)), compared.figures
     )
     edge = float(np.quantile(scores, 1 - _TAIL))
     if score <= edge:
@@ -513,7 +513,7 @@ def rarity(own: Float64, compared: Compared) -> float:
     return float(np.exp(min((score - edge) / scale, 50.0)) / _TAIL)
 
 
-def _mean_of_known(rows: Float64) -> Float64:
+def _mean_of_finite(rows: Float64) -> Float64:
     """Return the mean over rows without missing values; NaN without any value."""
     known = np.isfinite(rows)
     sums = np.where(known, rows, 0.0).sum(axis=0)

@@ -55,7 +55,7 @@ from hearthlog.models.classifiers.model import (
     Model,
     NamesHead,
 )
-from hearthlog.models.classifiers.names import insist_taught
+from hearthlog.models.classifiers.names import require_trained
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int32
 from hearthlog.schemas.errors import ignore_progress
@@ -331,7 +331,7 @@ _FOLDS = 3  # for fitting the temperature
 
 def base_classes(model: Model) -> tuple[str, ...]:
     """Return the classes of a model without those learned only from a home."""
-    insist_taught(model)
+    require_trained(model)
     kept = kept_inputs(model)
     if kept is None or not len(kept[1]):
         return model.classes
@@ -365,7 +365,7 @@ def adapt_model(base: Model, home: Dataset) -> Model:
     ModelError
         If the feature set or the kind of classifier of the base is not installed.
     """
-    insist_taught(base)
+    require_trained(base)
     if not len(home):
         raise DataError("the home has no segments of a class of the model")
     moved = base if is_moved(base) else learned_over(base)
@@ -500,7 +500,7 @@ def _of_classes(description: Description, classes: Sequence[str]) -> Description
     labelled = {name: tuple(description.scenario.get(name, [name])) for name in description.classes}
     before = Scenario(description.scenario_name, labelled)
     kept = before.with_classes(name for name in classes if name not in new)
-    labels = kept.with_taught(new).classes
+    labels = kept.with_trained(new).classes
     update = {
         "classes": list(classes),
         "scenario": {name: list(labels[name]) for name in classes},

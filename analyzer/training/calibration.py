@@ -101,13 +101,13 @@ def collection_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> l
         for number in np.unique(fold)
     ]
     several = all(len(np.unique(data.target[seen])) > 1 for seen, _ in folds)
-    tried = np.unique(data.target[taught_elsewhere(data, folds)])
+    tried = np.unique(data.target[trained_elsewhere(data, folds)])
     others = [n for n, name in enumerate(data.classes) if name != UNKNOWN and n not in taught]
     enough = 2 * len(np.setdiff1d(tried, list(taught))) >= len(others)
     return folds if len(folds) >= _FEWEST_COLLECTIONS and several and enough else []
 
 
-def taught_elsewhere(data: Dataset, folds: Sequence[Fold]) -> Bool:
+def trained_elsewhere(data: Dataset, folds: Sequence[Fold]) -> Bool:
     """Return which segments have a known class with five sources in the other folds.
 
     Returns
@@ -137,7 +137,7 @@ def calibrate_elsewhere(
     decisions : np.ndarray [shape=(n, C)], float64
         Of classifiers trained without the fold of the segment.
     """
-    taught = taught_elsewhere(data, folds)
+    taught = trained_elsewhere(data, folds)
     probabilities = nested_probabilities(decisions, data.target, folds, taught)
     elsewhere = scores_elsewhere(probabilities, data, taught)
     return inverse_temperature(decisions[taught], data.target[taught]), elsewhere
@@ -151,7 +151,7 @@ def scores_elsewhere(probabilities: Float64, data: Dataset, taught: Bool) -> Els
     probabilities : np.ndarray [shape=(n, C)], float64
         Of classifiers trained without the collection of the segment.
     taught : np.ndarray [shape=(n,)], bool
-        Result of `taught_elsewhere`.
+        Result of `trained_elsewhere`.
     """
     predicted, scored = probabilities.argmax(axis=1), taught.copy()
     if UNKNOWN in data.classes:

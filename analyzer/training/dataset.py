@@ -549,7 +549,7 @@ def segment_digests(windows: Float32) -> Int64:
     np.ndarray [shape=(m,)], int64
         Sorted and unique.
     """
-    return np.unique(_digests(windows)[_told_apart(windows)])
+    return np.unique(_digests(windows)[_distinguishable(windows)])
 
 
 def learned_digests(model: Model) -> Int64:
@@ -573,7 +573,7 @@ def learned_groups(model: Model, data: Dataset) -> Indices:
         Numbers of the groups.
     """
     learned = np.isin(_digests(data.windows), learned_digests(model))
-    return np.unique(data.group[learned & _told_apart(data.windows)])
+    return np.unique(data.group[learned & _distinguishable(data.windows)])
 
 
 def _digests(windows: Float32) -> Int64:
@@ -585,7 +585,7 @@ def _digests(windows: Float32) -> Int64:
     return np.frombuffer(whole, "<i8").astype(np.int64)
 
 
-def _told_apart(windows: Float32) -> Bool:
+def _distinguishable(windows: Float32) -> Bool:
     """Return which segments have changing features."""
     changing: Bool = (windows != windows[:, :1]).any(axis=(1, 2))
     return changing

@@ -218,7 +218,7 @@ def _with_new_classes(
         else:
             unlearned |= set(every[name])
         notes.append(f"{count} {'mark' if count == 1 else 'marks'} of {name}: {what}")
-    return known.with_taught(learned), notes + _lumped(marked, known), unlearned
+    return known.with_trained(learned), notes + _lumped(marked, known), unlearned
 
 
 def _lumped(marked: Sequence[Recording], known: Scenario) -> list[str]:

@@ -82,7 +82,7 @@ def scaler_arrays(scaler: StandardScaler) -> dict[str, NDArray[Any]]:
     return {"scaler_mean": scaler.mean_, "scaler_scale": scaler.scale_}
 
 
-def in_whole_steps(scaler: StandardScaler, steps: int | None) -> Pipeline:
+def rounded_to_steps(scaler: StandardScaler, steps: int | None) -> Pipeline:
     """Return a scaler with the rounding of the trained SVM.
 
     Parameters

@@ -273,7 +273,7 @@ class Scenario:
             classes[sound.UNKNOWN] += tuple(label for labels in others for label in labels)
         return Scenario(self.name, classes, self.ignored)
 
-    def with_taught(self, learned: Mapping[str, tuple[str, ...]]) -> "Scenario":
+    def with_trained(self, learned: Mapping[str, tuple[str, ...]]) -> "Scenario":
         """Return this scenario with the new classes of a home, which are then no longer unknown."""
         classes = {**self.classes, **learned}
         if sound.UNKNOWN in self.classes:

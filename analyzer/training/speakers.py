@@ -46,7 +46,7 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
             read_reviewed_sound(folder, features, scenario) for scenario in ("", SPEAKERS)
         )
         for sound in of_both:
-            taught = sound if sound.enrolled else _saying_who(teaching(sound))
+            taught = sound if sound.enrolled else _with_speaker(teaching(sound))
             for one in marked_recordings([taught], folder, features, 0.0):
                 # `unknown` means undecided in a review, but nobody enrolled in an enrolment.
                 label = OTHER if class_name(one.label) == UNKNOWN else one.label
@@ -58,7 +58,7 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
     yield from _by_time(cut)
 
 
-def _saying_who(sound: HomeSound) -> HomeSound:
+def _with_speaker(sound: HomeSound) -> HomeSound:
     """Drop `speech` labels that name no speaker."""
     marks = sound.marks
     if sound.labelling == LIVE:

@@ -14,8 +14,8 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.learned_inputs import (
     balanced,
     fitted_scaler,
-    in_whole_steps,
     rounded,
+    rounded_to_steps,
     scaler_arrays,
     spread_over_classes,
 )
@@ -70,7 +70,7 @@ class SvmMethod(Method):
             kept = spread_over_classes(target, weight, self.most_windows, self.seed)
             inputs, target, weight = inputs[kept], target[kept], weight[kept]
         inputs = rounded(inputs)
-        scaler = in_whole_steps(fitted_scaler(inputs), self.steps)
+        scaler = rounded_to_steps(fitted_scaler(inputs), self.steps)
         machine = SVC(
             C=self.cost, gamma=self.gamma / inputs.shape[1], decision_function_shape="ovo"
         ).fit(

@@ -20,7 +20,7 @@ from hearthlog.analyzer.training.calibration import (
     inverse_temperature,
     scores_elsewhere,
     softmax,
-    taught_elsewhere,
+    trained_elsewhere,
     unknown_bias,
 )
 from hearthlog.analyzer.training.clips import ClipEmbedder, network_embedder
@@ -250,7 +250,7 @@ def train_model(  # noqa: PLR0913, PLR0917
         measured, sure = mixture.of_sources, 1.0
         if mixture.of_collections is not None:
             probabilities = softmax(mixture.of_collections)
-            tried = taught_elsewhere(data, collections)
+            tried = trained_elsewhere(data, collections)
             elsewhere = scores_elsewhere(probabilities, data, tried)
     learned = method.fit(examples)
     progress(1.0)
@@ -350,7 +350,7 @@ def _mixture(
     of_sources, of_collections = Tried(folds, inverse * decisions, known), None
     folds, left_out = collections
     if left_out is not None:
-        of_collections = Tried(folds, inverse * left_out, taught_elsewhere(data, folds))
+        of_collections = Tried(folds, inverse * left_out, trained_elsewhere(data, folds))
     return learn_mixture(data, head_inputs_of(method.network), of_sources, of_collections)
 
 

@@ -195,7 +195,7 @@ def is_by_names(model: Model) -> bool:
     return model.description.kind == BY_NAMES
 
 
-def insist_taught(model: Model) -> None:
+def require_trained(model: Model) -> None:
     """Refuse a model that labels by names where a trained model is required.
 
     Raises

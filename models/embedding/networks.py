@@ -25,7 +25,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import HearthlogWarning, printable
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
@@ -298,7 +298,7 @@ def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str
                 f"{path}: is not the network {network.name}, or not all of it: it has {size:,} "
                 f"bytes, not {known}; {remedy}"
             )
-    data = read_whole(path, "network", max(sizes), ModelError)
+    data = read_limited(path, "network", max(sizes), ModelError)
     sha256 = hashlib.sha256(data).hexdigest()
     if sha256 not in {each.sha256 for each in network.files}:
         raise ModelError(

@@ -23,7 +23,7 @@ from hearthlog.schemas.arrays import (
     read_sealed,
     write_sealed,
 )
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +197,7 @@ def read_projection(path: Path) -> Projection:
 
     Raise `ModelError` if the file is missing or damaged.
     """
-    data = read_whole(path, "projection of a network", _SIZE_LIMIT, ModelError)
+    data = read_limited(path, "projection of a network", _SIZE_LIMIT, ModelError)
     try:
         arrays, text, damage = read_sealed(path, data, _KEY)
         groups = json.loads(text)

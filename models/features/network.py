@@ -22,7 +22,7 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.errors import HearthlogWarning, printable
-from hearthlog.schemas.files import read_toml, read_whole
+from hearthlog.schemas.files import read_limited, read_toml
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 INPUTS = "embedding"
@@ -164,7 +164,7 @@ def read_network(path: Path) -> bytes:
 
     Raise `ModelError` if the file is missing, larger, or cannot be read.
     """
-    return read_whole(path, "network", _SIZE_LIMIT, ModelError)
+    return read_limited(path, "network", _SIZE_LIMIT, ModelError)
 
 
 def _numbered(width: int) -> tuple[str, ...]:

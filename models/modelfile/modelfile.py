@@ -41,7 +41,7 @@ from hearthlog.models.starter import (
 )
 from hearthlog.schemas.arrays import damage, read_sealed, write_sealed
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.writer import Attachment
 from hearthlog.schemas.new_files import check_new, new_file
@@ -178,7 +178,7 @@ def _read(path: Path) -> tuple[Path, bytes]:
             f"{path}: there is no such model file; the starter models are "
             f"{' and '.join(BY_FEATURES)}"
         )
-    return path, read_whole(path, "model file", _SIZE_LIMIT, ModelError)
+    return path, read_limited(path, "model file", _SIZE_LIMIT, ModelError)
 
 
 def _halved(array: Array) -> Array:

@@ -193,7 +193,7 @@ class LiveLog:
             if self._failing:
                 self._failing = False
                 self._notices.append(Notice(OK, f"{self._root} can be written again"))
-                self._log.complete_what_was_cut()
+                self._log.complete_truncated()
         self._let_go()
         if was_failing and not self._failing:
             give_back()

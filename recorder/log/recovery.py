@@ -23,7 +23,7 @@ from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.new_files import sync_file, sync_folder
 from hearthlog.schemas.salvage.recover import (
-    NothingWholeError,
+    NothingIntactError,
     Recovery,
     check_copy,
     lock_abandoned,
@@ -155,7 +155,7 @@ def _recover_clips(active: Path, path: Path) -> list[Recovered]:
         recovery = _complete(active, path)
         active.unlink(missing_ok=True)
         sync_folder(path.parent)
-    except NothingWholeError:
+    except NothingIntactError:
         active.unlink()
         return []
     damages = [damage for damage in recovery.damages if not damage.cut]
@@ -166,7 +166,7 @@ def _recover_clips(active: Path, path: Path) -> list[Recovered]:
 def _recover(active: Path, path: Path) -> list[Recovered]:
     try:
         recovery = _complete(active, path)
-    except NothingWholeError:
+    except NothingIntactError:
         recovery = Recovery({}, [], complete=False)
     damages = [damage for damage in recovery.damages if not damage.cut]
     if damages or not recovery.messages:

@@ -228,7 +228,7 @@ class RollingLog:
         disk error: the written part remains and is completed at the next start. Also, unless live,
         if the name of a new file is taken.
         """
-        with self._keeping_what_was_written():
+        with self._preserving_written():
             for part in self._parts(messages):
                 if not self._last - self._late <= part[0].log_time < self._until:
                     self._roll(part[0].log_time)
@@ -282,7 +282,7 @@ class RollingLog:
         LogError
             On a disk error; the written part remains and is completed at the next start.
         """
-        with self._keeping_what_was_written():
+        with self._preserving_written():
             if self._writer is not None:
                 self._append(messages)
                 self._given += len(messages)
@@ -334,7 +334,7 @@ class RollingLog:
         self._description = description
         self._until = 0
 
-    def complete_what_was_cut(self) -> None:
+    def complete_truncated(self) -> None:
         """Start the completion of files with disk errors, including clips; return immediately."""
         if self._finisher is None:
             return
@@ -356,7 +356,7 @@ class RollingLog:
         self._flush_at = None
 
     @contextmanager
-    def _keeping_what_was_written(self) -> Iterator[None]:
+    def _preserving_written(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:

@@ -265,7 +265,7 @@ class _Choice:
         is_usual_there = sounding.sum() > 1 or (self._usual == [best] and sounding[best])
         covers = covers and usable[self._usual].all() and usual * _COVERS > total[best]
         if self._heard != self._usual and covers and is_usual_there:
-            self._hear(self._usual, "")
+            self._on_samples(self._usual, "")
             return
         power = self._mixed(pieces, self._heard).var(axis=1).mean()
         # The steady noise of an unplugged socket is louder than a quiet room.
@@ -293,23 +293,25 @@ class _Choice:
         others = [i for i in self._heard if self._usable[i] and i != best]
         is_back = best not in self._heard and self._piece - self._left[best] < _REMEMBERED
         if is_back and others:
-            self._hear(sorted([*others, best]), "sound comes from one or the other")
+            self._on_samples(sorted([*others, best]), "sound comes from one or the other")
         elif self._is_mean():
-            self._hear([best], "the others hide it" if hides else "their mean is much fainter")
+            self._on_samples(
+                [best], "the others hide it" if hides else "their mean is much fainter"
+            )
         else:
             before = "the first one" if self._heard == [0] else _names(self._heard)
             verb = "is" if len(self._heard) == 1 else "are"
             why = "hides it" if hides else f"{verb} much fainter"
-            self._hear([best], f"{before} {why}")
+            self._on_samples([best], f"{before} {why}")
 
     def _leave_silent(self) -> None:
         """Drop selected channels that held no sound for a minute."""
         there = [i for i in self._heard if self._piece - self._sounded[i] < _REMEMBERED]
         if there and there != self._heard:
             silent = _names(i for i in self._heard if i not in there)
-            self._hear(there, f"no more sound comes from {silent}")
+            self._on_samples(there, f"no more sound comes from {silent}")
 
-    def _hear(self, channels: list[int], why: str) -> None:
+    def _on_samples(self, channels: list[int], why: str) -> None:
         if channels == self._heard:
             return
         if not self._is_mean():

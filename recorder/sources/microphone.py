@@ -159,7 +159,7 @@ class MicrophoneSource:
                     returned.kill()
                 return
             if returned is not None:
-                self._hear(self._own, returned)
+                self._on_samples(self._own, returned)
                 reason = f"{self.device} is there again"
                 continue
             self._lost_at = time.monotonic()
@@ -200,7 +200,7 @@ class MicrophoneSource:
                 return "the microphone went silent"
             if self._steps_clock():
                 self._framer.step_clock(self._wall_offset)
-            self._tell_channel()
+            self._report_channel()
             if blocks:  # stamped with the frames' time, as the current time would be ahead of them
                 yield from self._report(self._framer.last_stamp)
             if ending := self._reason_to_end():
@@ -230,7 +230,7 @@ class MicrophoneSource:
             self._watch(event, is_flat=is_flat)
             yield event
 
-    def _tell_channel(self) -> None:
+    def _report_channel(self) -> None:
         """Report a change of the selected channels once; the sound itself is fine."""
         if self._mixer is not None and self._mixer.news and self._health[0] != ERROR:
             self._health = (WARNING, self._mixer.news)
@@ -238,7 +238,7 @@ class MicrophoneSource:
 
     def _try_at_the_start(self, *, waits: bool) -> None:
         try:
-            self._hear(self._own, self._open(self._own, Flag()))
+            self._on_samples(self._own, self._open(self._own, Flag()))
         except SourceError as error:
             self._miss(error)
             if not waits or (self._unfit and not self._falls_back(Flag())):
@@ -263,7 +263,7 @@ class MicrophoneSource:
             device.could_not_be_opened()
             raise
 
-    def _hear(self, device: "_Device", capture: Capture) -> None:
+    def _on_samples(self, device: "_Device", capture: Capture) -> None:
         self._capture = capture
         device.is_heard(capture)
         self._device_heard = device
@@ -276,7 +276,7 @@ class MicrophoneSource:
         pauses = iter(_RETRY_SECONDS)
         while not stop.is_set() and not self._resting():
             try:
-                self._hear(self._own, self._open(self._own, stop))
+                self._on_samples(self._own, self._open(self._own, stop))
             except SourceError as error:
                 if stop.is_set():
                     return
@@ -309,7 +309,7 @@ class MicrophoneSource:
         if self._fallback is None or time.monotonic() - self._lost_at < _FALLBACK_SECONDS:
             return False
         try:
-            self._hear(self._fallback, self._open(self._fallback, stop))
+            self._on_samples(self._fallback, self._open(self._fallback, stop))
         except SourceError as error:
             self._health = (ERROR, f"{self._health[1]}; nor is its fallback heard: {error}")
             return False

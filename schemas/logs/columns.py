@@ -233,7 +233,7 @@ def decode_readable(
         message.
     """
     decoded = (_decode_readable(raw, fields) for raw in messages)
-    return _joined([_with_known_times(columns) for columns in decoded if columns is not None])
+    return _joined([_with_valid_times(columns) for columns in decoded if columns is not None])
 
 
 def unreadable(channel: Channel, schema: Schema | None) -> str:
@@ -344,7 +344,7 @@ def _decode(
     )
 
 
-def _with_known_times(columns: Columns) -> Columns:
+def _with_valid_times(columns: Columns) -> Columns:
     """Replace publish times beyond the int64 range by its maximum, with a warning."""
     late = columns.publish_times < 0  # 2**63 or more in the file
     if not late.any():

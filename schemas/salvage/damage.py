@@ -35,16 +35,16 @@ from hearthlog.schemas.mcap.records import (
     Definitions,
     read_footer,
 )
-from hearthlog.schemas.salvage.record_verifier import Claim, RecordVerifier
-from hearthlog.schemas.salvage.whole_records import (
+from hearthlog.schemas.salvage.intact_records import (
     SHORTEST,
+    IntactAttachment,
+    IntactChunk,
+    IntactRecord,
     LargeAttachment,
     LargeChunk,
     UnknownRecord,
-    WholeAttachment,
-    WholeChunk,
-    WholeRecord,
 )
+from hearthlog.schemas.salvage.record_verifier import Claim, RecordVerifier
 
 _BLOCK = 1 << 20
 _DATA_END = HEAD.pack(Opcode.DATA_END, UINT32.size)
@@ -184,12 +184,12 @@ def _name_of(
     record: records.MetadataIndex
     | records.AttachmentIndex
     | records.Metadata
-    | WholeAttachment
+    | IntactAttachment
     | LargeAttachment,
 ) -> str:
     if isinstance(record, records.MetadataIndex | records.Metadata):
         return f"the metadata {record.name!r}"
-    if isinstance(record, WholeAttachment | LargeAttachment):
+    if isinstance(record, IntactAttachment | LargeAttachment):
         record = record.index_record
     name = record.name
     return f"the attachment {name!r}"
@@ -230,15 +230,15 @@ class MetRecords:
         self._order = np.lexsort(keys.T)
         self._keys = np.ascontiguousarray(keys[self._order, ::-1])
 
-    def meet(self, whole: WholeRecord) -> None:
+    def meet(self, whole: IntactRecord) -> None:
         """Mark a record as found."""
         record = whole.record
-        if isinstance(record, records.Metadata | WholeAttachment | LargeAttachment):
+        if isinstance(record, records.Metadata | IntactAttachment | LargeAttachment):
             self._names[_name_of(record)] -= 1
-        elif isinstance(record, WholeChunk | LargeChunk):
+        elif isinstance(record, IntactChunk | LargeChunk):
             self._meet_chunk(whole, record.stored)
 
-    def _meet_chunk(self, whole: WholeRecord, chunk: StoredChunk) -> None:
+    def _meet_chunk(self, whole: IntactRecord, chunk: StoredChunk) -> None:
         chunks = self._index.chunks
         span, length = (chunk.start, chunk.end), whole.end - whole.offset
         row = int(np.searchsorted(chunks[:, 0], whole.offset - self._shift))
@@ -351,7 +351,7 @@ class DamageList:
         self._damages.append((damage, messages or {}))
 
     def add_unnamed(
-        self, channel: int, messages: int, times: tuple[int, int], whole: WholeRecord
+        self, channel: int, messages: int, times: tuple[int, int], whole: IntactRecord
     ) -> None:
         """Add messages of a channel without a definition so far.
 
@@ -359,7 +359,7 @@ class DamageList:
         ----------
         times : tuple of int
             First and last log time in nanoseconds.
-        whole : WholeRecord
+        whole : IntactRecord
             Record of the messages, behind those added before for the channel.
         """
         count, span, (start, _) = self.unnamed.get(channel, (0, times, (whole.offset, 0)))

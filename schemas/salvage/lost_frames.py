@@ -20,8 +20,8 @@ from hearthlog.schemas.messages.fields import lacking
 from hearthlog.schemas.messages.message_types import GAP, definition, type_hash
 from hearthlog.schemas.messages.topics import LIVE, Quality, parse_topic, topic
 from hearthlog.schemas.messages.type_definitions import message_type
+from hearthlog.schemas.salvage.intact_records import IntactChunk
 from hearthlog.schemas.salvage.salvage import Salvage
-from hearthlog.schemas.salvage.whole_records import WholeChunk
 
 _FEATURES, _LABEL, _GAP, _INFO = "features", "label", "gap", "info"
 _STAMP = "header.stamp"
@@ -45,7 +45,7 @@ class FramePosition(NamedTuple):
 
 
 def read_marks(
-    piece: WholeChunk | Message, definitions: Definitions
+    piece: IntactChunk | Message, definitions: Definitions
 ) -> dict[str, list[FramePosition]]:
     """Read the gaps of a piece, and its first and last frames.
 
@@ -81,7 +81,7 @@ def _defines(schema: Schema, fields: Sequence[str]) -> bool:
         return False
 
 
-def _places(piece: WholeChunk | Message) -> Iterator[tuple[int, Int64]]:
+def _places(piece: IntactChunk | Message) -> Iterator[tuple[int, Int64]]:
     """Yield each channel of a piece, with the offsets of its messages in the content."""
     if isinstance(piece, Message):
         yield piece.channel_id, np.zeros(1, np.int64)
@@ -90,7 +90,7 @@ def _places(piece: WholeChunk | Message) -> Iterator[tuple[int, Int64]]:
             yield number, np.frombuffer(entries, INDEX_ENTRIES)["offset"]
 
 
-def _content(piece: WholeChunk | Message) -> bytes:
+def _content(piece: IntactChunk | Message) -> bytes:
     if not isinstance(piece, Message):
         return piece.stored.content()
     length = MESSAGE_FIXED + len(piece.data)
@@ -140,7 +140,7 @@ class FrameSearch:
         self._salvage = salvage
         self._followers: dict[str, _FrameFollower] = {}
 
-    def before(self, piece: WholeChunk | Message) -> list[LostFrames]:
+    def before(self, piece: IntactChunk | Message) -> list[LostFrames]:
         """Return the frames missing before the first frames of a piece."""
         lost: list[LostFrames] = []
         for microphone, marks in read_marks(piece, self._salvage.definitions).items():

@@ -46,17 +46,17 @@ from hearthlog.schemas.mcap.records import (
     decompress,
     parse_escaped,
 )
-from hearthlog.schemas.salvage import whole_records
-from hearthlog.schemas.salvage.whole_records import (
+from hearthlog.schemas.salvage import intact_records
+from hearthlog.schemas.salvage.intact_records import (
     FIELDS,
     LARGEST,
     SHORTEST,
     UNKNOWN,
+    IntactAttachment,
+    IntactChunk,
+    IntactRecord,
     LargeAttachment,
     LargeChunk,
-    WholeAttachment,
-    WholeChunk,
-    WholeRecord,
 )
 
 _VARIABLE = [kind for kind, fields in FIELDS.items() if len(fields) > 1]  # with inner lengths
@@ -175,7 +175,7 @@ class RecordVerifier:
                 return offset == self.end
         return True
 
-    def whole(self, offset: int, chained: int = 1) -> WholeRecord:
+    def whole(self, offset: int, chained: int = 1) -> IntactRecord:
         """Read a complete record.
 
         Parameters
@@ -202,7 +202,7 @@ class RecordVerifier:
             return self._message(offset, chained)
         return self._framed(offset, opcode, strict=chained > 1)
 
-    def _framed(self, offset: int, opcode: int, *, strict: bool) -> WholeRecord:
+    def _framed(self, offset: int, opcode: int, *, strict: bool) -> IntactRecord:
         """Read a record that ends by its inner lengths; if `strict`, only with valid UTF-8."""
         outer, inner = self.ends(offset)
         end = outer if self._is_padded(inner, outer) else inner
@@ -212,7 +212,7 @@ class RecordVerifier:
                 raise McapError("a record claims to be longer than the file")
             large = self._large_attachment(offset, outer)
             escaped = (large.index_record.name,) * large.escaped
-            return WholeRecord(offset, outer, large, escaped=escaped)
+            return IntactRecord(offset, outer, large, escaped=escaped)
         if inner - offset > LARGEST[opcode]:
             raise McapError("a record claims to be too large")
         if inner > self.end:
@@ -220,22 +220,22 @@ class RecordVerifier:
         if wrong and not self.plausible(inner):
             raise McapError("a record has another length than it claims")
         if opcode == Opcode.MESSAGE_INDEX:  # the writer builds a new one
-            return WholeRecord(offset, end, None, wrong)
+            return IntactRecord(offset, end, None, wrong)
         raw = self.read(offset, inner - offset)
         if inner != outer:
             raw = HEAD.pack(opcode, inner - offset - HEAD.size) + raw[HEAD.size :]
-        record: McapRecord | WholeAttachment | None
+        record: McapRecord | IntactAttachment | None
         if opcode == Opcode.ATTACHMENT:
-            record, is_escaped = whole_records.read_attachment(raw)
+            record, is_escaped = intact_records.read_attachment(raw)
             name = record.index_record.name
         else:
             record, is_escaped = parse_escaped(opcode, raw[HEAD.size :])
-            name = whole_records.name_of(record)
+            name = intact_records.name_of(record)
         if is_escaped and strict:
             raise McapError("a text is not UTF-8")
-        return WholeRecord(offset, end, record, wrong, escaped=(name,) * is_escaped)
+        return IntactRecord(offset, end, record, wrong, escaped=(name,) * is_escaped)
 
-    def chunk(self, offset: int) -> WholeRecord:
+    def chunk(self, offset: int) -> IntactRecord:
         """Read a chunk with a verified content, whatever its head states.
 
         Raises
@@ -261,7 +261,7 @@ class RecordVerifier:
         if max(size, stored) > LIMIT:
             if not exact or outer > self.end:
                 raise McapError("the head of a chunk is damaged")
-            return WholeRecord(offset, outer, self._large_chunk(offset, outer))
+            return IntactRecord(offset, outer, self._large_chunk(offset, outer))
         compression = head[name : first - UINT64.size]
         claim = ChunkHead(start, end, size, 0, compression, slice(None))
         # One of two lengths may be wrong. Decompressors ignore trailing bytes,
@@ -276,24 +276,24 @@ class RecordVerifier:
                     raise
                 continue
             break
-        messages, others = whole_records.split_content(content)
+        messages, others = intact_records.split_content(content)
         self.inner += len(messages) + len(others)
         entries = index_messages(content, messages)
-        span = whole_records.span_of(entries)
+        span = intact_records.span_of(entries)
         agrees = not entries or span == (start, end)
         wrong = "" if exact and agrees else "the head of a chunk"
-        definitions, escaped = whole_records.read_definitions(content, others)
+        definitions, escaped = intact_records.read_definitions(content, others)
         leading = int((others < messages[0]).sum()) if len(messages) else len(others)
         stored_chunk = StoredChunk(compression, data, size, checksum, *span, entries)
-        whole = WholeChunk(stored_chunk, definitions, leading)
+        whole = IntactChunk(stored_chunk, definitions, leading)
         if escaped:
-            whole, content = whole_records.with_definitions(whole, content, others)
-            messages, _ = whole_records.split_content(content)
+            whole, content = intact_records.with_definitions(whole, content, others)
+            messages, _ = intact_records.split_content(content)
         if span[1] > LAST_TIME:
-            whole = whole_records.without_late(whole, content, messages)
+            whole = intact_records.without_late(whole, content, messages)
         behind = outer if padded else offset + first + number
         proved = bool(crc) or agrees
-        return WholeRecord(offset, behind, whole, wrong, escaped=tuple(escaped), proved=proved)
+        return IntactRecord(offset, behind, whole, wrong, escaped=tuple(escaped), proved=proved)
 
     def _large_chunk(self, offset: int, end: int) -> LargeChunk:
         """Verify a chunk that is too large for the memory."""
@@ -319,13 +319,13 @@ class RecordVerifier:
             others = np.array([start for start, _ in part.others], np.int64)
             if not entries:
                 leading += int((others < starts[0]).sum()) if len(starts) else len(others)
-            definitions += whole_records.read_definitions(part.content, others)[0]
+            definitions += intact_records.read_definitions(part.content, others)[0]
             for channel, rows in index_messages(part.content, starts).items():
                 moved = np.frombuffer(rows, INDEX_ENTRIES).copy()
                 moved["offset"] += part.first
                 entries[channel] += moved.tobytes()
         head = stream.head
-        span = whole_records.span_of(entries)
+        span = intact_records.span_of(entries)
         stored = StoredChunk(head.compression, b"", head.size, stream.check(), *span, entries)
         first = offset + HEAD.size
         data = first + head.data.start, first + head.data.stop
@@ -362,7 +362,7 @@ class RecordVerifier:
 
     def _large_attachment(self, offset: int, end: int) -> LargeAttachment:
         """Check an attachment that is too large to read."""
-        head = whole_records.attachment_head(self.read(offset, _ATTACHMENT_HEAD))
+        head = intact_records.attachment_head(self.read(offset, _ATTACHMENT_HEAD))
         (crc,) = UINT32.unpack(self.read(end - UINT32.size, UINT32.size))
         if crc not in {0, self._crc(offset + HEAD.size, end - UINT32.size)}:
             raise McapError("an attachment has another checksum than it claims")
@@ -376,7 +376,7 @@ class RecordVerifier:
             crc = zlib.crc32(self.read(place, min(_PIECE, end - place)), crc)
         return crc
 
-    def _unknown(self, offset: int, opcode: int, length: int) -> WholeRecord:
+    def _unknown(self, offset: int, opcode: int, length: int) -> IntactRecord:
         """Read a record of a private kind, unless it is a damaged record of a defined kind."""
         with suppress(McapError):
             return self.chunk(offset)
@@ -385,7 +385,7 @@ class RecordVerifier:
         if not self.plausible(end) or (end, end) in [self.ends(offset, kind) for kind in flipped]:
             raise McapError("a record of unknown kind, or too short")
         head = self.read(offset, min(MESSAGE.size, end - offset))
-        return WholeRecord(offset, end, whole_records.UnknownRecord(head, (offset, end)))
+        return IntactRecord(offset, end, intact_records.UnknownRecord(head, (offset, end)))
 
     def _is_padded(self, inner: int, outer: int) -> bool:
         """Return whether a record has trailing fields of a later version of the format.
@@ -419,7 +419,7 @@ class RecordVerifier:
             raise McapError("a chunk has another checksum than it claims")
         return content, checksum
 
-    def _message(self, offset: int, chained: int) -> WholeRecord:
+    def _message(self, offset: int, chained: int) -> IntactRecord:
         opcode, length = self.head(offset)
         end = offset + HEAD.size + length
         if length > LIMIT and chained > 1:
@@ -437,9 +437,9 @@ class RecordVerifier:
                 break
             follower += HEAD.size + length
         if end - offset > LIMIT:
-            return WholeRecord(offset, end, self._large_message(offset, end))
+            return IntactRecord(offset, end, self._large_message(offset, end))
         raw = self.read(offset, end - offset)
-        return WholeRecord(offset, end, whole_records.read_message(raw))
+        return IntactRecord(offset, end, intact_records.read_message(raw))
 
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
         """Read a message index.

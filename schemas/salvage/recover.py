@@ -44,17 +44,17 @@ from hearthlog.schemas.new_files import (
     sync_folder,
 )
 from hearthlog.schemas.salvage.damage import Damage
-from hearthlog.schemas.salvage.lost_frames import FrameSearch, LostFrames, gap_channel
-from hearthlog.schemas.salvage.salvage import Piece, Salvage
-from hearthlog.schemas.salvage.whole_records import (
+from hearthlog.schemas.salvage.intact_records import (
+    IntactAttachment,
+    IntactChunk,
     LargeAttachment,
     LargeChunk,
     UnknownRecord,
-    WholeAttachment,
-    WholeChunk,
     chunk_messages,
     encode_attachment,
 )
+from hearthlog.schemas.salvage.lost_frames import FrameSearch, LostFrames, gap_channel
+from hearthlog.schemas.salvage.salvage import Piece, Salvage
 
 
 @dataclass
@@ -208,9 +208,9 @@ class SalvagedCopy:
     def _add(self, piece: Piece) -> None:
         self._begin()
         self.pieces += 1
-        if self._chunk_span and not isinstance(piece, WholeChunk):
+        if self._chunk_span and not isinstance(piece, IntactChunk):
             self._writer.flush()
-        if isinstance(piece, WholeChunk):
+        if isinstance(piece, IntactChunk):
             self._add_chunk(piece, self._search.before(piece))
         elif isinstance(piece, Message):
             for lost in self._search.before(piece):
@@ -220,7 +220,7 @@ class SalvagedCopy:
             self._add_large(piece)
         elif isinstance(piece, UnknownRecord):
             self._writer.copy_record(self._salvage.stored(*piece.data))
-        elif isinstance(piece, WholeAttachment | LargeAttachment):
+        elif isinstance(piece, IntactAttachment | LargeAttachment):
             self._writer.copy_attachment(self._record_of(piece), piece.index_record)
         elif piece.name == HEARTHLOG_METADATA and self._selection is not None:
             self._writer.add_metadata(piece.name, {**piece.metadata, **self._selection.note})
@@ -229,7 +229,7 @@ class SalvagedCopy:
         else:
             self._writer.add_metadata(piece.name, piece.metadata)
 
-    def _add_chunk(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
+    def _add_chunk(self, piece: IntactChunk, losses: Sequence[LostFrames]) -> None:
         """Copy a chunk, unchanged unless messages are dropped or gaps inserted."""
         chunk = piece.stored
         if any(lost.end > chunk.start for lost in losses):
@@ -251,8 +251,8 @@ class SalvagedCopy:
             times = chunk.times(number)
             self._count(number, len(times), int(times.min()), int(times.max()))
 
-    def _record_of(self, piece: WholeAttachment | LargeAttachment) -> Iterable[bytes | memoryview]:
-        if isinstance(piece, WholeAttachment):
+    def _record_of(self, piece: IntactAttachment | LargeAttachment) -> Iterable[bytes | memoryview]:
+        if isinstance(piece, IntactAttachment):
             return [piece.record]
         if piece.escaped:
             return encode_attachment(piece.index_record, self._salvage.stored(*piece.inner))
@@ -290,7 +290,7 @@ class SalvagedCopy:
         schema = definitions.schemas.get(definitions.channels[number].schema_id)
         return schema is not None and schema.name == EMBEDDING
 
-    def _add_messages(self, piece: WholeChunk, losses: Sequence[LostFrames]) -> None:
+    def _add_messages(self, piece: IntactChunk, losses: Sequence[LostFrames]) -> None:
         waiting = deque(losses)
         for message in chunk_messages(piece.stored):
             while waiting and waiting[0].end <= message.log_time:
@@ -368,7 +368,7 @@ def _untraced(topics: dict[str, TopicRecovery], damages: list[Damage]) -> list[D
     return [Damage(0, 0, "a count in the log has more", missing)] if missing else []
 
 
-class NothingWholeError(LogError):
+class NothingIntactError(LogError):
     """No part of a log is undamaged."""
 
 
@@ -391,7 +391,7 @@ def recover_log(
 
     Raises
     ------
-    NothingWholeError
+    NothingIntactError
         If the source is not an MCAP file, or no part of it is undamaged.
     LogError
         If the source cannot be read, or the copy differs from the written messages.
@@ -418,11 +418,11 @@ def recover_log(
             with source.open("rb") as stream:
                 what = not_mcap(stream.read(2 * len(MAGIC)))
             if what != not_mcap(b""):
-                raise NothingWholeError(f"{source}: {what}")
-            raise NothingWholeError(
+                raise NothingIntactError(f"{source}: {what}")
+            raise NothingIntactError(
                 f"{source}: is not an MCAP file, and holds no whole piece of one"
             )
-        raise NothingWholeError(f"{source}: holds nothing that could be saved")
+        raise NothingIntactError(f"{source}: holds nothing that could be saved")
     check_copy(copy, recovery.topics)
     return recovery
 
@@ -437,7 +437,7 @@ def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[P
 
     Raises
     ------
-    NothingWholeError
+    NothingIntactError
         If the log is not an MCAP file, or no part of it is undamaged.
     LogError
         If the log is being written, cannot be read, or a required file name is taken; or if the

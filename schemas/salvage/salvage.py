@@ -32,19 +32,19 @@ from hearthlog.schemas.salvage.damage import (
     loss_in,
     read_index,
 )
-from hearthlog.schemas.salvage.record_verifier import IndexClaims, RecordVerifier
-from hearthlog.schemas.salvage.whole_records import (
+from hearthlog.schemas.salvage.intact_records import (
     SHORTEST,
+    IntactAttachment,
+    IntactChunk,
+    IntactRecord,
     LargeAttachment,
     LargeChunk,
     UnknownRecord,
     Whole,
-    WholeAttachment,
-    WholeChunk,
-    WholeRecord,
     chunk_messages,
     find_record_heads,
 )
+from hearthlog.schemas.salvage.record_verifier import IndexClaims, RecordVerifier
 
 _VAIN = 8
 _KEPT_LIMIT = 128 << 20  # maximum bytes of definitions, names and indexes kept in memory
@@ -110,7 +110,7 @@ class Salvage:
         for record in definitions:
             self.definitions.add(record)
         self._claims = IndexClaims()
-        self._next: WholeRecord | None = None  # found by the last search
+        self._next: IntactRecord | None = None  # found by the last search
         self._places = _Places(-1, [], [])  # of the last searched window
         self._vain = self._kept = 0
         self._cost = 0  # bytes of the last futile read
@@ -172,7 +172,7 @@ class Salvage:
             yield from self._take(whole)
             del whole  # frees memory before the next record, which may be as large
 
-    def _compare_index(self, whole: WholeRecord) -> None:
+    def _compare_index(self, whole: IntactRecord) -> None:
         """Compare message indexes with the chunk before them, if there is no other index."""
         if self._index is not None:
             return
@@ -182,10 +182,10 @@ class Salvage:
                 self._claims.add_index(channel, entries)
             return
         self._claims.close(whole.offset)
-        if isinstance(whole.record, WholeChunk | LargeChunk):
+        if isinstance(whole.record, IntactChunk | LargeChunk):
             self._claims.add_chunk(whole.end, whole.record.stored)
 
-    def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> WholeRecord:
+    def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> IntactRecord:
         """Read the record at an offset; raise McapError if there is no complete one."""
         if self._next is not None and self._next.offset == offset:
             whole, self._next = self._next, None
@@ -206,15 +206,15 @@ class Salvage:
             raise
         return whole
 
-    def _count_kept(self, whole: WholeRecord) -> None:
+    def _count_kept(self, whole: IntactRecord) -> None:
         """Count the bytes to keep of a record; raise McapError if they are too many."""
         record, size = whole.record, _KEPT_EACH
-        if isinstance(record, WholeChunk | LargeChunk):
+        if isinstance(record, IntactChunk | LargeChunk):
             size += 16 * len(record.stored.entries)
             size += sum(_size(definition) for definition in record.definitions)
         elif isinstance(record, Definition):
             size += _size(record)
-        elif isinstance(record, WholeAttachment | LargeAttachment):
+        elif isinstance(record, IntactAttachment | LargeAttachment):
             size += len(record.index_record.name) + len(record.index_record.media_type)
         elif isinstance(record, records.Metadata):
             size += len(record.name)
@@ -224,7 +224,7 @@ class Salvage:
             raise McapError("the file holds more definitions than can be kept")
         self._kept += size
 
-    def _doubt(self, whole: WholeRecord, *, searching: bool) -> None:
+    def _doubt(self, whole: IntactRecord, *, searching: bool) -> None:
         """Raise McapError for a possibly misread or accidental record."""
         unproved = records.Message | Definition | UnknownRecord
         if self._astray and isinstance(whole.record, unproved):
@@ -240,7 +240,7 @@ class Salvage:
             return
         if isinstance(whole.record, records.Message) and whole.record.log_time > LAST_TIME:
             raise McapError("a log time is out of range")
-        if not isinstance(whole.record, WholeChunk) and not self._reader.plausible(whole.end):
+        if not isinstance(whole.record, IntactChunk) and not self._reader.plausible(whole.end):
             raise McapError("no record begins where this one ends")
 
     def _like_message(self, record: bytes) -> bool:
@@ -336,7 +336,7 @@ class Salvage:
         chunks |= {place for place in heads if data[place - start] == Opcode.CHUNK}
         return _Places(window, sorted(chunks), sorted(chunks | heads))
 
-    def _take(self, whole: WholeRecord) -> Iterator[Piece]:
+    def _take(self, whole: IntactRecord) -> Iterator[Piece]:
         """Register the contents of a record; yield it if it belongs into the new log."""
         record = whole.record
         if self._met is not None:
@@ -349,7 +349,7 @@ class Salvage:
         elif isinstance(record, Definition):
             if not self.definitions.add(record) and not self._ended and self._index is None:
                 self.definitions.doubt(record)
-        elif isinstance(record, WholeChunk):
+        elif isinstance(record, IntactChunk):
             self._ended, self._astray, self._has_chunks = False, False, True
             yield from self._take_chunk(record, whole)
         elif isinstance(record, LargeChunk):
@@ -359,12 +359,12 @@ class Salvage:
         elif isinstance(record, records.Message):
             self._ended = False
             yield from self._take_message(record, whole)
-        elif isinstance(record, records.Metadata | WholeAttachment | LargeAttachment) or (
+        elif isinstance(record, records.Metadata | IntactAttachment | LargeAttachment) or (
             isinstance(record, UnknownRecord) and not self._ended
         ):
             yield record
 
-    def _take_large(self, chunk: LargeChunk, whole: WholeRecord) -> Iterator[Piece]:
+    def _take_large(self, chunk: LargeChunk, whole: IntactRecord) -> Iterator[Piece]:
         """Yield a chunk for an unchanged copy, if all its channels are defined."""
         for record in chunk.definitions:
             if not self.definitions.add(record):
@@ -393,7 +393,7 @@ class Salvage:
         for place in range(start, end, _WINDOW):
             yield self._file.read(place, min(_WINDOW, end - place))
 
-    def _take_message(self, message: records.Message, whole: WholeRecord) -> Iterator[Piece]:
+    def _take_message(self, message: records.Message, whole: IntactRecord) -> Iterator[Piece]:
         """Yield a message outside of chunks, if its channel is defined and its time is valid."""
         if message.log_time > LAST_TIME:
             self._add_late(whole, {message.channel_id: 1})
@@ -403,12 +403,12 @@ class Salvage:
             times = message.log_time, message.log_time
             self._damages.add_unnamed(message.channel_id, 1, times, whole)
 
-    def _add_late(self, whole: WholeRecord, messages: Mapping[int, int]) -> None:
+    def _add_late(self, whole: IntactRecord, messages: Mapping[int, int]) -> None:
         """Register messages that are skipped because readers cannot represent their log times."""
         if messages:
             self._damages.add(Damage(whole.offset, whole.end, _LATE, sound=True), dict(messages))
 
-    def _take_chunk(self, chunk: WholeChunk, whole: WholeRecord) -> Iterator[Piece]:
+    def _take_chunk(self, chunk: IntactChunk, whole: IntactRecord) -> Iterator[Piece]:
         """Yield a chunk if all its channels are defined; else its messages of defined ones."""
         self._add_late(whole, chunk.late)
         agree = True

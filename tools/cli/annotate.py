@@ -28,8 +28,8 @@ from hearthlog.tools.cli.terminal import (
     NAME_WIDTH,
     end_with_warnings,
     number,
+    print_notice,
     print_table,
-    tell,
     wrong_use,
 )
 
@@ -127,7 +127,9 @@ def import_labels(
         labels, coverage, options, lambda folded: _agree(labels, folded, yes=yes)
     )
     for other, count in moved.items():
-        tell(f"{number(count, 'label')} of {other}, by the file, are taken as of {microphone}")
+        print_notice(
+            f"{number(count, 'label')} of {other}, by the file, are taken as of {microphone}"
+        )
     losses = list(_losses(left_out))
     if not by_log:
         _end_without_labels(losses)
@@ -151,22 +153,22 @@ def import_labels(
     _print_amounts(taken)
     existing = sum(map(len, by_log.values())) - len(taken)
     if existing:
-        tell(f"{number(existing, 'mark')} stood there already")
+        print_notice(f"{number(existing, 'mark')} stood there already")
     if asked.exists():
         minutes = sum(span.chosen == RANDOM for span in seen)
-        tell(
+        print_notice(
             f"looked at, by {asked}: {number(len(seen) - minutes, 'span')} of the queue, "
             f"{number(minutes, 'minute')} drawn at random"
         )
         if others := unasked(spans, taken):
-            tell(f"{number(len(others), 'mark')} in no span of {asked}: of your own choice")
+            print_notice(f"{number(len(others), 'mark')} in no span of {asked}: of your own choice")
     if taken:
         what, of = (
             (f"scenario {scenario}, from these", f" --scenario {scenario}")
             if scenario
             else (f"this home, from these ({JUDGED_BY})", "")
         )
-        tell(f"next: a model of {what}: hearthlog train --home {quote(str(log))}{of}")
+        print_notice(f"next: a model of {what}: hearthlog train --home {quote(str(log))}{of}")
     end_with_warnings(losses)
 
 
@@ -206,7 +208,7 @@ def _log_and_labels(first: Path, second: Path | None) -> tuple[Path, Path]:
 
 def _end_without_labels(losses: list[str]) -> NoReturn:
     for line in losses:
-        tell(line)
+        print_notice(line)
     raise typer.Exit(1)
 
 
@@ -253,16 +255,16 @@ def _agree(labels: Path, folded: "Sequence[Folded]", *, yes: bool) -> None:
     more = [f"{len(texts) - _SHOWN} more"] if len(texts) > _SHOWN else []
     text = listed([*texts[:_SHOWN], *more], "and")
     if yes:
-        tell(f"taken: {text}")
+        print_notice(f"taken: {text}")
     elif not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise DataError(
             f"{labels}: not spelt as names of classes are: {text}; --yes takes them so, --map says "
             "what else they are"
         )
     else:
-        tell(f"{labels}: not spelt as names of classes are: {text}")
+        print_notice(f"{labels}: not spelt as names of classes are: {text}")
         if not typer.confirm("Take them so?", err=True):
-            tell("nothing was taken; --map says what they are")
+            print_notice("nothing was taken; --map says what they are")
             raise typer.Exit(1)
 
 
@@ -331,7 +333,7 @@ def enrol(
         done = _enrol_files(home, label, file, seconds, refused)
     elif log is None:
         seconds = seconds or enrolment.SECONDS
-        listening = partial(tell, f"listening for {seconds:g} s")
+        listening = partial(print_notice, f"listening for {seconds:g} s")
         done = enrolment.enrol_microphone(home, label, microphone or "", seconds, listening)
     elif first is None or last is None or seconds is not None:
         wrong_use("--log wants --start and --end, and no --seconds")

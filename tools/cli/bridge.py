@@ -15,9 +15,9 @@ from hearthlog.tools.cli.terminal import (
     number,
     print_json,
     print_lines,
+    print_notice,
     print_table,
     share_done,
-    tell,
     wrong_use,
 )
 
@@ -75,7 +75,7 @@ def bridge(
     for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(each, lambda *_: stop.set())
     home = RecorderAddress(logs or settings.output, settings.node, time_zone(settings.timezone))
-    say = ProblemReporter(tell)
+    say = ProblemReporter(print_notice)
     state = state_folder(own.state, home.folder)
     for line in [*exposed_files(own, config, state), *exposed_passwords(settings, config)]:
         say(line)
@@ -147,7 +147,7 @@ def replay(
     for rule in own.alert:
         unheard = unknown_microphone(rule, microphones, recorded=True)
         if text := unheard or unknown_class(rule, heard.classes):
-            tell(text)
+            print_notice(text)
     if as_json:
         print_json(_as_json(found, (first, last), zone))
     else:

@@ -23,9 +23,9 @@ from hearthlog.tools.cli.terminal import (
     end_with_warnings,
     number,
     print_json,
+    print_notice,
     print_table,
     share_done,
-    tell,
     wrong_use,
 )
 
@@ -163,9 +163,9 @@ def _group(
     save_groups(groups, file)
     save_summary(summary, summary_path(file))
     if note := unembedded_note(sounds, groups):
-        tell(note)
+        print_notice(note)
     if sounds.without:
-        tell(f"{number(sounds.without, 'log')} without features and labels")
+        print_notice(f"{number(sounds.without, 'log')} without features and labels")
     return summary, sounds.losses
 
 
@@ -186,7 +186,7 @@ def _name(
     summary = load_summary(summary_path(file))
     for each in undo:
         count = unmark_group([log.path for log in home.between()], reason_of(groups, each))
-        tell(f"group {each}: {number(count, 'mark')} taken back")
+        print_notice(f"group {each}: {number(count, 'mark')} taken back")
         groups, summary = _renamed(groups, summary, {each: ""}, file)
     losses: list[str] = []
     if names:
@@ -194,7 +194,7 @@ def _name(
             marked, losses = name_groups(home, groups, names, looked, reviewer, progress)
         for each, (made, left) in marked.items():
             more = f"; {left} are marked or looked at by somebody already" if left else ""
-            tell(f"group {each}: {number(made, 'mark')} of {names[each]}{more}")
+            print_notice(f"group {each}: {number(made, 'mark')} of {names[each]}{more}")
         groups, summary = _renamed(groups, summary, names, file)
     return summary, losses
 
@@ -263,7 +263,7 @@ def _tell_next(summary: "GroupsSummary", logs: Sequence[Path], file: Path | None
     if unnamed:
         where = " ".join(quote(str(log)) for log in logs)
         where += f" --groups {quote(str(file))}" if file else ""
-        tell(f"next: name one: hearthlog discover {where} --name {unnamed[0]}=doorbell")
+        print_notice(f"next: name one: hearthlog discover {where} --name {unnamed[0]}=doorbell")
 
 
 def voices(
@@ -340,7 +340,7 @@ def voices(
         print_json(_voices_as_json(summaries, speech, path, zone))
     else:
         _print_voices(summaries, speech, zone)
-        _tell_next_of_voices(summaries, logs, file)
+        _suggest_next_of_voices(summaries, logs, file)
     end_with_warnings(speech.losses)
 
 
@@ -395,7 +395,7 @@ def _enrol(
         row = voices.numbers.tolist().index(each)
         done = enrol_voice(home, label, speech, (of[speech.turns.voice] == row).nonzero()[0])
         seconds = sum(one.seconds for one in done)
-        tell(f"voice {each}: {seconds:.0f} s of {label} enrolled in {home}")
+        print_notice(f"voice {each}: {seconds:.0f} s of {label} enrolled in {home}")
 
 
 def _write_turns(output: Path, speech: "HomeSpeech", voices: "HomeVoices", of: "Int64") -> None:
@@ -452,14 +452,14 @@ def _voice_place(summary: "VoiceSummary", zone: "tzinfo") -> str:
     return f"{local_time(turn.start, zone):%Y-%m-%d %H:%M:%S} {turn.microphone}"
 
 
-def _tell_next_of_voices(
+def _suggest_next_of_voices(
     summaries: "Sequence[VoiceSummary]", logs: Sequence[Path], file: Path | None
 ) -> None:
     unnamed = [each.number for each in summaries if not each.name]
     if unnamed:
         where = " ".join(quote(str(log)) for log in logs)
         where += f" --voices {quote(str(file))}" if file else ""
-        tell(f"next: name one: hearthlog voices {where} --name {unnamed[0]}=anna")
+        print_notice(f"next: name one: hearthlog voices {where} --name {unnamed[0]}=anna")
 
 
 def _voices_as_json(

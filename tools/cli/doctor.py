@@ -8,7 +8,7 @@ import typer
 
 from hearthlog.schemas.errors import abridged, printable, shortened
 from hearthlog.tools.cli.options import Json, LocalLogs, check_output
-from hearthlog.tools.cli.terminal import number, print_lines, tell, wrong_use
+from hearthlog.tools.cli.terminal import number, print_lines, print_notice, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.doctor.findings import Findings
@@ -67,7 +67,7 @@ def doctor(
     with share_done("reading logs") as progress:
         files = examine(paths, progress, missing)
     for line in [*missing, *_network_changes(paths)]:
-        tell(line)
+        print_notice(line)
     if as_json:
         print(json.dumps(_as_json(files), indent=2))
     else:
@@ -120,7 +120,7 @@ def _examine_live(
         print_lines(f"{state.level}: {state.subject}: {state.text}" for state in states)
     levels = {state.level for state in states} - {"ok"}
     if ping_url is not None and (problem := ping(ping_url, is_well="error" not in levels)):
-        tell(f"the ping did not arrive: {problem}")
+        print_notice(f"the ping did not arrive: {problem}")
     if levels:
         raise typer.Exit(1 if "error" in levels else 3)
 
@@ -193,7 +193,7 @@ def recover(
         except LogError as error:
             if len(logs) == 1:
                 raise
-            tell(str(error))
+            print_notice(str(error))
             failed = True
             continue
         lost |= not recovery.lossless
@@ -225,12 +225,12 @@ def _say(log: Path, recovery: "Recovery") -> None:
     expected = [topic.expected for topic in recovery.topics.values() if topic.expected is not None]
     of = f" of {sum(expected)}" if expected else ""
     end = "" if recovery.complete else "; the log had no end, or a damaged one"
-    tell(f"{log}: {recovery.messages}{of} messages saved{end}")
+    print_notice(f"{log}: {recovery.messages}{of} messages saved{end}")
     if recovery.escaped:
         what = "bytes that are not UTF-8 are written as \\xNN in the names or metadata of"
-        tell(f"{log}: {what} {abridged([shortened(n, 60) for n in recovery.escaped], 5)}")
+        print_notice(f"{log}: {what} {abridged([shortened(n, 60) for n in recovery.escaped], 5)}")
     for text in dict.fromkeys([*map(str, recovery.damages), *recovery.losses]):
-        tell(f"{log}: {text}")
+        print_notice(f"{log}: {text}")
 
 
 def _recovery_as_json(log: Path, path: Path, recovery: "Recovery") -> dict[str, Any]:

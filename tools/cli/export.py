@@ -12,7 +12,7 @@ from hearthlog.tools.cli.options import End, Logs, NewLog, Start, Topics, check_
 from hearthlog.tools.cli.terminal import (
     end_with_warnings,
     number,
-    tell,
+    print_notice,
     unfinished_lines,
     wrong_use,
 )
@@ -90,7 +90,7 @@ def export(
         repeated = save(selection, output, format_, progress, folder=not one_file)
     print(output)
     if repeated:
-        tell(f"{number(repeated, 'message')} left out that the logs have twice")
+        print_notice(f"{number(repeated, 'message')} left out that the logs have twice")
     end_with_warnings(unfinished_lines(selection.unfinished))
 
 
@@ -181,7 +181,7 @@ def cut(
         repeated = merge_logs(selection, output, progress, latched=True)
     print(output)
     if repeated:
-        tell(f"{number(repeated, 'message')} left out that the logs have twice")
+        print_notice(f"{number(repeated, 'message')} left out that the logs have twice")
     end_with_warnings(unfinished_lines(selection.unfinished))
 
 
@@ -202,5 +202,5 @@ def merge(logs: Logs, *, output: NewLog) -> None:
         repeated = merge_logs(selection, output, progress)
     print(output)
     if repeated:
-        tell(f"{number(repeated, 'message')} left out that the logs have twice")
+        print_notice(f"{number(repeated, 'message')} left out that the logs have twice")
     end_with_warnings(unfinished_lines(selection.unfinished))

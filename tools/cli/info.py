@@ -17,9 +17,9 @@ from hearthlog.tools.cli.terminal import (
     moment,
     number,
     print_lines,
+    print_notice,
     print_table,
     share_done,
-    tell,
     wrong_use,
 )
 
@@ -54,7 +54,7 @@ def info(
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
     for error in summary.damaged.values():
-        tell(error)
+        print_notice(error)
     if not summary.files:
         raise typer.Exit(1)
     for stream in summary.streams:
@@ -135,7 +135,7 @@ def _accuracy(summary: "LogSummary", path: Path) -> "Accuracy | None":
     except LogError:  # the log belongs to no home
         return None
     for loss in accuracy.losses:
-        tell(loss)
+        print_notice(loss)
     return accuracy
 
 
@@ -336,7 +336,7 @@ def catalog(
     files = _write(folder, workers, scheduler)
     damaged = files.of_state(DAMAGED)
     for row in damaged:
-        tell(f"{folder / row.path}: {row.error}")
+        print_notice(f"{folder / row.path}: {row.error}")
     unfinished = [row.path for row in files.of_state(UNFINISHED)]
     if as_json:
         result = {
@@ -361,12 +361,12 @@ def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
 
     previous = read_catalog(folder)
     for line in () if previous is None else previous.unusable:
-        tell(f"{line}; it is made anew")
+        print_notice(f"{line}; it is made anew")
     try:
         with open_workers(workers, scheduler) as pool, share_done("reading logs") as progress:
             return write_catalog(folder, previous, progress, pool)
     except KeyboardInterrupt:
-        tell(
+        print_notice(
             "interrupted; what was read is in the catalogue, and the same command goes on from "
             "there"
         )

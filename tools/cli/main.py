@@ -25,7 +25,7 @@ from typer.core import TyperArgument, TyperOption
 from hearthlog import __version__
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 from hearthlog.schemas.files import denied_text, is_denied
-from hearthlog.tools.cli.terminal import OutputClosedError, checked_output, tell
+from hearthlog.tools.cli.terminal import OutputClosedError, checked_output, print_notice
 
 # In help order; each is a function, or an app of its own, in the module of its name.
 PANELS = {
@@ -184,7 +184,7 @@ def _status_of(step: Callable[[], Any]) -> str | int | None:
         return end.code
     except typer.TyperException as error:
         if error.format_message():  # otherwise the help was shown
-            tell(_usage_text(error))
+            print_notice(_usage_text(error))
         return error.exit_code
     except OutputClosedError:
         return 0  # the reader has closed the pipe, as in `| head`
@@ -192,7 +192,7 @@ def _status_of(step: Callable[[], Any]) -> str | int | None:
         if _debug["on"]:
             raise
         for line in getattr(error, "lines", None) or [_message(error)]:
-            tell(line)
+            print_notice(line)
         return error.status if isinstance(error, HearthlogError) else 1
 
 
@@ -231,7 +231,7 @@ def _warnings_shown() -> Iterator[dict[str, set[str]]]:
         if not places or (message.each and str(message.where) not in places):
             places.add(str(message.where))
             if len(places) <= _NAMED:
-                tell(f"{message.where}: {message}")
+                print_notice(f"{message.where}: {message}")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", HearthlogWarning)
@@ -239,7 +239,7 @@ def _warnings_shown() -> Iterator[dict[str, set[str]]]:
         yield warned
         for text, places in warned.items():
             if len(places) > _NAMED:
-                tell(f"and {len(places) - _NAMED:,} more: {text}")
+                print_notice(f"and {len(places) - _NAMED:,} more: {text}")
 
 
 if __name__ == "__main__":

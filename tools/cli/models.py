@@ -19,8 +19,8 @@ from hearthlog.tools.cli.tables import share
 from hearthlog.tools.cli.terminal import (
     end_with_warnings,
     print_lines,
+    print_notice,
     print_table,
-    tell,
     wrong_use,
 )
 
@@ -56,11 +56,11 @@ def fetch(
         _list()
         return
     network = NETWORKS.get(name)
-    tell(f"{network.attribution}; its licence is {network.licence}")
+    print_notice(f"{network.attribution}; its licence is {network.licence}")
     path = _put(network) if source is None else _put_from(network, source)
     print(path)
     if path.is_relative_to(network_folders()[0]) and (SYSTEM_UNITS / NAME).exists():
-        tell("the service of this machine does not look there: for it, run this with sudo")
+        print_notice("the service of this machine does not look there: for it, run this with sudo")
     end_with_warnings(_tried(network, path))
 
 
@@ -77,7 +77,7 @@ def _put(network: "EmbeddingNetwork") -> Path:
     except ModelError:
         pass
     else:
-        tell("it is there already")
+        print_notice("it is there already")
         return path
     file = network.files[0]
     if not file.url:
@@ -118,7 +118,9 @@ def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
     if probe.different_answers:
         first = probe.different_answers[0]
         return [f"{path}: hears otherwise than models were made with ({first}): labels are worse"]
-    tell(f"it works: {1000 * probe.seconds:.2g} ms for a window; recorders take it when they start")
+    print_notice(
+        f"it works: {1000 * probe.seconds:.2g} ms for a window; recorders take it when they start"
+    )
     return []
 
 
@@ -174,7 +176,7 @@ def list_(folder: _Folder = None, as_json: Json = False) -> None:
     place = models_folder(folder)
     entries = list_models(place)
     if not place.is_dir():
-        tell(f"{place}: no such folder of models; these come with hearthlog")
+        print_notice(f"{place}: no such folder of models; these come with hearthlog")
     if as_json:
         print(json.dumps([_as_json(entry) for entry in entries], indent=2))
     else:
@@ -198,7 +200,7 @@ def show(
     else:
         print_lines(model_card(model).splitlines())
     if (network := _network(model)) and not _is_here(network):
-        tell(f"the network {network} is not here: hearthlog models fetch {network}")
+        print_notice(f"the network {network} is not here: hearthlog models fetch {network}")
 
 
 @models.command()
@@ -242,10 +244,12 @@ def compare(
     heard = next((one for one in (first, second) if one.description.embedding), first)
     recordings = _recordings(data, logs, chosen, heard, left_out)
     if logs is not None and not recordings:
-        tell("nothing is marked: it is said how the models differ, not which is better")
+        print_notice("nothing is marked: it is said how the models differ, not which is better")
         shares = _minutes_in_logs(first, second, logs)
         if not shares:
-            tell("there are no recent logs that they have not learned from: record for some hours")
+            print_notice(
+                "there are no recent logs that they have not learned from: record for some hours"
+            )
         if as_json:
             print(json.dumps({"said": _shares_json(shares)}, indent=2))
         else:
@@ -301,7 +305,7 @@ def promote(
     if to == "champion":
         _check_harmless(place, name, logs or [_logs_folder()], anyway=anyway)
     else:
-        _check_beside_champion(place, name)
+        _check_against_champion(place, name)
     model, before = promote_model(place, name, to)
     if model.name == before:
         print(f"{model.name} is the {to} already")
@@ -366,7 +370,7 @@ def _starter_here(folder: Path, name: str) -> str:
     return other if is_starter(model.name, model.sha256) else name
 
 
-def _check_beside_champion(folder: Path, name: str) -> None:
+def _check_against_champion(folder: Path, name: str) -> None:
     """Raise ModelError if a candidate's feature set differs from that of an existing champion."""
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import CHAMPION, load

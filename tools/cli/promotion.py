@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hearthlog.analyzer.gate.comparison import Trial, gain_interval
 from hearthlog.analyzer.gate.paired_labels import time_words
 from hearthlog.schemas.errors import printable
-from hearthlog.tools.cli.terminal import print_table, tell
+from hearthlog.tools.cli.terminal import print_notice, print_table
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.gate.comparison import HomeComparison, PairedAccuracy
@@ -45,7 +45,7 @@ def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
         return
     for loss in evidence.losses[:1]:
         more = f" (and {len(evidence.losses) - 1} more)" if len(evidence.losses) > 1 else ""
-        tell(f"not heard: {loss}{more}")
+        print_notice(f"not heard: {loss}{more}")
     if not evidence.minutes:
         return
     _print_changes(evidence, verdict.model, verdict.champion)

@@ -21,7 +21,7 @@ from hearthlog.tools.cli.options import (
     parse_time,
     scenario_files,
 )
-from hearthlog.tools.cli.terminal import number, tell, wrong_use
+from hearthlog.tools.cli.terminal import number, print_notice, wrong_use
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -151,9 +151,9 @@ def record(
     configured = load()
     settings = with_model(configured)
     for line in exposed_passwords(settings, config):
-        tell(line)
+        print_notice(line)
     if sys.stderr.isatty():
-        _tell_of_network(settings)
+        _report_network(settings)
     os.umask(_HIDDEN[settings.readable_by])
     losses: list[str] = []
     stop = Flag()
@@ -175,13 +175,13 @@ def record(
         if not recording.labels and settings.model != NO_MODEL:
             doubts.append("the sound is too short for a label; a model needs a second of it")
         for line in [*doubts, *losses]:
-            tell(line)
+            print_notice(line)
     elif start is not None or realtime or start_pattern is not None:
         wrong_use("--start, --start-pattern and --realtime go with files")
     else:
         recording = _listen(settings, stop, reload_requests)
         if reload_requests.restart:
-            tell("the configuration was changed; starting again with it")
+            print_notice("the configuration was changed; starting again with it")
             os.execv(sys.executable, sys.orig_argv)  # noqa: S606  with the original arguments
     _say(recording, losses)
 
@@ -204,7 +204,7 @@ def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
     from hearthlog.recorder.recording_session import RecorderState
     from hearthlog.tools.cli.status_line import living_line
 
-    tell("Ctrl-C ends it, and completes the log")
+    print_notice("Ctrl-C ends it, and completes the log")
     state = RecorderState()
     with living_line(state, settings):
         yield state
@@ -216,11 +216,11 @@ def with_model(settings: "Settings") -> "Settings":
 
     model = DEFAULT_MODEL if settings.model is None else settings.model
     if model == DEFAULT_MODEL and model.is_symlink() and not model.exists():
-        tell(f"{model}: the model that it points to is gone; promote another one")
+        print_notice(f"{model}: the model that it points to is gone; promote another one")
     return settings.model_copy(update={"model": model})
 
 
-def _tell_of_network(settings: "Settings") -> None:
+def _report_network(settings: "Settings") -> None:
     """Print the benefit of a network and how to get one, unless the configuration decides."""
     from hearthlog.analyzer.extras import remedy
     from hearthlog.models.embedding.networks import YAMNET, find_network, missing_modules
@@ -232,7 +232,7 @@ def _tell_of_network(settings: "Settings") -> None:
     if settings.embedding or not by_starter or model.exists() or find_network(YAMNET.name):
         return
     absent = missing_modules(YAMNET.suffix)
-    tell(
+    print_notice(
         "labels are truer in a home that nobody has heard with a network that has heard two "
         f"million clips: hearthlog models fetch {YAMNET.name} (4 MB, once)"
         + (f"; it wants LiteRT, too; {remedy(*absent)}" if absent else "")
@@ -246,12 +246,12 @@ def _say(recording: "RecordingSummary", losses: list[str]) -> None:
     damaged = [old for old in recording.recovered if old.damage]
     for old in recording.recovered:
         if old.completed:
-            tell(f"completed {old.path}, which was left unfinished")
+            print_notice(f"completed {old.path}, which was left unfinished")
     for old in damaged:
-        tell(str(old.damage))
+        print_notice(str(old.damage))
     if recording.gaps:
         gaps, frames = number(recording.gaps, "gap"), number(recording.frames_lost, "frame")
-        tell(f"{gaps}, {frames} not heard")
+        print_notice(f"{gaps}, {frames} not heard")
     if damaged or recording.gaps or recording.models_refused or losses:
         raise typer.Exit(3)
 
@@ -270,7 +270,7 @@ def _look_at_hangup(
         try:
             changed = load() != configured
         except HearthlogError as error:
-            tell(f"{error}; the recorder goes on as it was configured")
+            print_notice(f"{error}; the recorder goes on as it was configured")
             return
         if changed:
             reload_requests.restart = True

@@ -24,7 +24,7 @@ from hearthlog.tools.cli.terminal import (
     number,
     print_json,
     print_lines,
-    tell,
+    print_notice,
     wrong_use,
 )
 
@@ -50,7 +50,7 @@ def devices(*, as_json: Json = False) -> None:
         rate = f"{device.default_rate:.0f} Hz"
         print(f"{device.name}  {device.channels} channels, {rate}{place}{default}")
     if not microphones:
-        tell("no microphone found")
+        print_notice("no microphone found")
         raise typer.Exit(1)
 
 
@@ -103,7 +103,7 @@ def check(
     warnings += unheard_classes(bridge.alert, settings, microphones)
     warnings += [*exposed_passwords(settings, file), *exposed_files(bridge, file, bridge.state)]
     for line in [*map(str, errors), *problems, *warnings]:
-        tell(line)
+        print_notice(line)
     if errors or problems:
         raise typer.Exit(max([1, *(error.status for error in errors)]))
     print(f"{file}: can be used")
@@ -273,7 +273,9 @@ def _print(done: _Done, *, dry_run: bool) -> None:
     print_lines(f"{path}: is kept: {reason}" for path, reason in done.kept.items())
     print_lines(f"{log.path}: {would}thinned of {STEPS[step]}" for log, step in done.thinned)
     freed = size_text(sum(log.size for log, _ in done.deleted))
-    tell(f"{number(len(done.deleted), 'log')} {would}deleted, {freed}; {len(done.thinned)} thinned")
+    print_notice(
+        f"{number(len(done.deleted), 'log')} {would}deleted, {freed}; {len(done.thinned)} thinned"
+    )
 
 
 def _as_json(done: _Done, *, dry_run: bool) -> dict[str, Any]:
@@ -333,11 +335,11 @@ def install_service(
     print(installed.unit)
     manager = "systemctl --user" if user else "systemctl"
     if installed.started:
-        tell(f"it records: `{manager} status hearthlog` says how it is")
+        print_notice(f"it records: `{manager} status hearthlog` says how it is")
     else:
-        tell("it is enabled, and starts when systemd does")
+        print_notice("it is enabled, and starts when systemd does")
     if user and not (_LINGER / getpass.getuser()).exists():
-        tell("it ends when you log out; to let it run on: loginctl enable-linger")
+        print_notice("it ends when you log out; to let it run on: loginctl enable-linger")
 
 
 def _install_bridge(config: Path | None, account: str | None) -> None:
@@ -348,6 +350,6 @@ def _install_bridge(config: Path | None, account: str | None) -> None:
     installed = install_bridge(config, account)
     print(installed.unit)
     if installed.started:
-        tell("it runs: `systemctl status hearthlog-bridge` says how it is")
+        print_notice("it runs: `systemctl status hearthlog-bridge` says how it is")
     else:
-        tell("it is enabled, and starts when systemd does")
+        print_notice("it is enabled, and starts when systemd does")

@@ -30,8 +30,8 @@ from hearthlog.tools.cli.terminal import (
     end_with_warnings,
     first_of,
     number,
+    print_notice,
     share_done,
-    tell,
     unfinished_lines,
     wrong_use,
 )
@@ -101,14 +101,16 @@ def _print(result: "Relabelled", model: str) -> None:
         print(f"{number(len(result.active), 'log')} still being written")
     if result.left_out:
         named = [f"{name} (features of {kind})" for name, kind in sorted(result.left_out.items())]
-        tell(f"left out, as {model} is for other features: {listed(named, 'and')}")
+        print_notice(f"left out, as {model} is for other features: {listed(named, 'and')}")
     if result.by_features:
         logs_there = number(len(result.by_features), "log")
-        tell(f"{logs_there} without the embeddings that {model} takes: labelled without them")
+        print_notice(
+            f"{logs_there} without the embeddings that {model} takes: labelled without them"
+        )
     for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
         named = [why if str(log.parent) in why else f"{log}: {why}" for log, why in logs.items()]
         for line in first_of(what, sorted(named)):
-            tell(line)
+            print_notice(line)
 
 
 def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]:
@@ -188,7 +190,7 @@ def diff(
     if output is not None:
         listed = result.spans()
         write_list(output, listed)
-        tell(f"{len(listed)} spans are listed in {output}")
+        print_notice(f"{len(listed)} spans are listed in {output}")
     if as_json:
         spans_as_text = [span.as_text() for span in result.spans()]
         print(json.dumps({**result.figures, "spans": spans_as_text}, allow_nan=False))
@@ -240,7 +242,7 @@ def _queue(
             progress=progress,
         )
     if not ranked.has_uncertainty:
-        tell(
+        print_notice(
             f"{names[0]}: no labels with probabilities, so how sure the model was is no part of "
             "the score"
         )

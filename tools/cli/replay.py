@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hearthlog.tools.cli.options import Json, LocalLog, Microphone, scenario_files
-from hearthlog.tools.cli.terminal import moment, print_recording, tell, wrong_use
+from hearthlog.tools.cli.terminal import moment, print_notice, print_recording, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import RecorderInfo
@@ -115,12 +115,12 @@ def replay(
         else:
             print(*result.logs, sep="\n")
         for line in _figures(result, took):
-            tell(line)
+            print_notice(line)
     warnings = _warnings(result)
     if models.are_recorded and not warnings and not result.compared.identical:
         warnings.append("with the recorded model not all is as recorded: is this another version?")
     for line in warnings:
-        tell(line)
+        print_notice(line)
     if warnings or models.are_lacking:
         raise typer.Exit(3)
 
@@ -169,7 +169,7 @@ class _Models:
                 what = "which was not found; no labels: give it, or another, with --model"
             else:
                 what = f"replayed with {model.name!r} (sha256 {digest[:12]})"
-            tell(f"{recorded}, {what}")
+            print_notice(f"{recorded}, {what}")
 
 
 def _check_span(start_offset: float, duration: float | None) -> None:

@@ -59,7 +59,7 @@ def report(
     home_logs = find_home_logs(logs)
     zone = home_zone(timezone, home_logs.records())
     if first is None and day is None:
-        first = home_logs.last_whole_day(zone)
+        first = home_logs.last_complete_day(zone)
     elif first is None:
         first = datetime.now(zone).date() - timedelta(days=_NEAR[day or ""])
     count = 1 if week is None else WEEK

@@ -28,12 +28,12 @@ from hearthlog.tools.cli.options import (
 from hearthlog.tools.cli.terminal import (
     JUDGED_BY,
     end_with_warnings,
+    print_notice,
     print_recording,
     print_table,
     read_keys,
     share_done,
     show_page,
-    tell,
     wrong_use,
 )
 
@@ -266,7 +266,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     show_page(viewer.address)
     with read_keys(keys) as ended, suppress(KeyboardInterrupt):
         if viewer.wait_until_drawn(lambda: ended.is_set() and keys.qsize() <= 1) is None:
-            tell("nobody opened the page, and the input ended")
+            print_notice("nobody opened the page, and the input ended")
             return
         grid = timeline.grid
         if not items and grid.end - grid.start <= MOST_FRAMES:
@@ -276,7 +276,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         if session.run(keys):
             _say_next(logs, marking.scenario)
     if not marking.scenario:
-        _say_how_right(logs)
+        _report_accuracy(logs)
 
 
 def _say_next(logs: list[Path], scenario: str) -> None:
@@ -285,10 +285,10 @@ def _say_next(logs: list[Path], scenario: str) -> None:
     what = f"scenario {scenario}" if scenario else "this home"
     judged = "" if scenario else f" ({JUDGED_BY})"
     train = f"hearthlog train {shlex.join(words)}"
-    tell(f"next: a model of {what}, from what is marked{judged}: {train}")
+    print_notice(f"next: a model of {what}, from what is marked{judged}: {train}")
 
 
-def _say_how_right(logs: list[Path]) -> None:
+def _report_accuracy(logs: list[Path]) -> None:
     """Print the accuracy from the randomly drawn minutes so far."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.tools.cli.info_summary import Accuracy
@@ -319,7 +319,7 @@ def _work(
             items = review_items(
                 _queue_spans(choice.queue, sources, (microphone, labelling), choice)
             )
-            _tell_fewer(len(items), choice)
+            _report_fewer(len(items), choice)
     marking = Marking(
         microphone,
         timeline.coverage[microphone],
@@ -393,24 +393,26 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
             for line, (begin, one) in enumerate(zip(clock, marks, strict=True), 1)
         ],
     )
-    _tell_fewer(len(spans), choice)
-    _tell_of_sounds(files, folder, len(marks))
+    _report_fewer(len(spans), choice)
+    _report_sounds(files, folder, len(marks))
     scenario = scenario_name(labelling)
     of = f" --scenario {scenario}" if scenario else ""
-    tell(
+    print_notice(
         f"{path}: correct the labels, delete the lines that you cannot judge, and take the rest as "
         f"marks: hearthlog annotate import {logs[0]} {path}{of}"
     )
     end_with_warnings(sources.losses)
 
 
-def _tell_of_sounds(files: "Sequence[SoundFile]", folder: Path, lines: int) -> None:
+def _report_sounds(files: "Sequence[SoundFile]", folder: Path, lines: int) -> None:
     heard = sum(file.first == file.last for file in files)
     if not files:
-        tell("no sound of these lines was kept; `hearthlog record --keep-audio unsure` keeps some")
+        print_notice(
+            "no sound of these lines was kept; `hearthlog record --keep-audio unsure` keeps some"
+        )
         return
     others = "" if heard == lines else "; of the others no sound was kept"
-    tell(f"{folder}: the sound of {heard} of {lines} lines, numbered as they are{others}")
+    print_notice(f"{folder}: the sound of {heard} of {lines} lines, numbered as they are{others}")
 
 
 def _queue_spans(
@@ -429,9 +431,11 @@ def _queue_spans(
         )
 
 
-def _tell_fewer(count: int, choice: _Choice) -> None:
+def _report_fewer(count: int, choice: _Choice) -> None:
     if choice.spans is not None and count < choice.spans:
-        tell(f"{count} of the {choice.spans} that were asked for: no more is left to review")
+        print_notice(
+            f"{count} of the {choice.spans} that were asked for: no more is left to review"
+        )
 
 
 def _microphone(timeline: "Timeline", name: str | None) -> str:

@@ -40,12 +40,12 @@ def print_json(result: dict[str, Any]) -> None:
     print(json.dumps(result, allow_nan=False))
 
 
-def tell(text: str) -> None:
+def print_notice(text: str) -> None:
     """Write a line to standard error, for anything but results."""
     print(f"hearthlog: {printable(text)}", file=sys.stderr)
 
 
-class TellOnce:
+class ReportOnce:
     """Writes repeated messages once per text."""
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class TellOnce:
         """Write a message unless written recently."""
         if str(what) not in self._told:
             self._told.append(str(what))
-            tell(str(what))
+            print_notice(str(what))
 
     def __bool__(self) -> bool:
         return bool(self._told)
@@ -63,7 +63,7 @@ class TellOnce:
 
 def wrong_use(message: str) -> NoReturn:
     """End with one line, and the exit status of wrong use."""
-    tell(message)
+    print_notice(message)
     raise typer.Exit(2)
 
 
@@ -76,7 +76,7 @@ def unfinished_lines(paths: Sequence[Path]) -> list[str]:
 def end_with_warnings(lines: Sequence[str]) -> None:
     """Write each line to standard error; end with exit status 3 if there are any."""
     for line in lines:
-        tell(line)
+        print_notice(line)
     if lines:
         raise typer.Exit(3)
 
@@ -227,7 +227,7 @@ def share_done(what: str, *, announce: bool = False) -> Iterator[Progress]:
     """
     if not sys.stderr.isatty():
         if announce:
-            tell(what)
+            print_notice(what)
         yield _lines(what)
         return
     from rich.console import Console
@@ -247,7 +247,7 @@ def _lines(what: str) -> Progress:
         nonlocal last
         if time.monotonic() - last >= _LINE_SECONDS:
             last = time.monotonic()
-            tell(f"{what}: {share:.1%}")
+            print_notice(f"{what}: {share:.1%}")
 
     return report
 
@@ -296,7 +296,7 @@ def print_recording(path: Path) -> None:
 
     print(path)
     print(f"open it with: rerun {hidden_options()} {shlex.quote(str(path))}")
-    tell("by --bind and --port no web page finds what Rerun shows")
+    print_notice("by --bind and --port no web page finds what Rerun shows")
 
 
 def show_page(address: str) -> None:
@@ -305,7 +305,7 @@ def show_page(address: str) -> None:
         return
     from hearthlog.analyzer.review.viewer.process import has_display
 
-    tell(f"open {address}")
+    print_notice(f"open {address}")
     if has_display():  # otherwise a text browser would take over the terminal
         import webbrowser
 

@@ -27,9 +27,9 @@ from hearthlog.tools.cli.terminal import (
     end_with_warnings,
     number,
     print_lines,
+    print_notice,
     print_table,
     share_done,
-    tell,
     wrong_use,
 )
 
@@ -189,7 +189,7 @@ def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
         with share_done("listening to what it would change", announce=True) as report:
             return judge(output.parent, model, home, report)
     except ModelError as error:  # the model was written regardless
-        tell(str(error))
+        print_notice(str(error))
         return None
 
 
@@ -241,7 +241,7 @@ def _model_of(home: list[Path], scenario: str) -> Path:
             f"the latest log is labelled by {name} ({sha256[:12]}), which is neither in "
             f"{folder} nor a starter model of this version: name its file with --base"
         )
-    tell(f"adapting {name}, which labelled the latest log")
+    print_notice(f"adapting {name}, which labelled the latest log")
     return path
 
 
@@ -264,10 +264,10 @@ def _learned(
         return _learned_voices(data, home, method, smoothing, left_out)
     chosen = load_scenario(scenario)
     clips = labelled_clips(data, chosen.labels, left_out)
-    _tell_left_out(left_out)
+    _report_skipped(left_out)
     chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
     if UNKNOWN not in chosen.classes:
-        tell(
+        print_notice(
             "fewer than 5 sources have a label of no class, such as other_negative: the model will "
             "take every sound for one of its classes; add some to be told what is unknown"
         )
@@ -280,7 +280,7 @@ def _learned(
     ]
     without = sum(one.embedded is None for one in recordings)
     if space is not None and without:
-        tell(
+        print_notice(
             f"{without} of {len(recordings)} marks of the home have no embedding of "
             f"{space.network} as it is here: they teach by features alone"
         )
@@ -288,7 +288,7 @@ def _learned(
         segments = build_dataset(
             clips, chosen, report, recordings, method.features, method.rooms, embedder, method.seed
         )
-    _tell_left_out(segments.left_out)
+    _report_skipped(segments.left_out)
     left_out += segments.left_out
     _warn_of_few(segments)
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
@@ -310,11 +310,11 @@ def _check_use(
         wrong_use("--data goes with --scenario and --output, and without --base")
 
 
-def _tell_left_out(left_out: "Sequence[SkippedClip]") -> None:
+def _report_skipped(left_out: "Sequence[SkippedClip]") -> None:
     from hearthlog.analyzer.training.manifest import left_out_lines
 
     for line in left_out_lines(left_out):
-        tell(line)
+        print_notice(line)
 
 
 def _check_smoothing(name: str) -> None:
@@ -348,7 +348,7 @@ def _learned_voices(
     scenario = speakers_scenario(enrolled)
     check_voices(enrolled, method.features)
     clips = labelled_clips(data, scenario.labels, left_out)
-    _tell_left_out(left_out)
+    _report_skipped(left_out)
     others = others_of(load_model(starter_file(GENERAL)), method, scenario)
     with share_done(f"listening to {len(clips)} clips", announce=bool(clips)) as report:
         more = list(
@@ -357,7 +357,7 @@ def _learned_voices(
             )
         )
     segments = cut_recordings([*enrolled, *more], scenario, method.features)
-    _tell_left_out(segments.left_out)
+    _report_skipped(segments.left_out)
     left_out += segments.left_out
     with share_done(f"learning from {len(segments)} segments", announce=True) as report:
         model = train_model(segments, scenario, report, method, smoothing, others)
@@ -373,13 +373,13 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
     model = load_model(base)
     segments, notes, nothing = home_lessons(home, model, scenario)
     for note in notes:
-        tell(note)
+        print_notice(note)
     if not len(segments):
         reasons = [f"{count} recordings: {why}" for why, count in segments.skipped.items()]
         why = "; ".join(reasons) or nothing
         raise DataError(f"the home has no segments of a class of the model ({why})")
     if not is_moved(model):
-        tell(
+        print_notice(
             f"{model.name} is of kind {model.description.kind}: landmarks learn what it says, and "
             "then from the home"
         )
@@ -392,7 +392,7 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
 def _warn_of_few(segments: "Dataset") -> None:
     for name, amount in segments.amounts.items():
         if amount.sources < _FEW_SOURCES or amount.seconds < _FEW_SECONDS:
-            tell(
+            print_notice(
                 f"class {name} has {amount.sources} sources, {amount.seconds:.0f} s: "
                 f"too few to be trusted; better {_FEW_SOURCES} sources and {_FEW_SECONDS:.0f} s"
             )
@@ -506,7 +506,7 @@ def manifest(
     print(f"\n{output}: {number(made.clips.total(), 'clip')}")
     alone = [label for label, count in made.clips.items() if len(made.groups[label]) == 1 < count]
     if chosen == FOLDER and alone:
-        tell(
+        print_notice(
             f"{', '.join(alone)}: all files count as one recording, for their names differ in a "
             "number only, and training wants several; give each recording or person a sub-folder"
         )

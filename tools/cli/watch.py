@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 import typer
 
 from hearthlog.tools.cli.options import LogsFolder, Timezone, parse_span
-from hearthlog.tools.cli.terminal import TellOnce, show_page, tell, wrong_use
+from hearthlog.tools.cli.terminal import ReportOnce, print_notice, show_page, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.foxglove.server import Admission
@@ -44,7 +44,7 @@ def show_in_foxglove(
     address = _checked_address(bind or HOST)
     origins = frozenset() if origin is None else frozenset({_checked_origin(origin)})
     admission = Admission(address, secrets.token_urlsafe(16), origins)
-    damaged, publisher, player = TellOnce(), Publisher(), None
+    damaged, publisher, player = ReportOnce(), Publisher(), None
     if span != (None, None):
         recording = RecordedSpan(find_logs(logs), *span, damaged)
         for channel, schema in recording.channels.values():
@@ -52,8 +52,8 @@ def show_in_foxglove(
         player = Playback(recording, publisher, stop)
     listener = listen(port or PORT, address)
     with (
-        serve(listener, admission, TellOnce(), publisher, player) as server,
-        _address_said(admission, port or PORT),
+        serve(listener, admission, ReportOnce(), publisher, player) as server,
+        _reported_address(admission, port or PORT),
     ):
         if player is not None:
             player.play(server)
@@ -63,7 +63,7 @@ def show_in_foxglove(
 
 
 @contextmanager
-def _address_said(admission: "Admission", port: int) -> Iterator[None]:
+def _reported_address(admission: "Admission", port: int) -> Iterator[None]:
     """Print where viewers connect; in a journal, a temporary file with the token instead."""
     from hearthlog.recorder.host import writes_to_journal
 
@@ -76,16 +76,18 @@ def _address_said(admission: "Admission", port: int) -> Iterator[None]:
             file = Path(folder) / "foxglove-address"
             file.write_text(f"{address}\n")  # only this account can read the folder
             address = f"ws://{place}/; its whole address, which opens it, is in {file}"
-        tell(f"open in Foxglove or Lichtblick: {address}")
-        _say_who_reaches(admission, place)
+        print_notice(f"open in Foxglove or Lichtblick: {address}")
+        _report_reach(admission, place)
         yield
 
 
-def _say_who_reaches(admission: "Admission", place: str) -> None:
+def _report_reach(admission: "Admission", place: str) -> None:
     if ip_address(admission.bind).is_loopback:
-        tell(f"from another machine, first: ssh -L {place}:{place} and the name of this one")
+        print_notice(
+            f"from another machine, first: ssh -L {place}:{place} and the name of this one"
+        )
     else:
-        tell(
+        print_notice(
             f"listening on {admission.bind}: what is heard here crosses the network in the clear, "
             "and so does the token that lets one look; without --bind, only this machine is reached"
         )
@@ -178,7 +180,7 @@ def watch(
     check_allowed(logs)
     newest = last_time(logs)
     if newest is None and start is None and end is None:
-        tell(f"no log in {logs} yet; waiting for a recorder")
+        print_notice(f"no log in {logs} yet; waiting for a recorder")
     if foxglove:
         span = parse_span(start, end)
         troubled = show_in_foxglove(logs, port, bind, origin, span, stop)
@@ -215,7 +217,7 @@ def _show_in_rerun(
         server = opened.enter_context(_server(port, bind, minutes, web=web))
         viewer = None
         if serve:
-            _say_where(server.url, bind)
+            _report_address(server.url, bind)
         else:
             viewer = opened.enter_context(_open(server.url, port, web=web))
             Thread(target=_wait_until_closed, args=(viewer, stop), daemon=True).start()
@@ -247,17 +249,19 @@ def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
     return viewer
 
 
-def _say_where(url: str, bind: str | None) -> None:
+def _report_address(url: str, bind: str | None) -> None:
     from urllib.parse import urlsplit
 
     from hearthlog.analyzer.review.viewer.process import hidden_options
 
     place = urlsplit(url).netloc
-    tell(f"look with: rerun {hidden_options()} --connect {url}")
+    print_notice(f"look with: rerun {hidden_options()} --connect {url}")
     if bind is None:
-        tell(f"from another machine, first: ssh -L {place}:{place} and the name of this one")
+        print_notice(
+            f"from another machine, first: ssh -L {place}:{place} and the name of this one"
+        )
     else:
-        tell(
+        print_notice(
             f"listening on {bind}: whoever reaches this port, perhaps a web page in a browser, "
             "sees what is heard here; without --bind, only those who log in to this machine do"
         )
@@ -278,7 +282,7 @@ def _follow(
     from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.follow import follow_messages
 
-    damaged = TellOnce()
+    damaged = ReportOnce()
     live, zone = LiveTimeline(), None
     for path, batch in follow_messages(logs, start=start, stop=stop, damaged=damaged):
         zone = zone or zone_of([logs], timezone)

@@ -80,7 +80,7 @@ class Rooms:
         level = _FLOOR_DBFS[microphone] + rng.uniform(-_FLOOR_SPREAD_DB, _FLOOR_SPREAD_DB)
         self.floor = _noise(rng, level, rng.uniform(0.25, 0.9))
         self.steady: Mapping[str, Float32] = {
-            name: self._heard_steadily(name, rng) for name in _STEADY
+            name: self._steadily_audible(name, rng) for name in _STEADY
         }
         self._responses: dict[str, Float64] = {}
 
@@ -120,7 +120,7 @@ class Rooms:
         lost = attenuation(room, self._microphone)
         return _dulled(response, lost) * 10.0 ** (-lost / 20.0)
 
-    def _heard_steadily(self, name: str, rng: np.random.Generator) -> Float32:
+    def _steadily_audible(self, name: str, rng: np.random.Generator) -> Float32:
         room, level = _STEADY[name]
         lost = attenuation(room, self._microphone)
         hum = 0.7 if name == FRIDGE else 0.0
@@ -184,7 +184,7 @@ _FRAMES_AT_ONCE = 384
 _TINY = 1e-9
 
 
-class HeardSound(NamedTuple):
+class AudibleSound(NamedTuple):
     """A planned sound at the level received by the microphone.
 
     Attributes
@@ -224,7 +224,7 @@ class Composition:
         """
         mix = self._background(first, count)
         for sound in self._sounds(first, first + count):
-            begin, end = max(sound.start, first), min(_heard_until(sound), first + count)
+            begin, end = max(sound.start, first), min(_audible_until(sound), first + count)
             heard = self._wet(sound)[begin - sound.start : end - sound.start]
             mix[begin - first : end - first] += heard * np.float32(self._gain(sound))
         return _quantised(mix)
@@ -233,11 +233,11 @@ class Composition:
         """Begin a stream of the features of the composed sound."""
         return FeatureStream(self, features)
 
-    def heard(self, first: int, count: int) -> Iterator[HeardSound]:
+    def heard(self, first: int, count: int) -> Iterator[AudibleSound]:
         """Yield the sounds that begin in some frames, at their received level."""
         places = np.searchsorted(self._starts, (first, first + count))
         for sound in self.plan.sounds[places[0] : places[1]]:
-            yield HeardSound(sound, np.float64(self._gain(sound) ** 2) * self._loudness(sound)[0])
+            yield AudibleSound(sound, np.float64(self._gain(sound) ** 2) * self._loudness(sound)[0])
 
     def floor_power(self, first: int, count: int) -> Float64:
         """Return the mean square of the steady noise.
@@ -260,7 +260,7 @@ class Composition:
         """
         busy = np.zeros(count, bool)
         for sound in self._sounds(first, first + count):
-            busy[max(sound.start - first, 0) : max(_heard_until(sound) - first, 0)] = True
+            busy[max(sound.start - first, 0) : max(_audible_until(sound) - first, 0)] = True
         for gains in self._gains(first, count).values():
             busy |= (gains[:-1] != gains[1:]) | ~np.isin(gains[1:], (0.0, 1.0))
         return busy
@@ -309,7 +309,7 @@ class Composition:
         """Find the audible sounds in some frames, in the order of the plan."""
         places = np.searchsorted(self._starts, (first - self._reach, end))
         near = self.plan.sounds[places[0] : places[1]]
-        return [sound for sound in near if _heard_until(sound) > first]
+        return [sound for sound in near if _audible_until(sound) > first]
 
     def _wet(self, sound: PlannedSound) -> Float32:
         """Return a sound as received, shape (frames, FRAME_SAMPLES), for a level of 0 dBFS."""
@@ -393,7 +393,7 @@ class FeatureStream:
         return self._tables[state]
 
 
-def _heard_until(sound: PlannedSound) -> int:
+def _audible_until(sound: PlannedSound) -> int:
     return sound.end + TAIL_FRAMES
 
 

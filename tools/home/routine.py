@@ -149,7 +149,7 @@ class _Day:
         for _ in range(rng.poisson(_DAY_COUGHS)):
             self._at(rng.uniform(up, bed), self._cough, LIVING_ROOM, "day")
         for _ in range(rng.poisson(3.0)):
-            self._at(rng.uniform(6.0, 23.0), self._hear_outside)
+            self._at(rng.uniform(6.0, 23.0), self._add_outside_sounds)
         self._some(0.06, rng.uniform(10.0, 21.0), self._despair)
         self._at(bed, self._go_to_bed)
         for seconds, do in sorted(self._doings, key=lambda doing: doing[0]):
@@ -261,7 +261,7 @@ class _Day:
                 device.sound(LAUGHING if funny else SPEECH, room, origin, origin=origin)
                 device.wait((0.2, 1.2))
 
-    def _hear_outside(self) -> None:
+    def _add_outside_sounds(self) -> None:
         self._outside.wait_until(self._person.now)
         for _ in range(self._rng.integers(1, 6)):
             self._outside.sound(OTHER_NEGATIVE, OUTSIDE, "outside", origin=OUTSIDE)

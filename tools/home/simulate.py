@@ -26,7 +26,7 @@ from hearthlog.schemas.arrays import Float64, Int16, Int64
 from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
-from hearthlog.tools.home.composition import Composition, HeardSound, Rooms, full_scale
+from hearthlog.tools.home.composition import AudibleSound, Composition, Rooms, full_scale
 from hearthlog.tools.home.plan import LIVING_ROOM, PlannedSound
 from hearthlog.tools.home.routine import DAY_FRAMES, plan_short_day
 from hearthlog.tools.home.sounds import LABELS, SimulationError, generator, synthesize
@@ -181,7 +181,7 @@ def truth_of(composition: Composition) -> Truth:
     """Compute the truth of a composition, without composing its sound."""
     events: list[TrueEvent] = []
     runs: list[tuple[int, int, str]] = []
-    held: list[tuple[int, HeardSound]] = []  # sounds that continue into the next day
+    held: list[tuple[int, AudibleSound]] = []  # sounds that continue into the next day
     for first in range(0, composition.plan.frames, DAY_FRAMES):
         count = min(DAY_FRAMES, composition.plan.frames - first)
         begun = enumerate(composition.heard(first, count), start=len(events))
@@ -229,11 +229,11 @@ def _row(event: TrueEvent) -> tuple[object, ...]:
     )
 
 
-def _event(sound: HeardSound) -> TrueEvent:
+def _event(sound: AudibleSound) -> TrueEvent:
     return TrueEvent(sound.plan, float(10.0 * np.log10(sound.power.max() + _TINY)), 0)
 
 
-def _loudest(sounds: list[tuple[int, HeardSound]], floor: Float64, first: int) -> Int64:
+def _loudest(sounds: list[tuple[int, AudibleSound]], floor: Float64, first: int) -> Int64:
     """Return the index of the loudest audible sound in each frame; -1 for none."""
     power = floor * 10.0 ** (_AUDIBLE_DB / 10.0)
     loudest = np.full(len(floor), -1)

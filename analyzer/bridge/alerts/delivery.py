@@ -21,7 +21,7 @@ from hearthlog.analyzer.bridge.state import BridgeError, secret_path
 from hearthlog.analyzer.extras import remedy
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.files import exposed_secret, read_whole
+from hearthlog.schemas.files import exposed_secret, read_limited
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import private_folder, replaced_file
 
@@ -123,7 +123,7 @@ class Outbox:
             key=lambda notification: notification.time,
         )
 
-    def note_told(self, target: str, notification: Notification) -> None:
+    def record_delivery(self, target: str, notification: Notification) -> None:
         """Record a delivery; a notification that all targets have is removed."""
         with self._lock:
             waiting = self._waiting.get(notification.id)
@@ -174,7 +174,7 @@ class Outbox:
 
     def _load(self, path: Path) -> None:
         try:
-            waiting = _waiting(json.loads(read_whole(path, "alert", _LONGEST, LogError)))
+            waiting = _waiting(json.loads(read_limited(path, "alert", _LONGEST, LogError)))
             if waiting.notification.id != path.name.removesuffix(_SUFFIX):
                 raise ValueError
         except _DAMAGED:
@@ -303,7 +303,7 @@ def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
         importlib.invalidate_caches()  # Apprise may have been installed since the last call
         import apprise  # noqa: PLC0415
 
-        text = _text(read_whole(file, "file of addresses", _LIMIT, BridgeError))
+        text = _text(read_limited(file, "file of addresses", _LIMIT, BridgeError))
     except BridgeError as error:
         return Addresses([], [str(error)], [])
     except ModuleNotFoundError as error:
@@ -451,7 +451,7 @@ class Delivery:
                     "again, a quarter of an hour apart at most"
                 )
                 return told, True
-            self._outbox.note_told(target.name, notification)
+            self._outbox.record_delivery(target.name, notification)
             told += 1
         return told, False
 

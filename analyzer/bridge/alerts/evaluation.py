@@ -94,11 +94,11 @@ def events_of_rule(rule: SoundRule, heard: HomeActivity) -> SoundEvents:
     least = round(rule.least_seconds * NANOSECONDS)
     if not least:
         return SoundEvents(starts, ends, starts, spans)
-    counted, long_enough = _times_heard(spans, firsts, least)
+    counted, long_enough = _listened_times(spans, firsts, least)
     return SoundEvents(starts[long_enough], ends[long_enough], counted[long_enough], spans)
 
 
-def _times_heard(spans: Spans, firsts: Int64, least: int) -> tuple[Int64, Int64]:
+def _listened_times(spans: Spans, firsts: Int64, least: int) -> tuple[Int64, Int64]:
     """Return when each group of spans reaches a total length, and the groups that reach it."""
     lengths = spans.ends - spans.starts
     sums = np.cumsum(lengths)

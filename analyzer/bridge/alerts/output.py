@@ -48,7 +48,7 @@ from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings
 from hearthlog.analyzer.bridge.state import BridgeError, secret_path
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import log_name
@@ -86,7 +86,7 @@ class RuleProgressStore:
         known = {}
         try:
             if self._path.exists():
-                content = json.loads(read_whole(self._path, "memory", _LIMIT, LogError))
+                content = json.loads(read_limited(self._path, "memory", _LIMIT, LogError))
                 known = {name: _progress(each) for name, each in content.items()}
         except _DAMAGED:
             self._say(f"{self._path}: cannot be read; all rules begin anew")
@@ -115,7 +115,7 @@ class KnownLines:
         self.names: list[str] = []
         try:
             if path.exists():
-                content = json.loads(read_whole(path, "memory", _LIMIT, LogError))
+                content = json.loads(read_limited(path, "memory", _LIMIT, LogError))
                 self.names = [str(name) for name in content]
         except _DAMAGED:
             say(f"{path}: cannot be read; whoever is on an edited line may be told twice")
@@ -315,7 +315,7 @@ class AlertsOutput:
                 self._labels.append((microphone.name, label, microphone.classes))
         self._has_news.set()
         if self._on_notification is not None:
-            while self._tell_broker(self._on_notification):
+            while self._publish_ring(self._on_notification):
                 pass
 
     def close(self) -> None:
@@ -324,7 +324,7 @@ class AlertsOutput:
         self._thread.join(_CLOSE_SECONDS)
         self._delivery.close()
 
-    def _tell_broker(self, on_notification: OnNotification) -> bool:
+    def _publish_ring(self, on_notification: OnNotification) -> bool:
         """Offer one notification to the broker, repeatedly; return whether it was taken."""
         if self._told_now is None:
             waiting = self._outbox.waiting_for(BROKER, time.time_ns())
@@ -335,7 +335,7 @@ class AlertsOutput:
         notification, text = self._told_now
         is_taken = on_notification(notification.rule, text, notification.time)
         if is_taken:
-            self._outbox.note_told(BROKER, notification)
+            self._outbox.record_delivery(BROKER, notification)
             self._told_now = None
         return is_taken
 
@@ -431,9 +431,9 @@ class AlertsOutput:
                 self._heard.add_label(name, label, classes)
         self._watch.evaluate(self._heard.heard, self._weeks, self._heard.known_until(now), now)
         if time.monotonic() - self._began >= _WAIT_SECONDS:
-            self._say_unknown_classes()
+            self._report_unknown_classes()
 
-    def _say_unknown_classes(self) -> None:
+    def _report_unknown_classes(self) -> None:
         for rule in self._rules:
             if text := unknown_class(rule, self._heard.classes):
                 self._say(f"alerts: {text}")

@@ -17,7 +17,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from hearthlog.analyzer.bridge.settings import MqttSettings
 from hearthlog.analyzer.bridge.state import BridgeError, secret_path
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 
 _KEEPALIVE = 20  # seconds: the broker drops a client that is silent for 1.5 times as long
 _QUEUED = 1000  # messages waiting for the broker, and events waiting for a connection
@@ -304,7 +304,9 @@ def tls_context(settings: MqttSettings) -> ssl.SSLContext:
     ca, certificate, key = paths = [getattr(settings, name) for name in names]
     for path in paths:
         if path is not None:
-            read_whole(path, "certificate", _LARGEST_CERTIFICATE, BridgeError)  # a pipe would hang
+            read_limited(
+                path, "certificate", _LARGEST_CERTIFICATE, BridgeError
+            )  # a pipe would hang
     try:
         context = ssl.create_default_context(cafile=ca)
         if ca is not None:
@@ -332,7 +334,7 @@ def read_password(settings: MqttSettings) -> str | None:
     if settings.password_file is None:
         return None
     path = secret_path(settings.password_file)
-    data = read_whole(path, "password file", _LONGEST_PASSWORD, BridgeError)
+    data = read_limited(path, "password file", _LONGEST_PASSWORD, BridgeError)
     try:
         return data.decode().split("\n", 1)[0].rstrip("\r")
     except UnicodeDecodeError:

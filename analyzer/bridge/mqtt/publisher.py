@@ -14,7 +14,7 @@ from paho.mqtt.client import MQTTMessage
 
 from hearthlog.analyzer.bridge.events import ANY_SOUND, SoundEvent
 from hearthlog.analyzer.bridge.home import RecorderAddress, iso_time
-from hearthlog.analyzer.bridge.home_state import EnoughHeard, HomeState, LiveMicrophone
+from hearthlog.analyzer.bridge.home_state import HomeState, ListeningThreshold, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.connection import Connection, place_of
 from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     command_discovery,
@@ -116,9 +116,9 @@ class MqttPublisher:
             if each.classes != self._classes.get(each.name, []):
                 self._describe(each)
             self._leave_out_again(each.classes)
-            self._say_state(each, news)
+            self._publish_state(each, news)
             if each.name in news.state.microphones:
-                self._say_problem(each, news.state)
+                self._publish_problem(each, news.state)
         self._clear_gone(news.state)
         self._describe_switches()
         self._begun += news.begun
@@ -126,8 +126,8 @@ class MqttPublisher:
         if self._connection.is_ready():
             self._was_ready = True
             self._announced.save()  # before publishing retained values that must be cleared later
-            self._say_muted()
-            self._tell_begun(news)
+            self._report_muted()
+            self._publish_begun(news)
             self._send_events("event_ended", self._recent(self._ended, news), news)
         self._obey(news.state)
         if self._is_born:
@@ -137,7 +137,7 @@ class MqttPublisher:
         if self._was_ready or not self._reads_back:
             self._announced.save()
 
-    def _tell_begun(self, news: News) -> None:
+    def _publish_begun(self, news: News) -> None:
         """Publish the events that began, except those that an earlier bridge published."""
         events = self._announced.new_events(self._recent(self._begun, news))
         self._send_events("event", events, news)
@@ -237,7 +237,7 @@ class MqttPublisher:
     def _discovery_topic(self, device: str) -> str:
         return f"{self._settings.discovery_topic}/device/{device}/config"
 
-    def _say_muted(self) -> None:
+    def _report_muted(self) -> None:
         """Report the muted classes once, and how to unmute them."""
         muted = self._announced.muted()
         if muted and not self._has_said_muted:
@@ -312,7 +312,7 @@ class MqttPublisher:
         classes = self._classes.get(microphone)
         return bool(label) and classes is not None and label not in classes
 
-    def _say_state(self, microphone: LiveMicrophone, news: News) -> None:
+    def _publish_state(self, microphone: LiveMicrophone, news: News) -> None:
         def say(kind: str, value: str) -> None:
             self._keep(Place(kind, microphone.name), value)
 
@@ -334,7 +334,7 @@ class MqttPublisher:
                 shown = value if is_told or kind != "on" else _ON[False]
                 self._keep(Place(kind, microphone.name, label), shown)
 
-    def _say_problem(self, microphone: LiveMicrophone, state: HomeState) -> None:
+    def _publish_problem(self, microphone: LiveMicrophone, state: HomeState) -> None:
         others = state.microphones.keys() - {microphone.name}
         bad = [
             f"{subject}: {health.text}"
@@ -346,7 +346,7 @@ class MqttPublisher:
 
 
 def class_values(
-    microphone: LiveMicrophone, label: str, news: News, known: EnoughHeard
+    microphone: LiveMicrophone, label: str, news: News, known: ListeningThreshold
 ) -> Iterator[tuple[str, str]]:
     """Yield the retained values of a class: the kind of topic, and the value."""
     yield "on", _ON[microphone.heard.is_heard(label)]

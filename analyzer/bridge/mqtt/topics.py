@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hearthlog.analyzer.bridge.events import SoundEvent
 from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.files import read_whole
+from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.new_files import (
     create_file,
     open_lock,
@@ -292,7 +292,7 @@ class RetainedTopics:
 
     def _load(self, path: Path) -> _Content:
         try:
-            data = read_whole(path, "memory of what was published", _LIMIT, LogError)
+            data = read_limited(path, "memory of what was published", _LIMIT, LogError)
             return _Content.model_validate_json(data)
         except (HearthlogError, ValidationError):
             self._say(f"mqtt: {path}: cannot be read, and begins anew; all classes are told of")

@@ -27,7 +27,7 @@ from hearthlog.analyzer.bridge.home import (
     told,
     when,
 )
-from hearthlog.analyzer.bridge.home_state import EnoughHeard, HomeState, LiveMicrophone
+from hearthlog.analyzer.bridge.home_state import HomeState, ListeningThreshold, LiveMicrophone
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
@@ -72,7 +72,7 @@ class CurrentSounds:
         words = _sentence(microphone)
         last = self._last.get(microphone.name)
         if last is None or last.words != words:
-            since = _known_since(microphone) or (news.today.now if last is not None else 0)
+            since = _active_since(microphone) or (news.today.now if last is not None else 0)
             last = self._last[microphone.name] = _Heard(words, since)
         shown = f"since {when(last.since, news.today.now, news.zone)}" if last.since else ""
         health = news.state.health.get(microphone.name)
@@ -89,13 +89,13 @@ class CurrentSounds:
 def _sentence(microphone: LiveMicrophone) -> str:
     if not microphone.is_listening():
         return _NOT_LISTENING
-    names = [class_words(label) for label in heard_classes(microphone)]
+    names = [class_words(label) for label in active_classes(microphone)]
     if names:
         return listed([names[0], *map(str.lower, names[1:])], "and")
     return "A sound" if microphone.heard.is_heard(ANY_SOUND) else in_words(SILENCE)
 
 
-def heard_classes(microphone: LiveMicrophone) -> list[str]:
+def active_classes(microphone: LiveMicrophone) -> list[str]:
     """Return the active classes except silence, in the order of the model."""
     return [
         label
@@ -104,11 +104,11 @@ def heard_classes(microphone: LiveMicrophone) -> list[str]:
     ]
 
 
-def _known_since(microphone: LiveMicrophone) -> int:
+def _active_since(microphone: LiveMicrophone) -> int:
     """Return the start of the microphone's current state, from the log; 0 if unknown."""
     if not microphone.is_listening():
         return microphone.heard.time
-    heard = heard_classes(microphone)
+    heard = active_classes(microphone)
     if heard:
         last = [microphone.last_event(label) for label in heard]
         end = microphone.heard.time - _GOES_ON
@@ -267,7 +267,7 @@ def scenario_lines(news: News) -> list[Any]:
 def _now(own: LiveMicrophone) -> str:
     if not own.is_listening():
         return "not listening"
-    return listed([class_words(label).lower() for label in heard_classes(own)], "and") or "nothing"
+    return listed([class_words(label).lower() for label in active_classes(own)], "and") or "nothing"
 
 
 def _today(own: LiveMicrophone, midnight: int) -> str:
@@ -332,7 +332,7 @@ def _room(microphone: LiveMicrophone, day: DaySpan, today: Today) -> Any:
 
 
 def _lane(
-    microphone: LiveMicrophone, label: str, day: DaySpan, today: Today, known: EnoughHeard
+    microphone: LiveMicrophone, label: str, day: DaySpan, today: Today, known: ListeningThreshold
 ) -> Any:
     count, night = microphone.counts(label, today, known)
     last = microphone.last_event(label)

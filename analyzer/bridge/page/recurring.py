@@ -80,7 +80,7 @@ def _described(key: str, group: GroupSummary, said: str, moment: Moment, *, is_a
         "words": group_words(group),
         "is_named": bool(group.name),
         "about": _how_often(group),
-        "heard": _heard_as(group),
+        "heard": _named_as(group),
         "listen": f"For instance {_examples(group, moment, is_alone=is_alone)}",
         "said": said,
     }
@@ -94,7 +94,7 @@ def _how_often(group: GroupSummary) -> str:
     return f"{often[0].upper()}{often[1:]} on {days}{usual}, {length(group.seconds)} each"
 
 
-def _heard_as(group: GroupSummary) -> str:
+def _named_as(group: GroupSummary) -> str:
     labels = [*group.labels.items()][:_LABELS]
     told = [f"{class_words(label)} ({100 * share:.0f}{_SPACE}%)" for label, share in labels]
     return f"Heard as {listed(told)}" if told else ""

@@ -164,7 +164,7 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
             add_to_plot(part, entity, canvas, strokes)
 
 
-def draw_asked(number: int, start: int, end: int, text: str, canvas: Canvas) -> None:
+def draw_requested(number: int, start: int, end: int, text: str, canvas: Canvas) -> None:
     """Draw the requested span, in place of the previous one.
 
     Parameters
@@ -414,7 +414,7 @@ def review_layout(
     ends = (clock.shown(time) for time in (timeline.grid.start, timeline.grid.end))
     boundaries = (Boundary.absolute(nanos=time) for time in ends)
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
-    asked: list[Row] = [(_ASKED_HEIGHT, _asked_view())]
+    asked: list[Row] = [(_ASKED_HEIGHT, _requested_view())]
     whole = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     return TimelineBlueprint([*(asked if close_up else []), whole], panel, *boundaries)
 
@@ -467,7 +467,7 @@ def _by_title(plots: Sequence[Plot]) -> list[list[Plot]]:
     return [[plot for plot in plots if plot.kind.title == title] for title in titles]
 
 
-def _asked_view() -> rrb.Container:
+def _requested_view() -> rrb.Container:
     lane = _time_series("Which span is asked", [ASKED], (0.0, 1.0))
     return rrb.Horizontal(_text(ASKED_WORDS), lane, column_shares=_COLUMNS)
 

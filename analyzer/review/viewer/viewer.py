@@ -18,9 +18,9 @@ from hearthlog.analyzer.review.viewer.drawing import (
     SHARED_AXIS,
     DrawnLane,
     draw,
-    draw_asked,
     draw_close_up,
     draw_frames,
+    draw_requested,
     review_layout,
     write_checked,
 )
@@ -186,7 +186,7 @@ class Viewer:
 
     def ask(self, start: int, end: int, text: str) -> None:
         """Draw the requested span, in place of the previous one."""
-        draw_asked(self._asked, start, end, text, self._canvas)
+        draw_requested(self._asked, start, end, text, self._canvas)
         self._asked += 1
         self._flush()
 

@@ -9,7 +9,7 @@ from sklearn.svm import OneClassSVM
 
 from hearthlog.analyzer.training.learned_inputs import (
     fitted_scaler,
-    in_whole_steps,
+    rounded_to_steps,
     scaler_arrays,
 )
 from hearthlog.analyzer.training.window_method import WindowMethod, as_room
@@ -81,7 +81,7 @@ class OneClassMethod(WindowMethod):
     ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
         """Learn from windows, as of `WindowMethod.learn`."""
         scaler = fitted_scaler(inputs)
-        scaled = in_whole_steps(scaler, self.steps).transform(inputs.astype(np.float64))
+        scaled = rounded_to_steps(scaler, self.steps).transform(inputs.astype(np.float64))
         gamma = self.gamma / inputs.shape[1]
         places, coefficients, offsets = [], [], []
         for number in range(target.max() + 1):

@@ -22,8 +22,8 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import rows_by_layout
 from hearthlog.schemas.messages.topics import is_review, parse_topic
 from hearthlog.schemas.messages.type_definitions import MessageType, message_type
+from hearthlog.schemas.salvage.intact_records import IntactAttachment, IntactChunk
 from hearthlog.schemas.salvage.salvage import Salvage
-from hearthlog.schemas.salvage.whole_records import WholeAttachment, WholeChunk
 
 _TIME = "builtin_interfaces/msg/Time"
 _SPAN = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])  # of a stamp, and of a duration
@@ -180,12 +180,12 @@ class ShiftedLog:
             writer.start(self._profile, self._library)
             defined: set[tuple[type, int]] = set()
             for piece in self._pieces:
-                if isinstance(piece, WholeChunk):
+                if isinstance(piece, IntactChunk):
                     self._define(writer, piece, defined)
                     writer.copy_chunk(next(chunks))
                 elif isinstance(piece, Metadata):
                     writer.add_metadata(piece.name, edit(piece, fewer))
-                elif isinstance(piece, WholeAttachment):
+                elif isinstance(piece, IntactAttachment):
                     _copy_attachment(writer, piece, time)
             if self._complete:
                 definitions = self._definitions
@@ -202,8 +202,8 @@ class ShiftedLog:
         self._chunks: list[tuple[StoredChunk, int, dict[int, tuple[int, int]]]] = []
         base = end = 0
         for number, piece in enumerate(self._pieces):
-            if not isinstance(piece, WholeChunk):
-                if not isinstance(piece, Metadata | WholeAttachment):
+            if not isinstance(piece, IntactChunk):
+                if not isinstance(piece, Metadata | IntactAttachment):
                     raise LogError(f"{path}: has messages outside of chunks, and is not copied")
                 continue
             stored, places = piece.stored, {}
@@ -282,7 +282,7 @@ class ShiftedLog:
             yield compress_chunk(content.data, span, index)
 
     def _define(
-        self, writer: CountedWriter, piece: WholeChunk, defined: set[tuple[type, int]]
+        self, writer: CountedWriter, piece: IntactChunk, defined: set[tuple[type, int]]
     ) -> None:
         """Write what defines the channels of a chunk before it, unless it stands in it."""
         defined.update((type(record), record.id) for record in piece.definitions[: piece.leading])
@@ -345,7 +345,7 @@ def _spans(nanoseconds: Int64) -> NDArray[Any]:
     return spans
 
 
-def _copy_attachment(writer: CountedWriter, piece: WholeAttachment, time: int) -> None:
+def _copy_attachment(writer: CountedWriter, piece: IntactAttachment, time: int) -> None:
     record = parse(Opcode.ATTACHMENT, piece.record[HEAD.size :])
     assert isinstance(record, Attachment)
     created, logged = (each + time if each else 0 for each in (record.create_time, record.log_time))

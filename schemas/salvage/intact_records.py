@@ -77,7 +77,7 @@ def find_record_heads(window: bytes) -> list[int]:
 _DEFINITIONS_LIMIT = 1 << 19
 
 
-class WholeChunk(NamedTuple):
+class IntactChunk(NamedTuple):
     """Chunk with verified content, and its definitions."""
 
     stored: StoredChunk
@@ -113,14 +113,14 @@ class UnknownRecord(NamedTuple):
     data: tuple[int, int]  # start and end offset of the record in the file
 
 
-class WholeAttachment(NamedTuple):
+class IntactAttachment(NamedTuple):
     """Attachment of a file, with its index entry."""
 
     record: bytes
     index_record: records.AttachmentIndex
 
 
-class WholeRecord(NamedTuple):
+class IntactRecord(NamedTuple):
     """Complete record."""
 
     offset: int
@@ -131,7 +131,7 @@ class WholeRecord(NamedTuple):
     proved: bool = True  # False: there is no checksum, so its content may be wrong
 
 
-Whole = WholeChunk | LargeChunk | WholeAttachment | LargeAttachment | UnknownRecord
+Whole = IntactChunk | LargeChunk | IntactAttachment | LargeAttachment | UnknownRecord
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:
@@ -165,7 +165,7 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
     return np.frombuffer(messages, np.int64), np.frombuffer(definitions, np.int64)
 
 
-def without_late(chunk: WholeChunk, content: bytes, messages: Int64) -> WholeChunk:
+def without_late(chunk: IntactChunk, content: bytes, messages: Int64) -> IntactChunk:
     """Remove the messages with log times after `LAST_TIME` from a chunk.
 
     Parameters
@@ -186,7 +186,9 @@ def without_late(chunk: WholeChunk, content: bytes, messages: Int64) -> WholeChu
     return chunk._replace(stored=stored, late=counts)
 
 
-def with_definitions(chunk: WholeChunk, content: bytes, starts: Int64) -> tuple[WholeChunk, bytes]:
+def with_definitions(
+    chunk: IntactChunk, content: bytes, starts: Int64
+) -> tuple[IntactChunk, bytes]:
     """Rewrite the definitions of a chunk; return the chunk and its content.
 
     Parameters
@@ -290,7 +292,7 @@ class AttachmentHead(NamedTuple):
         return self.first + self.index_record.data_size
 
 
-def read_attachment(raw: bytes) -> tuple[WholeAttachment, bool]:
+def read_attachment(raw: bytes) -> tuple[IntactAttachment, bool]:
     """Parse an attachment record; also return whether a text in it is not UTF-8.
 
     Raise `McapError` if its checksum is wrong.
@@ -302,7 +304,7 @@ def read_attachment(raw: bytes) -> tuple[WholeAttachment, bool]:
     head = attachment_head(raw)
     if head.escaped:
         raw = b"".join(encode_attachment(head.index_record, [record[head.first : head.end]]))
-    return WholeAttachment(raw, head.index_record), head.escaped
+    return IntactAttachment(raw, head.index_record), head.escaped
 
 
 def attachment_head(raw: bytes) -> AttachmentHead:
