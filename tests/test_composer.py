@@ -28,8 +28,15 @@ from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary, frame_powers
 from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, Rooms
-from hearthlog.tools.home.plan import HomePlan, PlannedNoise, PlannedSound
-from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days, plan_short_day
+from hearthlog.tools.home.routine import (
+    DAY_FRAMES,
+    Habits,
+    HomePlan,
+    PlannedNoise,
+    PlannedSound,
+    plan_days,
+    plan_short_day,
+)
 from hearthlog.tools.home.simulate import record_composition, truth_of, write_sound
 
 HOUR = DAY_FRAMES // 24

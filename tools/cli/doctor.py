@@ -93,7 +93,7 @@ def _network_changes(paths: list[Path]) -> list[str]:
 def _write_bundle(bundle: Path, folder: Path) -> None:
     from zipfile import ZIP_DEFLATED, ZipFile
 
-    from hearthlog.analyzer.support import support_bundle
+    from hearthlog.analyzer.recorder_status import support_bundle
     from hearthlog.schemas.new_files import new_file
 
     check_output("--bundle", bundle, ".zip", "a bundle")

@@ -321,7 +321,7 @@ def install_service(
     It is checked first what the service will find. Given again it writes the unit anew, and starts
     the recorder again: the log is completed, and the next one says in a gap what was not heard.
     """
-    from hearthlog.tools.service.install import install_for_system, install_for_user
+    from hearthlog.tools.service.unit import install_for_system, install_for_user
 
     if user and (bridge or account is not None):
         wrong_use("--account and --bridge are of the service of the machine; --user runs as you")
@@ -343,7 +343,7 @@ def install_service(
 
 
 def _install_bridge(config: Path | None, account: str | None) -> None:
-    from hearthlog.tools.service.install import install_bridge
+    from hearthlog.tools.service.unit import install_bridge
 
     if config is None:
         wrong_use("--bridge wants --config, with a table such as [bridge.mqtt]")

@@ -11,7 +11,7 @@ from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int16
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.home.clips import ArrayCache, ClipLibrary, frame_powers
-from hearthlog.tools.home.plan import (
+from hearthlog.tools.home.routine import (
     BATHROOM,
     BEDROOM,
     FAN,

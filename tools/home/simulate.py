@@ -27,8 +27,7 @@ from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import AudibleSound, Composition, Rooms, full_scale
-from hearthlog.tools.home.plan import LIVING_ROOM, PlannedSound
-from hearthlog.tools.home.routine import DAY_FRAMES, plan_short_day
+from hearthlog.tools.home.routine import DAY_FRAMES, LIVING_ROOM, PlannedSound, plan_short_day
 from hearthlog.tools.home.sounds import LABELS, SimulationError, generator, synthesize
 
 _PUSHED_FRAMES = 200  # as from `FileSource`, after a health report

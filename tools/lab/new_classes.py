@@ -33,7 +33,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
-from hearthlog.tools.home.plan import LEVELS, LIVING_ROOM, RESIDENT, HomePlan, PlannedSound
+from hearthlog.tools.home.routine import LEVELS, LIVING_ROOM, RESIDENT, HomePlan, PlannedSound
 from hearthlog.tools.home.simulate import record_composition, truth_of
 from hearthlog.tools.lab.adaptation import wrong_sounds
 from hearthlog.tools.lab.command import run

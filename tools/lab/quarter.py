@@ -26,8 +26,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
-from hearthlog.tools.home.plan import LIVING_ROOM, HomePlan
-from hearthlog.tools.home.routine import DAY_FRAMES, Habits, plan_days
+from hearthlog.tools.home.routine import DAY_FRAMES, LIVING_ROOM, Habits, HomePlan, plan_days
 from hearthlog.tools.home.simulate import record_composition, truth_of
 from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.lab.bench.timing import HEARTHLOG

@@ -21,7 +21,7 @@ from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unifie
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.tools.home.plan import RADIO, TELEVISION
+from hearthlog.tools.home.routine import RADIO, TELEVISION
 from hearthlog.tools.lab.command import run
 
 MEASURED = Path(__file__).with_suffix(".csv")

@@ -10,7 +10,7 @@ from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.arrays import Int16
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.composition import Rooms
-from hearthlog.tools.home.plan import LIVING_ROOM
+from hearthlog.tools.home.routine import LIVING_ROOM
 from hearthlog.tools.lab.bench.timing import BenchError
 
 DENSE, QUIET, NIGHT = KINDS = ("dense", "quiet", "night")

@@ -12,8 +12,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
-from hearthlog.tools.home.plan import LIVING_ROOM, ROOMS
-from hearthlog.tools.home.routine import Habits, plan_days
+from hearthlog.tools.home.routine import LIVING_ROOM, ROOMS, Habits, plan_days
 from hearthlog.tools.home.simulate import (
     embedder_of,
     record_composition,
