@@ -426,6 +426,18 @@ def test_any_division_of_the_time_gives_the_same_rings(life):
         assert (found, state) == at_once
 
 
+def test_a_rule_of_any_sound_says_when_the_first_of_them_began_however_it_is_evaluated():
+    activity = home((0, 60, "music"), (70, 1500, "coughing"))
+    one = rule("longer_than", longer_than="20m", pause="3m")
+    (at_once,), _ = notifications(one, activity, NOON, NOON + HOUR * SECOND, UTC)
+    cut = NOON + 1000 * SECOND
+    _, state = notifications(one, activity.between(0, cut, LONGEST_PAUSE), NOON, cut, UTC)
+    end = NOON + HOUR * SECOND
+    later = activity.between(cut - history(one), end, LONGEST_PAUSE)
+    assert notifications(one, later, cut, end, UTC, state)[0] == [at_once]
+    assert at_once.text.endswith("since 12:00")
+
+
 def test_a_sound_that_pauses_where_one_evaluation_ends_rings_once():
     heard = home((0, 100, "music"), (105, 100, "music"))
     one = rule("longer_than", longer_than="1m", cooldown="1m")

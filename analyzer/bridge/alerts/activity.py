@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from pathlib import Path
 
@@ -40,21 +40,6 @@ class Sounds:
             self.starts[rows], self.ends[rows], self.confidences[rows], self.microphones[rows]
         )
 
-    def between(self, start: int, end: int, pause: int) -> "Sounds":
-        """Return the segments in a time span, with the complete events ongoing at its start.
-
-        Parameters
-        ----------
-        pause : int
-            Longest pause within an event, in nanoseconds.
-        """
-        own = self.rows(self.starts < end)
-        own = Sounds(own.starts, np.minimum(own.ends, end), own.confidences, own.microphones)
-        events = joined(own.starts, own.ends, pause)
-        first = np.searchsorted(events.ends, start)
-        begin = events.starts[first] if first < len(events.starts) else end
-        return own.rows(own.starts >= begin)
-
 
 NO_SOUNDS = Sounds(NONE.starts, NONE.ends, np.empty(0, np.float32), np.empty(0, object))
 
@@ -70,6 +55,25 @@ def sounds_of(parts: Iterable[Sounds]) -> Sounds:
     ]
     order = np.argsort(columns[0], kind="stable")
     return Sounds(*(column[order] for column in columns))
+
+
+def _between(classes: Iterable[Sounds], start: int, end: int, pause: int) -> list[Sounds]:
+    """Return segments of classes in a time span, with the complete events ongoing at its start.
+
+    An event has sounds of any class, as in a rule of any sound: such a rule needs its start too.
+
+    Parameters
+    ----------
+    pause : int
+        Longest pause within an event, in nanoseconds.
+    """
+    own = [sounds.rows(sounds.starts < end) for sounds in classes]
+    own = [replace(sounds, ends=np.minimum(sounds.ends, end)) for sounds in own]
+    every = sounds_of(own)
+    events = joined(every.starts, every.ends, pause)
+    first = np.searchsorted(events.ends, start)
+    begin = events.starts[first] if first < len(events.starts) else end
+    return [sounds.rows(sounds.starts >= begin) for sounds in own]
 
 
 @dataclass(frozen=True)
@@ -134,12 +138,13 @@ class HomeActivity:
         pause : int
             Longest pause within an event, in nanoseconds.
         """
+        recent = _between(
+            [*self.sounds.values(), *self.scenario_sounds.values()], start, end, pause
+        )
+        count = len(self.sounds)
         return HomeActivity(
-            {label: sounds.between(start, end, pause) for label, sounds in self.sounds.items()},
-            {
-                label: sounds.between(start, end, pause)
-                for label, sounds in self.scenario_sounds.items()
-            },
+            dict(zip(self.sounds, recent[:count], strict=True)),
+            dict(zip(self.scenario_sounds, recent[count:], strict=True)),
             {name: cut(spans, start, end) for name, spans in self.coverage.items()},
             self.classes,
             cut(self.written, start, end),
@@ -307,9 +312,11 @@ class SegmentCollector:
         pause : int
             Longest pause within an event, in nanoseconds.
         """
-        for rows in (*self._rows.values(), *self._scenario_rows.values()):
-            if rows.starts:
-                rows.keep(rows.sounds().between(time, 1 << 62, pause))
+        classes = [*self._rows.values(), *self._scenario_rows.values()]
+        recent = _between([rows.sounds() for rows in classes], time, 1 << 62, pause)
+        for rows, sounds in zip(classes, recent, strict=True):
+            if len(sounds.starts) < len(rows.starts):
+                rows.keep(sounds)
         for own in (*self._coverage.values(), self._written):
             own.forget_before(time)
 
