@@ -65,11 +65,13 @@ class LabelMap:
         Broad categories are ignored. The others must all have the same label; a category outside
         the map becomes `other_negative`, or its own name.
         """
-        told = [name for name in categories if name not in self.broad]
-        detail = " + ".join(sorted(set(told)))
-        labels = {self.label_of.get(name, name if self.keep else OTHER_NEGATIVE) for name in told}
-        skipped = [name for name in told if name in self.skip]
-        if not told:
+        specific = [name for name in categories if name not in self.broad]
+        detail = " + ".join(sorted(set(specific)))
+        labels = {
+            self.label_of.get(name, name if self.keep else OTHER_NEGATIVE) for name in specific
+        }
+        skipped = [name for name in specific if name in self.skip]
+        if not specific:
             return Decision("", "", BROAD)
         if skipped:
             return Decision("", skipped[0], SKIPPED)
@@ -172,9 +174,9 @@ def labelled_parts(
         Length of the file; infinite if unknown.
     """
     decided = [(sound, label_map.decide(sound.categories)) for sound in sounds]
-    told = [(sound, what) for sound, what in decided if what.reason != BROAD]
+    specific = [(sound, what) for sound, what in decided if what.reason != BROAD]
     covered: dict[str, list[_Span]] = {}
-    for sound, what in told:
+    for sound, what in specific:
         covered.setdefault(what.label, []).append((sound.start, sound.end))
     joined = {label: _joined(spans) for label, spans in covered.items()}
     alone: dict[str, list[tuple[_Span, str]]] = {}

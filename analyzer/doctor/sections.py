@@ -471,12 +471,12 @@ class SummarySection:
         if differing:
             self._error("statistics", f"the statistics say {'; '.join(differing)}", offset)
 
-    def _count(self, kind: type, defined: Iterable[int], said: int) -> int:
+    def _count(self, kind: type, defined: Iterable[int], stated: int) -> int:
         """Count definitions; writers may omit definitions that are only in the summary."""
         none = {0} if kind is Schema else set()  # schema 0 means that a channel has none
         in_data = set(defined) - none
-        if said == len(in_data):  # libmcap omits them, and so does `ros2 bag record`
-            return said
+        if stated == len(in_data):  # libmcap omits them, and so does `ros2 bag record`
+            return stated
         return len((in_data | self._copies[kind].keys()) - none)
 
     def _check_offsets(self) -> None:

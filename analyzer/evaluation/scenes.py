@@ -379,8 +379,8 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
                     )
                 )
     each = [evaluate_labelling(truth, found, model.classes) for truth, found in scenes]
-    true, said = (_apart(same) for same in zip(*scenes, strict=True))
-    whole = evaluate_labelling(true, said, model.classes)
+    true, predicted = (_apart(same) for same in zip(*scenes, strict=True))
+    whole = evaluate_labelling(true, predicted, model.classes)
     return ScenesEvaluation(
         scores=whole.scores,
         detections=whole.detections,

@@ -194,8 +194,8 @@ class LabelChanges:
 
     def pairs(self) -> list[LabelChange]:
         """Return the changes of half a minute or more, the longest first."""
-        told = (self.minutes >= _LEAST_MINUTES) & ~np.eye(len(self.classes), dtype=bool)
-        places = np.argwhere(told)
+        reported = (self.minutes >= _LEAST_MINUTES) & ~np.eye(len(self.classes), dtype=bool)
+        places = np.argwhere(reported)
         changes = [
             LabelChange(self.classes[i], self.classes[j], float(self.minutes[i, j]), self.each)
             for i, j in places.tolist()

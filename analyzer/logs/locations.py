@@ -489,20 +489,20 @@ def _looked_up(
     timed = spans["start"] != NEVER
     doubtful = timed & (overlaps(spans["start"], spans["end"], start, end) | ~spans["finished"])
     known: list[int] = logs[timed & ~doubtful].tolist()
-    asked = [index.path(folder, log) for log in logs[~timed].tolist()]
+    untimed = [index.path(folder, log) for log in logs[~timed].tolist()]
     for log in logs[doubtful].tolist():
         path = index.path(folder, log)
         if _is_current(index, log, path):
             known.append(log)
         else:
-            asked.append(path)
+            untimed.append(path)
     for listed in listing.logs:
         found = index.find(listed)
         if found is None or index.spans["start"][found] == NEVER:
-            asked.append(folder.joinpath(*listed.name.split("/")))
+            untimed.append(folder.joinpath(*listed.name.split("/")))
         else:
             known.append(found)
-    return _Known(folder, index, np.array(known, np.int64)), asked
+    return _Known(folder, index, np.array(known, np.int64)), untimed
 
 
 def _is_current(index: SpanIndex, log: int, path: Path) -> bool:

@@ -88,9 +88,9 @@ class Outbox:
         """Copy the delivery state of replaced targets to the new targets (new name to former)."""
         with self._lock:
             for waiting in self._waiting.values():
-                told = {now for now, before in former.items() if before in waiting.told}
-                if told - waiting.told:
-                    waiting.told |= told
+                delivered = {now for now, before in former.items() if before in waiting.told}
+                if delivered - waiting.told:
+                    waiting.told |= delivered
                     self._write(waiting)
 
     def _remove_done(self, now: int) -> None:

@@ -339,13 +339,13 @@ def _lane(
     last_heard = "" if last is None else when(last.end, today.now, day.zone)
     words = class_words(label)
     how_often = "not known" if count is None else times(count)
-    told = f"{words}: {how_often} today" + (f", last at {last_heard}" if count else "")
+    summary = f"{words}: {how_often} today" + (f", last at {last_heard}" if count else "")
     events = microphone.events(label, day.start - 24 * _HOUR)
     return {
         "words": words,
         "colour": colour_on_paper(label),
         "bars": bars((event for event in events if event.end > day.start), day),
-        "told": told,
+        "told": summary,
         "today": count,
         "night": night,
         "last": last_heard,

@@ -96,8 +96,8 @@ def _how_often(group: GroupSummary) -> str:
 
 def _named_as(group: GroupSummary) -> str:
     labels = [*group.labels.items()][:_LABELS]
-    told = [f"{class_words(label)} ({100 * share:.0f}{_SPACE}%)" for label, share in labels]
-    return f"Heard as {listed(told)}" if told else ""
+    shares = [f"{class_words(label)} ({100 * share:.0f}{_SPACE}%)" for label, share in labels]
+    return f"Heard as {listed(shares)}" if shares else ""
 
 
 def _examples(group: GroupSummary, moment: Moment, *, is_alone: bool) -> str:
@@ -144,10 +144,10 @@ class GroupNaming:
         BridgeError
             If another group is being named, or the folder is not writable.
         """
-        asked = ["--undo", str(number)]
+        options = ["--undo", str(number)]
         text = "The name is being taken back …"
         if label:
-            asked = ["--name", f"{number}={label}", "--reviewer", REVIEWER]
+            options = ["--name", f"{number}={label}", "--reviewer", REVIEWER]
             text = (
                 f"Being marked: {class_words(label)}. The box reads all its logs for that, which "
                 "can take many minutes."
@@ -157,7 +157,7 @@ class GroupNaming:
                 raise BridgeError("The box still marks another sound: try again when it is done.")
             if not os.access(self._folder, os.W_OK):
                 raise BridgeError(READ_ONLY)
-            process = self._process = _started([*asked, "--json", "--", str(self._folder)])
+            process = self._process = _started([*options, "--json", "--", str(self._folder)])
             self.said[key] = text
             self._thread = Thread(target=self._follow, args=(process, key, number), daemon=True)
             self._thread.start()
