@@ -370,6 +370,7 @@ _FORMAT: Final = 1
 _FORMAT_OF_EMBEDDINGS: Final = 2  # refused by versions without embedding support
 _LARGEST = 64 << 20  # bytes
 _LARGEST_HEADER = 1 << 20
+_Header = TypeVar("_Header", bound=BaseModel)
 _LEAST_NUMBER, _MOST_NUMBER = 1, (1 << 31) - 1
 _SMALL, _LARGE = 1e-6, 1e6  # limits of radii and scales; all other numbers are at most as large
 _ARRAYS = {"mean": 1, "scale": 1, "axes": 2, "examples": 2, "of": 1, "radii": 1}  # of a space
@@ -414,6 +415,46 @@ def locked_groups(path: Path) -> Iterator[None]:
         yield
 
 
+def write_arrays(path: Path, key: str, arrays: dict[str, NDArray[Any]], head: BaseModel) -> None:
+    """Write a safetensors file of arrays with a header, replacing an existing one.
+
+    Raise `LogError` if it cannot be written.
+    """
+    data = write_sealed(arrays, key, head.model_dump_json(exclude_none=True))
+    with replaced_file(path, readers=log_readers(path.parent)) as temporary:
+        temporary.write_bytes(data)
+
+
+def read_arrays(
+    path: Path, what: str, key: str, limit: int, kind: type[_Header]
+) -> tuple[dict[str, NDArray[Any]], _Header]:
+    """Read a file as `write_arrays` writes it.
+
+    Parameters
+    ----------
+    what : str
+        Content of the file, for messages: `groups` or `voices`.
+    limit : int
+        Bytes of the file, at most.
+
+    Raises
+    ------
+    DataError
+        If it is no such file, is too large, or damaged.
+    """
+    data = read_limited(path, f"file of {what}", limit, DataError)
+    if int.from_bytes(data[:8], "little") > _LARGEST_HEADER:
+        raise DataError(f"{path}: is no file of {what} (its header is too large)")
+    try:
+        arrays, text, damaged = read_sealed(path, data, key)
+        head = kind.model_validate_json(text)
+    except (safetensors.SafetensorError, KeyError, ValidationError) as error:
+        raise DataError(f"{path}: is no file of {what} of this version of hearthlog") from error
+    if damaged:
+        raise DataError(damaged)
+    return arrays, head
+
+
 def save_groups(groups: Groups, path: Path) -> None:
     """Write the groups file, replacing an existing one.
 
@@ -426,9 +467,7 @@ def save_groups(groups: Groups, path: Path) -> None:
         head.embedding = _Embedding(**groups.embedding._asdict())
         arrays |= {_EMBEDDED + name: getattr(groups.embedded, name) for name in _ARRAYS}
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    data = write_sealed(arrays, _KEY, head.model_dump_json(exclude_none=True))
-    with replaced_file(path, readers=log_readers(path.parent)) as temporary:
-        temporary.write_bytes(data)
+    write_arrays(path, _KEY, arrays, head)
 
 
 def load_groups(path: Path) -> Groups | None:
@@ -438,17 +477,7 @@ def load_groups(path: Path) -> Groups | None:
     """
     if not path.exists():
         return None
-    data = read_limited(path, "file of groups", _LARGEST, DataError)
-    size = int.from_bytes(data[:8], "little")
-    if size > _LARGEST_HEADER:
-        raise DataError(f"{path}: is no file of groups (its header is too large)")
-    try:
-        arrays, text, damaged = read_sealed(path, data, _KEY)
-        head = _Head.model_validate_json(text)
-    except (safetensors.SafetensorError, KeyError, ValidationError) as error:
-        raise DataError(f"{path}: is no file of groups of this version of hearthlog") from error
-    if damaged:
-        raise DataError(damaged)
+    arrays, head = read_arrays(path, "groups", _KEY, _LARGEST, _Head)
     if problem := _problem(head, arrays):
         raise DataError(f"{path}: is damaged: {problem}; move it away to begin anew")
     embedding, embedded = None, None

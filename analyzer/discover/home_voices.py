@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
-import safetensors
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from hearthlog.analyzer.discover.groups import read_arrays, write_arrays
 from hearthlog.analyzer.discover.speech import HomeSpeech, voices_of
 from hearthlog.analyzer.discover.voices import (
     HOP_FRAMES,
@@ -30,11 +30,8 @@ from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.speakers import APART, is_voice
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.schemas.arrays import Float32, Float64, Int64, read_sealed, write_sealed
-from hearthlog.schemas.files import read_limited
+from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, time_text
-from hearthlog.schemas.logs.files import log_readers
-from hearthlog.schemas.new_files import replaced_file
 
 NO_VOICE = -1
 MOST_VOICES = 1_000  # per file
@@ -146,7 +143,6 @@ VOICES = "voices.safetensors"  # in a folder of logs
 _KEY = "hearthlog_voices"
 _FORMAT: Final = 1
 _LARGEST = 4 << 20  # bytes
-_LARGEST_HEADER = 1 << 20
 _LEAST_NUMBER, _MOST_NUMBER = 1, (1 << 31) - 1
 _LARGE = 1e9  # of counts and sums
 _ARRAYS = {"numbers": np.int64, "counts": np.float64, "sums": np.float64}
@@ -176,9 +172,7 @@ def save_voices(voices: HomeVoices, path: Path) -> None:
             f"{path}: not written, for some speech has features that no sound has; leave out logs "
             "that hearthlog did not record"
         )
-    data = write_sealed(arrays, _KEY, head.model_dump_json())
-    with replaced_file(path, readers=log_readers(path.parent)) as temporary:
-        temporary.write_bytes(data)
+    write_arrays(path, _KEY, arrays, head)
 
 
 def load_voices(path: Path) -> HomeVoices | None:
@@ -188,17 +182,7 @@ def load_voices(path: Path) -> HomeVoices | None:
     """
     if not path.exists():
         return None
-    data = read_limited(path, "file of voices", _LARGEST, DataError)
-    size = int.from_bytes(data[:8], "little")
-    if size > _LARGEST_HEADER:
-        raise DataError(f"{path}: is no file of voices (its header is too large)")
-    try:
-        arrays, text, damaged = read_sealed(path, data, _KEY)
-        head = _Head.model_validate_json(text)
-    except (safetensors.SafetensorError, KeyError, ValidationError) as error:
-        raise DataError(f"{path}: is no file of voices of this version of hearthlog") from error
-    if damaged:
-        raise DataError(damaged)
+    arrays, head = read_arrays(path, "voices", _KEY, _LARGEST, _Head)
     if not _fits(head, arrays):
         raise DataError(f"{path}: is damaged; move it away to begin anew")
     return HomeVoices(
