@@ -3,7 +3,7 @@
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -29,12 +29,14 @@ from hearthlog.recorder.pause_schedule import (
     time_zone,
 )
 from hearthlog.recorder.retention import KeepingRules, Limits, Size, ThinningDays
-from hearthlog.recorder.stream.directions import ArrayGeometry, array_geometry
 from hearthlog.recorder.stream.messages import LOGGED_EVERY
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import exposed_secret, read_toml
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.messages.topics import check_microphone_name, check_scenario_name
+
+if TYPE_CHECKING:
+    from hearthlog.recorder.stream.directions import ArrayGeometry
 
 ReadableBy = Literal["owner", "group", "all"]
 Keep = Literal["off", "events", "unsure", "always"]
@@ -70,10 +72,16 @@ def _check_path(value: Any) -> Any:
 PlainPath = Annotated[Path, BeforeValidator(_check_path)]
 
 
+def _geometry(places: list[list[float]]) -> "ArrayGeometry":
+    from hearthlog.recorder.stream.directions import array_geometry  # noqa: PLC0415  few have one
+
+    return array_geometry(places)
+
+
 def _checked_places(places: list[list[float]]) -> list[list[float]]:
     try:
         if places:
-            array_geometry(places)
+            _geometry(places)
     except ConfigurationError as error:
         raise ValueError(str(error)) from error
     return places
@@ -126,9 +134,9 @@ class MicrophoneSettings(BaseModel):
     )
 
     @property
-    def geometry(self) -> ArrayGeometry | None:
+    def geometry(self) -> "ArrayGeometry | None":
         """Microphone positions of the array; None without an array."""
-        return array_geometry(self.array) if self.array else None
+        return _geometry(self.array) if self.array else None
 
     @property
     def channels(self) -> int | None:

@@ -40,7 +40,6 @@ from hearthlog.schemas.new_files import (
     sync_file,
     sync_folder,
 )
-from hearthlog.schemas.salvage.recover import lock_abandoned, thin_log, thinned_step
 
 _STATISTICS = 1  # thinning step without effect on training
 _RIGHTS = 0o666  # no execute bits
@@ -57,6 +56,9 @@ def plan_thinning(
     logs: Sequence[RecordedLog], days: RecordedDays, limits: ThinningDays
 ) -> Iterator[Thinned]:
     """Select the logs to thin; reviewed logs lose only statistics, as training needs the rest."""
+    # Here, as the recorder itself thins no log: the child process does.
+    from hearthlog.schemas.salvage.recover import thinned_step  # noqa: PLC0415
+
     for log in logs[:-1]:
         due = limits.step(days.since(log.start))
         if not due or (kept := kept_because(log)) not in {"", REVIEWED}:
@@ -84,6 +86,8 @@ def thin(log: Path, step: int) -> bool:
     OSError
         If the copy cannot be written.
     """
+    from hearthlog.schemas.salvage.recover import lock_abandoned, thin_log  # noqa: PLC0415
+
     copy = log.with_name(log.name + THINNING_SUFFIX)
     with lock_abandoned(log) as is_ours:
         if not is_ours:

@@ -30,7 +30,6 @@ from hearthlog.recorder.recording_session import (
     RecordingSummary,
 )
 from hearthlog.recorder.sources.audio_files import FileSource, LongBlocks
-from hearthlog.recorder.sources.microphone import MicrophoneSource, check_device
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
@@ -96,6 +95,8 @@ def record_microphones(
     ModelError, ConfigurationError
         As `record_files`.
     """
+    from hearthlog.recorder.sources.microphone import MicrophoneSource  # noqa: PLC0415  not for files
+
     keep_one_heap()
     with ExitStack() as stack:
         lock = stack.enter_context(FolderLock(settings.output, settings.node))
@@ -139,6 +140,8 @@ def check_recording(settings: Settings) -> None:
 
 def recording_problems(settings: Settings) -> list[HearthlogError]:
     """Return the errors of recording microphones with these settings, without side effects."""
+    from hearthlog.recorder.sources.microphone import check_device  # noqa: PLC0415  as above
+
     problems: dict[str, HearthlogError] = {}  # by message: microphones may share a model
 
     def check(step: Callable[[], object]) -> None:

@@ -33,8 +33,12 @@ from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.capture import _some_channels
-from hearthlog.recorder.stream.directions import ChannelWatch, DirectionFinder, array_geometry
-from hearthlog.recorder.stream.stages import ArrayDirections
+from hearthlog.recorder.stream.directions import (
+    ArrayDirections,
+    ChannelWatch,
+    DirectionFinder,
+    array_geometry,
+)
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logs.files import find_logs

@@ -695,7 +695,7 @@ LIES = {
 CHECK = """
 import resource, sys
 from pathlib import Path
-from hearthlog.recorder.log.recovery import recover_log
+from hearthlog.schemas.salvage.recover import recover_log
 resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
 recovery = recover_log(Path(sys.argv[1]), Path(sys.argv[2]), "copy.mcap")
 most = next(l for l in open("/proc/self/status") if l.startswith("VmHWM")).split()[1]

@@ -12,7 +12,9 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hearthlog.recorder.host import module_command
 from hearthlog.schemas.errors import LogError
@@ -22,13 +24,9 @@ from hearthlog.schemas.mcap.chunks import read_chunks
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
 from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.new_files import sync_file, sync_folder
-from hearthlog.schemas.salvage.recover import (
-    NothingIntactError,
-    Recovery,
-    check_copy,
-    lock_abandoned,
-    recover_log,
-)
+
+if TYPE_CHECKING:
+    from hearthlog.schemas.salvage.recover import Recovery
 
 _CHUNK_SPAN = 10 * NANOSECONDS  # of a finished log, which is read completely, not followed
 
@@ -99,14 +97,16 @@ def complete_log(active: Path) -> list[Recovered]:
     """
     if not active.exists():
         return []
+    # Here, as few recorders have a log to complete.
+    from hearthlog.schemas.salvage.recover import lock_abandoned  # noqa: PLC0415
+
     with lock_abandoned(active) as is_abandoned:
         if not is_abandoned:
             return []
         if not active.stat().st_size:
             active.unlink()
             return [Recovered(active, f"{active}: was empty, and is deleted", completed=False)]
-        recover = _recover_clips if is_layer(active) else _recover
-        return recover(active, active.with_name(stem(active) + SUFFIX))
+        return _recover(active, active.with_name(stem(active) + SUFFIX))
 
 
 def end_of_sound(root: Path, node: str, microphone: str, before: int) -> int:
@@ -150,40 +150,35 @@ def _end_in(file: LogFile, microphone: str) -> int:
     return 0
 
 
-def _recover_clips(active: Path, path: Path) -> list[Recovered]:
-    try:
-        recovery = _complete(active, path)
-        active.unlink(missing_ok=True)
-        sync_folder(path.parent)
-    except NothingIntactError:
-        active.unlink()
-        return []
-    damages = [damage for damage in recovery.damages if not damage.cut]
-    damage = f"{active}: {damages[0]}; this sound is deleted" if damages else ""
-    return [Recovered(path, damage)] if recovery.messages else []
-
-
 def _recover(active: Path, path: Path) -> list[Recovered]:
-    try:
-        recovery = _complete(active, path)
-    except NothingIntactError:
-        recovery = Recovery({}, [], complete=False)
+    recovery = _complete(active, path)
     damages = [damage for damage in recovery.damages if not damage.cut]
-    if damages or not recovery.messages:
+    if not is_layer(active) and (damages or not recovery.messages):
         active.rename(active.with_name(path.name + ".damaged"))
     else:
         active.unlink(missing_ok=True)
     sync_folder(path.parent)
     if not recovery.messages:
         return []
+    if not damages:
+        return [Recovered(path, "")]
+    if is_layer(active):
+        return [Recovered(path, f"{active}: {damages[0]}; this sound is deleted")]
     more = f", and in {len(damages) - 1} more places" if len(damages) > 1 else ""
-    kept = "; the original is kept as *.damaged"
-    damage = f"{active}: {damages[0]}{more}{kept}" if damages else ""
+    damage = f"{active}: {damages[0]}{more}; the original is kept as *.damaged"
     return [Recovered(path, damage)]
 
 
-def _complete(active: Path, path: Path) -> Recovery:
+def _complete(active: Path, path: Path) -> "Recovery":
     """Copy the intact part of a log to its final name, unless an earlier start has done so."""
+    from hearthlog.schemas.salvage.recover import (  # noqa: PLC0415  as above
+        NothingIntactError,
+        Recovery,
+        check_copy,
+        lock_abandoned,
+        recover_log,
+    )
+
     copy = active.with_name(path.name + ".recovering")
     try:
         recovery = recover_log(active, copy, path.name, chunk_span=_CHUNK_SPAN)
@@ -199,6 +194,8 @@ def _complete(active: Path, path: Path) -> Recovery:
                 active.rename(path)
         else:
             copy.rename(path)
+    except NothingIntactError:
+        return Recovery({}, [], complete=False)
     finally:
         copy.unlink(missing_ok=True)
     return recovery
@@ -216,6 +213,8 @@ class LogFinisher:
     """
 
     def __init__(self) -> None:
+        # Now, as the disk may be full later, or hold another version.
+        import_module("hearthlog.schemas.salvage.recover")
         self._left: list[Path] = []
         self._processes: list[subprocess.Popen[bytes]] = []
 

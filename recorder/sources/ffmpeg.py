@@ -83,11 +83,6 @@ def check_ffmpeg() -> None:
         )
 
 
-def has_ffmpeg() -> bool:
-    """Whether ffmpeg is installed."""
-    return shutil.which("ffmpeg") is not None
-
-
 class FileDecoder:
     """The first audio stream of a file, decoded by ffmpeg, which may open only this file.
 

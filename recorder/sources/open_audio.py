@@ -5,6 +5,7 @@ import mmap
 import os
 import re
 import shlex
+import shutil
 import struct
 import sys
 import tempfile
@@ -13,14 +14,16 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from threading import RLock
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import soundfile
 
 from hearthlog.recorder.errors import SourceError
-from hearthlog.recorder.sources.ffmpeg import FileDecoder, has_ffmpeg
 from hearthlog.schemas.arrays import Float32
+
+if TYPE_CHECKING:
+    from hearthlog.recorder.sources.ffmpeg import FileDecoder
 
 BLOCK_SECONDS = 10.0
 RATES = range(1_000, 768_001)  # Hz: covers recordings, and soxr converts in bounded memory
@@ -133,7 +136,7 @@ def _open(path: Path) -> Iterator[OpenAudio]:
         if not sound.frames:
             raise SourceError(f"{path}: holds no audio")
         hidden = _hidden_seconds(path, sound)
-        if hidden and has_ffmpeg():
+        if hidden and _has_ffmpeg():
             with _decoder(path, "") as decoder:
                 yield _by_ffmpeg(path, decoder)
             return
@@ -455,16 +458,22 @@ def _without_mpg123(path: Path, complaints: list[bytes]) -> Iterator[None]:
             os.close(original)
 
 
+def _has_ffmpeg() -> bool:
+    return shutil.which("ffmpeg") is not None
+
+
 @contextmanager
-def _decoder(path: Path, reason: str) -> Iterator[FileDecoder]:
+def _decoder(path: Path, reason: str) -> Iterator["FileDecoder"]:
     """Start ffmpeg for a file that libsndfile cannot read."""
     unreadable = f"{path}: cannot be read as audio"
-    if not has_ffmpeg():
+    if not _has_ffmpeg():
         target = f"{path.stem}{'-2' if path.suffix.lower() == '.wav' else ''}.wav"
         raise SourceError(
             f"{unreadable} ({reason}); install ffmpeg (Debian: apt install ffmpeg), or convert it "
             f"elsewhere: ffmpeg -i {shlex.quote(path.name)} {shlex.quote(target)}"
         )
+    from hearthlog.recorder.sources.ffmpeg import FileDecoder  # noqa: PLC0415  for few files
+
     try:
         decoder = FileDecoder(path)
     except SourceError as error:
@@ -474,7 +483,7 @@ def _decoder(path: Path, reason: str) -> Iterator[FileDecoder]:
         yield decoder
 
 
-def _by_ffmpeg(path: Path, decoder: FileDecoder) -> OpenAudio:
+def _by_ffmpeg(path: Path, decoder: "FileDecoder") -> OpenAudio:
     _check_rate(path, decoder.rate)
     place, end, reason = 0, 0.0, ""
 

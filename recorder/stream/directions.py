@@ -15,9 +15,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
+from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, NOWHERE, Directions
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.recorder.events import Frames
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
@@ -71,6 +72,10 @@ class ArrayGeometry:
     def pairs(self) -> Indices:
         """The two channels of each pair: [shape=(p, 2)]."""
         return np.array(list(combinations(range(len(self.positions)), 2)))
+
+    def direction_finder(self) -> "ArrayDirections":
+        """Return a finder of the directions of this array's sound."""
+        return ArrayDirections(self)
 
     def grid(self) -> DirectionGrid:
         """Return the directions that the array can distinguish.
@@ -358,3 +363,40 @@ def _in_a_row(before: Int64, flags: Bool) -> Int64:
         return before
     since = np.where(flags.all(axis=0), len(flags), flags[::-1].argmin(axis=0))
     return np.where(flags.all(axis=0), before + since, since)
+
+
+class ArrayDirections:
+    """Finds the directions of an array's sound, and checks its channels."""
+
+    def __init__(self, geometry: ArrayGeometry) -> None:
+        self._finder = DirectionFinder(geometry)
+        self._watch = ChannelWatch(len(geometry.positions))
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset: the next frame does not follow the last one."""
+        self._finder.restart()
+        self._stamps = np.empty(0, np.int64)  # of the frames of the incomplete block
+
+    def problem(self) -> str:
+        """Return the fault of the channels and its remedy; empty if there is none."""
+        return self._watch.problem()
+
+    def __call__(self, frames: Frames) -> Directions:
+        """Find the directions of the blocks that these frames complete.
+
+        Parameters
+        ----------
+        frames : Frames
+            The next frames. Frames without channels, as from a fallback microphone, have no
+            direction.
+        """
+        if frames.channels is None:
+            self.restart()
+            return NOWHERE
+        self._watch.add(frames.channels)
+        places, azimuths, confidences = self._finder(frames.channels, frames.first)
+        held = len(self._stamps)
+        stamps = np.concatenate([self._stamps, frames.stamps])
+        self._stamps = stamps[1 - BLOCK_FRAMES :]
+        return Directions(frames.first + places, stamps[held + places], azimuths, confidences)

@@ -4,6 +4,7 @@ from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.events import OK, READING, WARNING, Event, Frames, Gap, Notice, SourceHealth
-from hearthlog.recorder.stream.directions import ArrayGeometry
 from hearthlog.recorder.stream.messages import (
     LOGGED_EVERY,
     EncodedMessage,
@@ -39,7 +39,6 @@ from hearthlog.recorder.stream.privacy_filter import (
 )
 from hearthlog.recorder.stream.sound_watch import SoundWatch, problem_of_file
 from hearthlog.recorder.stream.stages import (
-    ArrayDirections,
     FeatureMessages,
     LabelStream,
     MicrophoneEmbeddings,
@@ -51,6 +50,9 @@ from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.message_types import encode_gap
 from hearthlog.schemas.messages.topics import LIVE, ROSOUT, EmbeddingSource, topic
+
+if TYPE_CHECKING:
+    from hearthlog.recorder.stream.directions import ArrayGeometry
 
 _REMEMBERED_WINDOWS = 4  # of embeddings: two seconds
 
@@ -80,7 +82,7 @@ class Pipeline:
         statistics_every: int = LOGGED_EVERY,
         secondary: Mapping[str, Classifier] | None = None,
         private: Sequence[str] = (),
-        array: ArrayGeometry | None = None,
+        array: "ArrayGeometry | None" = None,
         embedder: Embedder | None = None,
         embedding: EmbeddingSource | None = None,
     ) -> None:
@@ -113,7 +115,7 @@ class Pipeline:
         self._last_floor: Float64 = np.empty(0)  # of the last frame; empty without one
         self._recent_stamps = np.empty(0, np.int64)  # of the last window
         self._watch = SoundWatch()
-        self._directions = None if array is None else ArrayDirections(array)
+        self._directions = None if array is None else array.direction_finder()
         self._recent_directions = NOWHERE  # of the last second, or more
         self._end = 0
         self._level = OK

@@ -5,18 +5,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, NOWHERE, Auxiliary, Directions
+from hearthlog.models.classifiers.evidence import Auxiliary, Directions
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.embedding.projection import WINDOW_FRAMES, Embeddings
-from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.features.window_inputs import mean_and_std
 from hearthlog.models.labels.labeller import FrameLabels, segment_columns
 from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Segment
-from hearthlog.recorder.events import Frames
-from hearthlog.recorder.stream.directions import ArrayGeometry, ChannelWatch, DirectionFinder
 from hearthlog.recorder.stream.messages import EncodedMessage, encoded_messages, segment_line
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
 from hearthlog.schemas.messages import message_types
@@ -128,6 +125,10 @@ class MicrophoneEmbeddings:
     """Computes embeddings of sound above the noise floor."""
 
     def __init__(self, embedder: Embedder, features: FeatureSet) -> None:
+        from hearthlog.models.embedding.stream import (  # noqa: PLC0415  only with a network
+            EmbeddingStream,
+        )
+
         self._feature_set = features
         self._stream = EmbeddingStream(embedder)
         self.restart()
@@ -197,43 +198,6 @@ def embedding_messages(
     rows = encode_rows(message_types.EMBEDDING, columns, len(known))
     name = topic(microphone, "embedding")
     return encoded_messages(name, known, rows)
-
-
-class ArrayDirections:
-    """Finds the directions of an array's sound, and checks its channels."""
-
-    def __init__(self, geometry: ArrayGeometry) -> None:
-        self._finder = DirectionFinder(geometry)
-        self._watch = ChannelWatch(len(geometry.positions))
-        self.restart()
-
-    def restart(self) -> None:
-        """Reset: the next frame does not follow the last one."""
-        self._finder.restart()
-        self._stamps = np.empty(0, np.int64)  # of the frames of the incomplete block
-
-    def problem(self) -> str:
-        """Return the fault of the channels and its remedy; empty if there is none."""
-        return self._watch.problem()
-
-    def __call__(self, frames: Frames) -> Directions:
-        """Find the directions of the blocks that these frames complete.
-
-        Parameters
-        ----------
-        frames : Frames
-            The next frames. Frames without channels, as from a fallback microphone, have no
-            direction.
-        """
-        if frames.channels is None:
-            self.restart()
-            return NOWHERE
-        self._watch.add(frames.channels)
-        places, azimuths, confidences = self._finder(frames.channels, frames.first)
-        held = len(self._stamps)
-        stamps = np.concatenate([self._stamps, frames.stamps])
-        self._stamps = stamps[1 - BLOCK_FRAMES :]
-        return Directions(frames.first + places, stamps[held + places], azimuths, confidences)
 
 
 def direction_messages(
