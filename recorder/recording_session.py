@@ -31,15 +31,10 @@ from hearthlog.recorder.events import (
 from hearthlog.recorder.host import HealthJournal, MachineWatch, say
 from hearthlog.recorder.labelling.labelling_models import LabellingModels, ModelChange
 from hearthlog.recorder.log.clips import ClipRecorder
+from hearthlog.recorder.log.description import LogDescription, describe_log, join_descriptions
 from hearthlog.recorder.log.folder_lock import FolderLock
-from hearthlog.recorder.log.live_log import LiveLog
 from hearthlog.recorder.log.recovery import LogFinisher, Recovered
-from hearthlog.recorder.log.rolling_log import (
-    LogDescription,
-    RollingLog,
-    describe_log,
-    join_descriptions,
-)
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.messages import EncodedMessage, diagnostics, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
@@ -264,7 +259,7 @@ class RecordingSession:
             isinstance(source, FileSource) and not source.realtime for source in sources.values()
         )
         self._finisher = None if is_read_ahead else LogFinisher()
-        log = RollingLog(
+        self._log = RollingLog(
             self._describe(),
             settings.max_bag_duration,
             settings.flush_seconds,
@@ -272,8 +267,8 @@ class RecordingSession:
             live=is_live,
             file_bytes=settings.max_bag_size,
             finisher=self._finisher,
+            lock=lock,
         )
-        self._log = LiveLog(log, settings.output, lock) if is_live else log
         pipelines = [stream.pipeline for stream in self._streams.values()]
         self._clips = ClipRecorder(settings, pipelines, self._log.file_at)
         self._keeper = DiskKeeper(settings.keeping_rules()) if is_live else None

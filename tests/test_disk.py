@@ -22,7 +22,7 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
-from hearthlog.recorder.log import live_log
+from hearthlog.recorder.log import rolling_log
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
@@ -58,7 +58,7 @@ def settings(tmp_path, model_file):
 
 @pytest.fixture
 def at_once(monkeypatch):
-    monkeypatch.setattr(live_log, "_RETRY_SECONDS", 0.0)
+    monkeypatch.setattr(rolling_log, "_RETRY_SECONDS", 0.0)
 
 
 def errors(folder):
@@ -115,7 +115,7 @@ def test_a_folder_that_is_deleted_is_made_again_at_the_next_sync(settings):
 
 @pytest.mark.usefixtures("at_once")
 def test_what_the_memory_cannot_hold_is_a_gap(settings, monkeypatch):
-    monkeypatch.setattr(live_log, "_HELD_BYTES", 100_000)
+    monkeypatch.setattr(rolling_log, "_HELD_BYTES", 100_000)
     failing = False
     good = LogWriter.flush
 
@@ -233,4 +233,4 @@ def test_a_folder_that_is_gone_at_the_end_is_no_failure(tmp_path):
 
 def test_the_disk_behind_a_link_is_the_one_that_must_be_mounted(small_disk, tmp_path):
     (tmp_path / "link").symlink_to(small_disk)
-    assert live_log._mount_of(tmp_path / "link" / "logs") == small_disk
+    assert rolling_log._mount_of(tmp_path / "link" / "logs") == small_disk

@@ -44,8 +44,9 @@ from hearthlog.models.features.floor import BLOCK_FRAMES
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Gap
+from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.recovery import recover_active
-from hearthlog.recorder.log.rolling_log import RollingLog, describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.messages import stream_info

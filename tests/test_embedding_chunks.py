@@ -12,8 +12,9 @@ from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
+from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.recovery import LogFinisher, finish_log
-from hearthlog.recorder.log.rolling_log import RollingLog, describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS

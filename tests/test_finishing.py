@@ -23,8 +23,9 @@ from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
+from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.recovery import LogFinisher, finish_log, recover_active
-from hearthlog.recorder.log.rolling_log import RollingLog, describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS

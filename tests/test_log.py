@@ -12,7 +12,8 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
-from hearthlog.recorder.log.rolling_log import LogDescription, RollingLog, describe_log
+from hearthlog.recorder.log.description import LogDescription, describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline

@@ -17,7 +17,8 @@ from hearthlog.models.features.installed import DEFAULT, entries_of, feature_set
 from hearthlog.models.modelfile.modelfile import CARD, DESCRIPTION, model_attachments
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.labelling.labelling_models import class_conflict, shared_classes
-from hearthlog.recorder.log.rolling_log import LogDescription, RollingLog, with_scenarios
+from hearthlog.recorder.log.description import LogDescription, with_scenarios
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import LOGGED_EVERY, EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import LogError

@@ -1,171 +1,27 @@
-"""A recorder's log: files of limited length and size, and their description."""
+"""A recorder's log: files of limited length and size; a live log outlasts disk errors."""
 
-import hashlib
+import errno
+import os
+import shutil
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
-from typing import Any
 
-from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.installed import entries_of
-from hearthlog.models.modelfile.modelfile import attachment_of, model_attachments
-from hearthlog.recorder.config import Settings
-from hearthlog.recorder.events import Notice
+from hearthlog.recorder.events import OK, WARNING, Notice
+from hearthlog.recorder.host import give_back
+from hearthlog.recorder.log.description import LogDescription
+from hearthlog.recorder.log.folder_lock import FolderLock
+from hearthlog.recorder.log.held_messages import Held, HeldMessages
 from hearthlog.recorder.log.recovery import LogFinisher, active_logs
 from hearthlog.recorder.stream.messages import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import free_log_path, log_path
-from hearthlog.schemas.logs.metadata import (
-    RecordedScenario,
-    other_features,
-    provenance,
-    scenario_entries,
-)
-from hearthlog.schemas.logs.writer import Attachment, LogWriter
+from hearthlog.schemas.logs.writer import LogWriter
 from hearthlog.schemas.messages.message_types import header
-from hearthlog.schemas.messages.topics import (
-    CANDIDATE,
-    SCENARIO,
-    EmbeddingSource,
-    Topic,
-    topics_of,
-)
-
-
-@dataclass(frozen=True)
-class LogDescription:
-    """Description of a recording, written to every file."""
-
-    root: Path  # folder of the logs
-    node: str  # name of the recorder
-    topics: Sequence[Topic]
-    infos: Sequence[Any]  # `AudioStreamInfo` of each microphone; each file sets their stamps
-    metadata: Mapping[str, str]  # the `hearthlog` record
-    attachments: Sequence[Attachment]
-    # By microphone, additional lines of `/rosout` at the start of a file.
-    lines: Mapping[str, Sequence[str]] = field(default_factory=dict)
-
-
-def describe_log(  # noqa: PLR0913, PLR0917
-    settings: Settings,
-    info: Any,
-    features: FeatureSet,
-    model: Model | None,
-    secondary: Mapping[str, Model] | None = None,
-    embedding: EmbeddingSource | None = None,
-) -> LogDescription:
-    """Return the description of the logs of one microphone.
-
-    Parameters
-    ----------
-    model : Model or None
-        Labelling model; None for no labels.
-    embedding : EmbeddingSource, optional
-        Source of the embeddings; None without a network.
-    """
-    secondary = secondary or {}
-    microphone = info.header.frame_id
-    models = {"model", "scenarios"}
-    # Paths of this machine.
-    elsewhere: Any = dict.fromkeys(["output", *models], True)
-    elsewhere["microphone"] = {"__all__": models}
-    configuration = settings.model_dump_json(indent=2, exclude=elsewhere).encode()
-    classes = None if model is None else list(model.classes)
-    attachments = [Attachment("configuration.json", "application/json", configuration)]
-    metadata = provenance(
-        settings.node,
-        configuration_sha256=hashlib.sha256(configuration).hexdigest(),
-        **entries_of(features),
-        model=info.model,
-        model_sha256=info.model_sha256,
-        timezone=settings.timezone,
-    )
-    if (candidate := secondary.get(CANDIDATE)) is not None:
-        metadata |= {"candidate": candidate.name, "candidate_sha256": candidate.sha256}
-    if model is not None:
-        attachments += model_attachments(model)
-    named = {labelling: list(one.classes) for labelling, one in secondary.items()}
-    description = LogDescription(
-        root=settings.output,
-        node=settings.node,
-        topics=topics_of(
-            microphone,
-            features.feature_names,
-            classes,
-            named,
-            directions=bool(settings.settings_of(microphone).array),
-            embedding=embedding,
-        ),
-        infos=[info],
-        metadata=metadata,
-        attachments=attachments,
-    )
-    parts = {labelling.partition("/"): one for labelling, one in secondary.items()}
-    scenarios = {name: one for (kind, _, name), one in parts.items() if kind == SCENARIO}
-    return with_scenarios(description, microphone, scenarios)
-
-
-def with_scenarios(
-    description: LogDescription, microphone: str, scenarios: Mapping[str, Model]
-) -> LogDescription:
-    """Add metadata, attachments and lines of a microphone's scenarios, without their topics."""
-    entries = dict(description.metadata)
-    attachments = list(description.attachments)
-    for name, model in scenarios.items():
-        entries |= scenario_entries(RecordedScenario(microphone, name, model.name, model.sha256))
-        attachments += _scenario_attachments(name, model)
-    lines = [
-        f"scenario {name}: {len(model.classes)} labels by {model.name} ({model.sha256[:12]})"
-        for name, model in scenarios.items()
-    ]
-    return replace(
-        description,
-        metadata=entries,
-        attachments=attachments,
-        lines={**description.lines, microphone: lines},
-    )
-
-
-def _scenario_attachments(scenario: str, model: Model) -> list[Attachment]:
-    own = f"{SCENARIO}-{scenario}"  # not a valid microphone name
-    return [replace(each, name=attachment_of(each.name, own)) for each in model_attachments(model)]
-
-
-def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
-    """Join the descriptions of several microphones."""
-    first = descriptions[0]
-    attachments = {each.name: each for each in first.attachments}
-    for other in descriptions[1:]:
-        (info,) = other.infos
-        for each in other.attachments:
-            if each not in attachments.values():
-                name = attachment_of(each.name, info.header.frame_id)
-                attachments[name] = replace(each, name=name)
-    topics = {topic.name: topic for each in descriptions for topic in each.topics}
-    features: dict[str, str] = {}
-    for other in descriptions[1:]:
-        (info,) = other.infos
-        features |= other_features(first.metadata, other.metadata, info.header.frame_id)
-    scenarios = {
-        key: text
-        for each in descriptions
-        for key, text in each.metadata.items()
-        if key.startswith(SCENARIO)
-    }
-    return replace(
-        first,
-        metadata={**first.metadata, **features, **scenarios},
-        lines={name: lines for each in descriptions for name, lines in each.lines.items()},
-        topics=list(topics.values()),
-        infos=[info for each in descriptions for info in each.infos],
-        attachments=list(attachments.values()),
-    )
-
 
 # Maximum delay from a sound to its writing: a block of frames, and the capture delay.
 _DELAY_SECONDS = 0.9
@@ -173,6 +29,9 @@ _QUIET_SECONDS = 2.0  # without a flush; sound has one every half a second
 _FILES = 256  # remembered: longer than clips are buffered, even with one file per second
 _LATE = 10 * NANOSECONDS  # lag between microphones; more means that the clock was set back
 _NEVER = (1 << 63) - 1
+_HELD_BYTES = 8 << 20  # twenty minutes of one microphone
+_RETRY_SECONDS = 2.0
+_SPARE_BYTES = 1 << 20  # free space required in addition to the held messages
 
 
 class RollingLog:
@@ -188,6 +47,10 @@ class RollingLog:
         A power cut loses at most this much sound.
     file_bytes : int
         Size at which the next file begins; 0 for no limit.
+    live : bool
+        Whether disk errors do not raise: messages are held in memory until they can be written.
+    lock : FolderLock, optional
+        Renewed after a disk error.
     """
 
     def __init__(  # noqa: PLR0913
@@ -200,9 +63,10 @@ class RollingLog:
         live: bool = False,
         file_bytes: int = 0,
         finisher: LogFinisher | None = None,
+        lock: FolderLock | None = None,
     ) -> None:
         self.finished: list[Path] = []
-        self.safe = 0
+        self._safe = 0  # appended messages that are on the disk
         self._given = 0  # appended messages, without the opening messages of files
         self._description = description
         self._file_nanoseconds = file_seconds * NANOSECONDS
@@ -220,14 +84,28 @@ class RollingLog:
         self._flushed = time.monotonic()
         self._synced = time.monotonic()
         self._begun: deque[tuple[int, Path]] = deque(maxlen=_FILES)
+        self._lock = lock
+        self._mount = _mount_of(description.root)
+        self._held = HeldMessages()  # of a live log: not yet synced to the disk
+        self._dropped = 0  # messages dropped from `_held`
+        self._failing = False
+        self._reason = ""
+        self._retry_at = 0.0
+        self._notices: list[Notice] = []
 
     def write(self, messages: Sequence[EncodedMessage]) -> None:
         """Append messages.
 
-        If time runs backwards, because the clock was set, a new file begins. Raise `LogError` on a
-        disk error: the written part remains and is completed at the next start. Also, unless live,
-        if the name of a new file is taken.
+        If time runs backwards, because the clock was set, a new file begins. Raise `LogError`,
+        unless live, on a disk error: the written part remains and is completed at the next start.
+        Also if the name of a new file is taken.
         """
+        if self._live:
+            self._hold(messages)
+        else:
+            self._write(messages)
+
+    def _write(self, messages: Sequence[EncodedMessage]) -> None:
         with self._preserving_written():
             for part in self._parts(messages):
                 if not self._last - self._late <= part[0].log_time < self._until:
@@ -266,7 +144,7 @@ class RollingLog:
         self.flush()
         if self._writer is not None:
             self._writer.sync()
-        self.safe = self._given
+        self._safe = self._given
         self._synced = time.monotonic()
 
     def finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
@@ -275,13 +153,25 @@ class RollingLog:
         Parameters
         ----------
         messages : sequence of EncodedMessage
-            In the order of their log times; dropped if no file is open.
+            In the order of their log times; dropped if no file is open, unless live.
 
         Raises
         ------
         LogError
             On a disk error; the written part remains and is completed at the next start.
         """
+        if self._live:
+            self._retry_at = 0.0
+            self._hold(messages)
+            if self._failing:
+                times = [item.log_time for item in self._held if isinstance(item, EncodedMessage)]
+                seconds = (max(times) - min(times)) / NANOSECONDS if times else 0.0
+                what = f"{self._description.root}: cannot be written ({self._reason})"
+                raise LogError(f"{what}; the last {seconds:.0f} s are lost")
+            messages = ()
+        self._finish(messages)
+
+    def _finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
         with self._preserving_written():
             if self._writer is not None:
                 self._append(messages)
@@ -290,18 +180,21 @@ class RollingLog:
 
     def may_begin(self, stamp: int) -> bool:
         """Return whether a file may begin at a time: each second has one name."""
+        if self._failing:
+            return False
         description = self._description
         path = log_path(description.root, description.node, stamp)
         return free_log_path(description.root, description.node, stamp) == path
 
     @property
     def is_full(self) -> bool:
-        """Whether sound must be dropped; always false, as disk errors raise."""
-        return False
+        """Whether so much is held after a disk error that sound must be dropped."""
+        return self._failing and self._held.size >= _HELD_BYTES
 
     def notices(self) -> list[Notice]:
-        """Return notices about the disk; none, as disk errors raise."""
-        return []
+        """Return the notices about the disk of a live log since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
 
     def file_at(self, stamp: int) -> tuple[Path, int]:
         """Return the file that contains a time; the later one if the clock was set back.
@@ -328,32 +221,97 @@ class RollingLog:
     def begin_anew(self, description: LogDescription, messages: Sequence[EncodedMessage]) -> None:
         """Complete the open file; the next message begins a file with another description.
 
-        Raise `LogError` as `finish` does.
+        Raise `LogError` as `write` does.
         """
-        self.finish(messages)
+        if self._live:
+            self._hold([*messages, description])
+        else:
+            self._finish(messages)
+            self._describe(description)
+
+    def _describe(self, description: LogDescription) -> None:
+        """Let the next message begin a file with another description."""
         self._description = description
         self._until = 0
 
-    def complete_truncated(self) -> None:
-        """Start the completion of files with disk errors, including clips; return immediately."""
-        if self._finisher is None:
+    def _hold(self, items: Sequence[Held]) -> None:
+        """Hold new items until they are on the disk; write them, or all of them after an error."""
+        self._held.extend(items)
+        was_failing = self._failing
+        if was_failing and time.monotonic() < self._retry_at:
             return
-        # The open file is excluded: the disk may refuse it before that process has started.
-        is_open = None if self._writer is None else self._writer.active_path
-        logs = active_logs(self._description.root, self._description.node)
-        self._finisher.add([path for path in logs if path != is_open])
+        try:
+            if was_failing:
+                self._write_anew()
+            else:
+                self._pour(items)
+                if self._held.size >= _HELD_BYTES:
+                    self.sync()
+        except (LogError, OSError) as error:
+            self._fail(error)
+        self._drop_synced()
+        if was_failing and not self._failing:
+            give_back()
 
-    def begin_after_failure(self) -> None:
-        """Continue after an error: messages that are not `safe` must be written again.
+    def _write_anew(self) -> None:
+        """Write all held items after a disk error.
 
-        Raise `OSError` if the disk error persists.
+        Raise `LogError` or `OSError` if the error persists.
         """
+        self._check_disk()
+        if self._lock is not None:
+            self._lock.renew()
         if self._abandoned is not None:
             self._abandoned.discard_unsynced()
             self._abandoned = None
-        self._given = self.safe
+        self._given = self._safe
         self._until = 0
         self._flush_at = None
+        for batch in self._held.batches():
+            self._pour(batch)
+        self.sync()
+        self._failing = False
+        root = self._description.root
+        self._notices.append(Notice(OK, f"{root} can be written again"))
+        if self._finisher is not None:  # completes the files with disk errors, including clips
+            # The open file is excluded: the disk may refuse it before that process has started.
+            is_open = None if self._writer is None else self._writer.active_path
+            logs = active_logs(root, self._description.node)
+            self._finisher.add([path for path in logs if path != is_open])
+
+    def _pour(self, items: Sequence[Held]) -> None:
+        for is_message, run in groupby(items, lambda item: isinstance(item, EncodedMessage)):
+            if is_message:
+                self._write([item for item in run if isinstance(item, EncodedMessage)])
+                continue
+            for description in run:
+                assert isinstance(description, LogDescription)
+                self._finish()
+                self._describe(description)
+
+    def _check_disk(self) -> None:
+        if not self._mount.is_mount():  # the folder under the mount point is on another disk
+            raise OSError(errno.ENODEV, f"{self._mount} is not mounted")
+        if shutil.disk_usage(self._mount).free < 2 * self._held.size + _SPARE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _fail(self, error: LogError | OSError) -> None:
+        cause = error.__cause__ if isinstance(error.__cause__, OSError) else error
+        self._reason = getattr(cause, "strerror", None) or str(error)
+        self._retry_at = time.monotonic() + _RETRY_SECONDS
+        if not self._failing:
+            self._failing = True
+            what = f"{self._description.root} cannot be written ({self._reason})"
+            self._notices.append(Notice(WARNING, f"{what}: it is held in memory until it can"))
+
+    def _drop_synced(self) -> None:
+        """Drop the held messages that are on the disk."""
+        while self._held:
+            begins_log = self._held.begins_log
+            if self._dropped == self._safe and (self._failing or not begins_log):
+                return
+            self._held.drop_first()
+            self._dropped += not begins_log
 
     @contextmanager
     def _preserving_written(self) -> Iterator[None]:
@@ -378,7 +336,7 @@ class RollingLog:
                 self._finisher.add([self._writer.active_path])
             self.finished.append(self._writer.path)
             self._writer = None
-        self.safe = self._given
+        self._safe = self._given
 
     def _parts(self, messages: Sequence[EncodedMessage]) -> Iterator[Sequence[EncodedMessage]]:
         """Split messages where a file may begin; ordered messages within the file stay together."""
@@ -414,3 +372,9 @@ class RollingLog:
             self._append(opening_messages(info, lines))
         self._writer.flush()  # the file is identifiable whatever happens next
         self._flush_at = None
+
+
+def _mount_of(folder: Path) -> Path:
+    """Return the mount point of a folder that may not exist yet."""
+    folder = folder.resolve()
+    return next(path for path in (folder, *folder.parents) if path.is_mount())

@@ -13,7 +13,8 @@ pytest.importorskip("hearthlog.tools.lab.month", reason="the wheel leaves the si
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Gap
-from hearthlog.recorder.log.rolling_log import RollingLog, describe_log
+from hearthlog.recorder.log.description import describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS

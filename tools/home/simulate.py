@@ -19,7 +19,8 @@ from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import OK, Frames, SourceHealth
 from hearthlog.recorder.labelling.embedder_probe import network_path
-from hearthlog.recorder.log.rolling_log import RollingLog, describe_log
+from hearthlog.recorder.log.description import describe_log
+from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Float64, Int16, Int64
