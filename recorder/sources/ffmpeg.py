@@ -23,8 +23,7 @@ from array import array
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 from urllib.parse import urlsplit
 
 from hearthlog.recorder.addresses import public_name
@@ -143,17 +142,6 @@ class FileDecoder:
             if pipe is not None:
                 pipe.close()
         self._process.wait()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _read(self, size: int) -> bytes:
         """Return `size` bytes, or the rest."""

@@ -30,11 +30,11 @@ from hearthlog.recorder.sources.ffmpeg import check_ffmpeg
 from hearthlog.recorder.sources.framing import STEP_SECONDS, Framer, SampleBlock, WallClock
 from hearthlog.recorder.sources.process import (
     Capture,
-    CaptureProcess,
-    NetworkProcess,
     ReturnWatch,
     cards_change,
     check_ros,
+    open_address,
+    open_device,
 )
 from hearthlog.recorder.stream.sound_watch import DEAD_STEPS
 from hearthlog.schemas.arrays import Float32
@@ -250,9 +250,9 @@ class MicrophoneSource:
 
     def _open(self, device: "_Device", stop: Flag) -> Capture:
         if is_address(device.wanted):
-            return NetworkProcess(device.wanted, stop, device.channel)
+            return open_address(device.wanted, stop, device.channel)
         try:
-            return CaptureProcess(
+            return open_device(
                 device.wanted,
                 exact=device.was_heard,
                 channels=device.channels,

@@ -10,7 +10,7 @@ import struct
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from threading import RLock
@@ -29,21 +29,8 @@ BLOCK_SECONDS = 10.0
 RATES = range(1_000, 768_001)  # Hz: covers recordings, and soxr converts in bounded memory
 
 _SUFFIXES = frozenset(
-    {
-        ".wav",
-        ".wave",
-        ".bwf",
-        ".flac",
-        ".ogg",
-        ".oga",
-        ".opus",
-        ".mp3",
-        ".aif",
-        ".aiff",
-        ".aifc",
-        ".au",
-        ".caf",
-    }
+    {".wav", ".wave", ".bwf", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc"}
+    | {".au", ".caf"}
     | {".w64", ".rf64", ".voc", ".snd", ".paf", ".svx", ".nist", ".sph", ".ircam", ".sf", ".pvf"}
     | {".htk", ".sds", ".avr", ".sd2", ".wve"}
     | {".m4a", ".m4b", ".aac", ".mp4", ".m4v", ".mov", ".3gp", ".3g2", ".amr", ".awb", ".webm"}
@@ -479,7 +466,7 @@ def _decoder(path: Path, reason: str) -> Iterator["FileDecoder"]:
     except SourceError as error:
         why = str(error) or f"{reason}; not by ffmpeg either"
         raise SourceError(f"{unreadable} ({why})") from error
-    with decoder:
+    with closing(decoder):
         yield decoder
 
 

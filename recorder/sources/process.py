@@ -26,6 +26,7 @@ _NETWORK_CAPTURE = module_command("hearthlog.recorder.sources.ffmpeg")
 _TOPIC_CAPTURE = module_command("hearthlog.recorder.sources.topic_capture")
 _HANGS = "PortAudio does not answer: unplug the microphone and connect it again"
 _CRASHES = "PortAudio crashed: check ALSA's configuration"
+_NO_ANSWER = "the capture process does not answer"
 _PIPE_BYTES = 1 << 20  # 32 s of sound: the recorder's maximum delay
 _START_SECONDS = 10.0
 _NETWORK_START_SECONDS = 30.0  # the process ends by itself earlier
@@ -69,13 +70,33 @@ def check_ros() -> None:
         )
 
 
-class _Process:
-    """One run of a capture process, started and with a known format."""
+class Capture:
+    """One run of a capture process, started and with a known format.
 
-    _hangs: str
-    _crashes: str
+    Parameters
+    ----------
+    seconds : float
+        Time to start.
+    hangs, crashes : str
+        Messages of the errors of a process that does not answer, or ends without a reason.
 
-    def __init__(self, process: "subprocess.Popen[bytes]", seconds: float, stop: Flag) -> None:
+    Raises
+    ------
+    DeviceError
+        If the device is missing, cannot be opened or has too few channels, or there is no sound,
+        with the message of the capture process; if it hangs, or was stopped.
+    SourceError
+        If PortAudio is missing, cannot start, or crashes.
+    """
+
+    def __init__(
+        self,
+        process: "subprocess.Popen[bytes]",
+        seconds: float,
+        stop: Flag,
+        hangs: str,
+        crashes: str,
+    ) -> None:
         self._process = process
         assert process.stdout is not None
         self._pipe = process.stdout.fileno()
@@ -83,7 +104,7 @@ class _Process:
         os.set_blocking(self._pipe, False)
         self._held = b""
         try:
-            self.format = self._read_format(seconds, stop)
+            self.format = self._read_format(time.monotonic() + seconds, stop, hangs, crashes)
         except SourceError:
             self.kill()
             raise
@@ -133,20 +154,23 @@ class _Process:
 
     def _ended(self) -> None:
         """Raise DeviceError if the process gave a reason for its end."""
+        if self._process.stderr is not None:
+            lines = self._process.stderr.read().decode(errors="replace").splitlines()
+            if lines:
+                raise DeviceError(lines[-1])
 
-    def _read_format(self, seconds: float, stop: Flag) -> CaptureFormat:
-        deadline = time.monotonic() + seconds
+    def _read_format(self, deadline: float, stop: Flag, hangs: str, crashes: str) -> CaptureFormat:
         while b"\n" not in self._held:
             if not self._wait(_LOOK_SECONDS):
                 if stop.is_set():
                     raise DeviceError("the recorder was stopped")
                 if time.monotonic() > deadline:
-                    raise DeviceError(self._hangs)
+                    raise DeviceError(hangs)
                 continue
             data = self._read()
             if not data:
                 self._ended()
-                raise SourceError(self._crashes)
+                raise SourceError(crashes)
             self._held += data
         line, self._held = self._held.split(b"\n", 1)
         answer = json.loads(line)
@@ -161,8 +185,15 @@ class _Process:
         return os.read(self._pipe, _PIPE_BYTES)
 
 
-class CaptureProcess(_Process):
-    """One run of the capture process of a local microphone.
+def open_device(
+    device: str,
+    *,
+    exact: bool = False,
+    channels: int | None = None,
+    channel: int | None = None,
+    latency: float = LATENCY_SECONDS,
+) -> Capture:
+    """Start to capture from a local microphone.
 
     Parameters
     ----------
@@ -174,76 +205,38 @@ class CaptureProcess(_Process):
         Selected channel, counted from 1; by default the blocks have all of up to eight.
     latency : float
         Length of PortAudio's buffer in seconds.
-
-    Raises
-    ------
-    DeviceError
-        If the device is missing, cannot be opened or has too few channels, with the message of the
-        capture process; or if PortAudio hangs.
-    SourceError
-        If PortAudio is missing, cannot start, or crashes.
     """
-
-    _hangs, _crashes = _HANGS, _CRASHES
-
-    def __init__(
-        self,
-        device: str,
-        *,
-        exact: bool = False,
-        channels: int | None = None,
-        channel: int | None = None,
-        latency: float = LATENCY_SECONDS,
-    ) -> None:
-        arguments = [device, str(channels or 0), str(channel or 0), str(latency)]
-        arguments += ["exact"] if exact else []
-        process = subprocess.Popen(  # noqa: S603  our own module
-            [*_CAPTURE, *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
-            bufsize=0,
-        )
-        super().__init__(process, _START_SECONDS, Flag())
+    arguments = [device, str(channels or 0), str(channel or 0), str(latency)]
+    arguments += ["exact"] if exact else []
+    process = subprocess.Popen(  # noqa: S603  our own module
+        [*_CAPTURE, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,  # PortAudio fills a disk when a device vanishes
+        bufsize=0,
+    )
+    return Capture(process, _START_SECONDS, Flag(), _HANGS, _CRASHES)
 
 
-class NetworkProcess(_Process):
-    """One run of the capture process of a network microphone.
+def open_address(address: str, stop: Flag, channel: int | None = None) -> Capture:
+    """Start to capture from a network microphone.
 
     Parameters
     ----------
     channel : int or None
         Selected channel, counted from 1; by default the blocks have all, for a topic the first one.
-
-    Raises
-    ------
-    DeviceError
-        If there is no sound, with the message of the capture process; or if it was stopped.
     """
-
-    _hangs = _crashes = "the capture process does not answer"
-
-    def __init__(self, address: str, stop: Flag, channel: int | None = None) -> None:
-        pipe = subprocess.PIPE
-        process = subprocess.Popen(  # noqa: S603  our own modules
-            [*(_TOPIC_CAPTURE if is_topic(address) else _NETWORK_CAPTURE), str(channel or 0)],
-            stdin=pipe,
-            stdout=pipe,
-            stderr=pipe,
-            bufsize=0,
-        )
-        assert process.stdin is not None
-        process.stdin.write(address.encode())
-        process.stdin.close()
-        super().__init__(process, _NETWORK_START_SECONDS, stop)
-
-    def _ended(self) -> None:
-        assert self._process.stderr is not None
-        said = self._process.stderr.read().decode(errors="replace").splitlines()
-        if said:
-            raise DeviceError(said[-1])
-
-
-Capture = CaptureProcess | NetworkProcess
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(  # noqa: S603  our own modules
+        [*(_TOPIC_CAPTURE if is_topic(address) else _NETWORK_CAPTURE), str(channel or 0)],
+        stdin=pipe,
+        stdout=pipe,
+        stderr=pipe,
+        bufsize=0,
+    )
+    assert process.stdin is not None
+    process.stdin.write(address.encode())
+    process.stdin.close()
+    return Capture(process, _NETWORK_START_SECONDS, stop, _NO_ANSWER, _NO_ANSWER)
 
 
 def _block(

@@ -64,7 +64,7 @@ class Course(Protocol):
 
 
 class FastMicrophone:
-    """One run of the capture process, as `CaptureProcess` has it.
+    """One run of the capture process, as `Capture` has it.
 
     Parameters
     ----------

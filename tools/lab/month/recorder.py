@@ -129,7 +129,7 @@ def main() -> None:
         del exact, channels, channel, latency
         return FastMicrophone(state, sound, month, rng)
 
-    setattr(microphone, "CaptureProcess", capture)  # noqa: B010  it is imported there
+    setattr(microphone, "open_device", capture)  # noqa: B010  it is imported there
     setattr(os, "fsync", folder.note_synced)  # noqa: B010  a power cut takes what is not synced
     record_microphones(load_settings(None, folder.settings(), {}), stop)
 
