@@ -127,19 +127,12 @@ def record_microphones(
     return summary
 
 
-def check_recording(settings: Settings) -> None:
-    """Check whether microphones can be recorded with these settings, without side effects.
-
-    Raise `LogError` if the log folder is not writable. Raise `SourceError` if a microphone's
-    address is invalid, or needs ffmpeg and it is missing. Raise `ModelError, ConfigurationError` as
-    `record_files`.
-    """
-    if problems := recording_problems(settings):
-        raise problems[0]
-
-
 def recording_problems(settings: Settings) -> list[HearthlogError]:
-    """Return the errors of recording microphones with these settings, without side effects."""
+    """Return the errors of recording microphones with these settings, without side effects.
+
+    They are a `LogError` if the log folder is not writable, a `SourceError` if a microphone's
+    address is invalid, or needs ffmpeg and it is missing, and errors as of `record_files`.
+    """
     from hearthlog.recorder.sources.microphone import check_device  # noqa: PLC0415  as above
 
     problems: dict[str, HearthlogError] = {}  # by message: microphones may share a model

@@ -1,6 +1,6 @@
 """Encoded messages of a stream: its description, `/rosout` lines and `/diagnostics`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import repeat
 from typing import Any, NamedTuple
 
@@ -11,6 +11,7 @@ from hearthlog.recorder.events import OK, WARNING, Gap, Notice, SourceHealth
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
 from hearthlog.schemas.messages.message_types import (
     encode,
     header,
@@ -94,10 +95,13 @@ class EncodedMessage(NamedTuple):
     data: bytes  # CDR
 
 
-def encoded_messages(
-    topic_name: str, log_times: Int64, rows: Sequence[bytes]
+def column_messages(
+    topic_name: str, typename: str, log_times: Int64, columns: Mapping[str, Column]
 ) -> list[EncodedMessage]:
-    """Return the messages of one topic from their log times and CDR rows."""
+    """Return the messages of one topic from their log times and columns."""
+    if not len(log_times):
+        return []
+    rows = encode_rows(typename, columns, len(log_times))
     fields = zip(log_times.tolist(), [topic_name] * len(rows), rows, strict=True)
     # `EncodedMessage` itself takes three times as long, 150,000 times in an hour.
     return list(map(tuple.__new__, repeat(EncodedMessage), fields))

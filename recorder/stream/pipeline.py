@@ -334,7 +334,8 @@ class Pipeline:
         if classifier is not None:
             stream = LabelStream(self.microphone, labelling, classifier, self._source)
             self._streams[labelling] = stream
-            self._follow(stream, frame, 0 if earlier is None else frame - earlier.delay)
+            unlabelled = 0 if earlier is None else frame - earlier.labeller.timing.delay
+            self._follow(stream, frame, unlabelled)
         opening = self.notice_messages("model", stamp, _from_frame(labelling, model, frame))
         if classifier is not None and (lacking := self.lacking_embeddings(classifier)):
             opening += self.notice_messages("model", stamp, Notice(WARNING, lacking))
@@ -363,7 +364,7 @@ class Pipeline:
         if floors is not None:
             floors = floors[max(len(floors) - len(recent), 0) :]
         known = Auxiliary(self._recent_directions, self._recent_embeddings)
-        stream.follow(recent, floors, stamps, frame, unlabelled, known)
+        stream.labeller.follow(recent, floors, stamps, frame, unlabelled, known)
 
     def notice_messages(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
         """Convert a notice to messages.

@@ -14,10 +14,10 @@ from hearthlog.models.features.window_inputs import mean_and_std
 from hearthlog.models.labels.labeller import FrameLabels, segment_columns
 from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Segment
-from hearthlog.recorder.stream.messages import EncodedMessage, encoded_messages, segment_line
-from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
+from hearthlog.recorder.stream.messages import EncodedMessage, column_messages, segment_line
+from hearthlog.schemas.arrays import Bool, Float32, Indices, Int64
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.cdr_codec import Column, encode_rows
+from hearthlog.schemas.messages.cdr_codec import Column
 from hearthlog.schemas.messages.topics import (
     LIVE,
     ROSOUT,
@@ -114,8 +114,7 @@ class FeatureMessages:
             **arrays,
         }
         typename = message_types.FEATURES if kind == "features" else message_types.STATISTICS
-        name, rows = topic(self._microphone, kind), encode_rows(typename, columns, len(stamps))
-        return encoded_messages(name, stamps, rows)
+        return column_messages(topic(self._microphone, kind), typename, stamps, columns)
 
 
 _GATE, _GATE_FRAMES = 2.0, 8  # dB above the floor, and the window, as in the models
@@ -186,8 +185,6 @@ def embedding_messages(
     known : np.ndarray [shape=(m,)], int64
         Log times: starts of the last frames of the windows, in nanoseconds of UTC.
     """
-    if not len(known):
-        return []
     columns: dict[str, Column] = {
         "header.stamp": embeddings.stamps,
         "header.frame_id": microphone,
@@ -195,9 +192,8 @@ def embedding_messages(
         "frames": np.full(len(known), WINDOW_FRAMES, np.uint32),
         "values": embeddings.values,
     }
-    rows = encode_rows(message_types.EMBEDDING, columns, len(known))
     name = topic(microphone, "embedding")
-    return encoded_messages(name, known, rows)
+    return column_messages(name, message_types.EMBEDDING, known, columns)
 
 
 def direction_messages(
@@ -217,9 +213,8 @@ def direction_messages(
         "azimuth": directions.azimuths,
         "confidence": directions.confidences,
     }
-    rows = encode_rows(message_types.DIRECTION, columns, len(known))
     name = topic(microphone, "direction")
-    return encoded_messages(name, known, rows)
+    return column_messages(name, message_types.DIRECTION, known, columns)
 
 
 class LabelStream:
@@ -227,6 +222,8 @@ class LabelStream:
 
     Attributes
     ----------
+    labeller : Labeller or NamesLabeller
+        Follows another stream.
     classes : tuple of str
         Names of the columns of the probabilities.
     segments_converged : bool
@@ -248,34 +245,7 @@ class LabelStream:
         self.last: FrameLabels | None = None
         self._microphone = microphone
         self._labelling = labelling
-        self._labeller = labeller_of(classifier, microphone, embedding)
-
-    @property
-    def delay(self) -> int:
-        """Delay of a label in frames."""
-        return self._labeller.timing.delay
-
-    def follow(  # noqa: PLR0913, PLR0917
-        self,
-        features: Float32,
-        floors: Float64 | None,
-        stamps: Int64,
-        frame: int,
-        unlabelled: int,
-        auxiliary: Auxiliary,
-    ) -> None:
-        """Replace another stream before a frame; as `Labeller.follow`.
-
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-            Features of the last frames before it.
-        floors : np.ndarray [shape=(m, b)], float64, or None
-        stamps : np.ndarray [shape=(n,)], int64
-        auxiliary : Auxiliary
-            Auxiliary inputs of at least the last second before it.
-        """
-        self._labeller.follow(features, floors, stamps, frame, unlabelled, auxiliary)
+        self.labeller = labeller_of(classifier, microphone, embedding)
 
     def push(
         self,
@@ -294,11 +264,11 @@ class LabelStream:
             Starts of the frames in nanoseconds of UTC.
         """
         self.last = None
-        labels, segments = self._labeller.push(features, floors, first, stamps, auxiliary)
+        labels, segments = self.labeller.push(features, floors, first, stamps, auxiliary)
         if not len(labels.frames):
             return []
         self.last = labels
-        self.segments_converged |= self._labeller.segments_converged
+        self.segments_converged |= self.labeller.segments_converged
         columns = labels.columns(self._microphone)
         return [
             *self._segment_messages(segments),
@@ -313,7 +283,7 @@ class LabelStream:
         end : int
             End of the sound, in nanoseconds of UTC.
         """
-        segments = self._labeller.close(end)
+        segments = self.labeller.close(end)
         self.segments_converged |= bool(segments)
         return self._segment_messages(segments)
 
@@ -333,5 +303,4 @@ class LabelStream:
         self, kind: str, typename: str, log_times: Int64, columns: Mapping[str, Column]
     ) -> list[EncodedMessage]:
         name = labelling_topic(self._microphone, self._labelling, kind)
-        rows = encode_rows(typename, columns, len(log_times)) if len(log_times) else []
-        return encoded_messages(name, log_times, rows)
+        return column_messages(name, typename, log_times, columns)

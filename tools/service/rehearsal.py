@@ -16,7 +16,7 @@ from pathlib import Path
 from hearthlog.recorder.addresses import is_address
 from hearthlog.recorder.config import Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.recording import check_recording
+from hearthlog.recorder.recording import recording_problems
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.tools.service.unit import STATE, Needs
 
@@ -40,7 +40,8 @@ def _rehearsed(settings: Settings, folder: Path) -> Needs:
     _check_folder(output, folder)
     is_made = output.is_relative_to(STATE) and not os.access(STATE, os.W_OK)  # by systemd
     there = Path(tempfile.gettempdir()) if is_made else output
-    check_recording(settings.model_copy(update={"output": there}))
+    if problems := recording_problems(settings.model_copy(update={"output": there})):
+        raise problems[0]
     models = {settings.model, *(each.model for each in settings.microphone)} - {None}
     files = [str(folder / model) for model in models if model is not None and model.exists()]
     devices = [name for each in settings.microphone for name in (each.device, each.fallback)]
