@@ -264,5 +264,5 @@ def test_a_long_log_is_counted_without_being_kept(monkeypatch):
     writer = LogStreamWriter(BytesIO(), [Topic("/mic/audio", message_types.RAW_AUDIO)])
     for number in range(1000):
         writer.write_messages([(START + number, "/mic/audio", bytes(20_000))])
-    writer.finish("long.mcap")
+    writer.end("long.mcap")
     assert max(batches) < 5 << 20 < 19 << 20 < sum(batches)

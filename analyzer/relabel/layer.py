@@ -416,7 +416,7 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
                 writer.write_columns(batch)
             record = layer_record(metadata, job.log.name, labelled.node, more)
             writer.add_metadata(HEARTHLOG_METADATA, record)
-            writer.finish(job.layer.name)
+            writer.end(job.layer.name)
     except LogError:
         if read_layer_metadata(job.layer) != metadata:  # otherwise another run was quicker
             raise

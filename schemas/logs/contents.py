@@ -214,18 +214,8 @@ _MOST = 1 << 63
 
 def as_metadata(contents: LogContents) -> dict[str, str] | None:
     """Build the contents record; None if it would be large."""
-    text = json.dumps(
-        {
-            "topics": contents.topics,
-            "frames": contents.frames,
-            "segments": contents.segments,
-            "seconds": contents.seconds,
-            "unsure": contents.unsure,
-            "gaps": contents.gaps,
-            "streams": contents.streams,
-            "health": contents.health,
-        }
-    )
+    recorded = [each.name for each in fields(contents) if each.compare]
+    text = json.dumps({name: getattr(contents, name) for name in recorded})
     if len(text) > _LARGEST:
         return None
     return {"version": _VERSION, "contents": text, "sha256": _digest(text)}

@@ -243,8 +243,8 @@ class LogStreamWriter:
         """End the chunk in progress."""
         self._writer.flush()
 
-    def finish(self, name: str) -> None:
-        """Finish the log."""
+    def end(self, name: str) -> None:
+        """Write the index and the other records at the end of the log."""
         self._writer.flush()
         for topic, channel in self._channels.items():
             self._topics[topic].messages = self._writer.message_counts.get(channel, 0)
@@ -253,7 +253,7 @@ class LogStreamWriter:
         self._writer.finish()
 
 
-class LogWriter:
+class LogWriter(LogStreamWriter):
     """Log that is being written.
 
     `flush` hands data to the operating system, and after `sync` they survive a power cut; only
@@ -288,10 +288,10 @@ class LogWriter:
         self._stream = _create(path, self.active_path)
         self._status = os.fstat(self._stream.fileno())
         try:
-            self._content = LogStreamWriter(self._stream, topics)
-            self._content.add_metadata(HEARTHLOG_METADATA, metadata)
+            super().__init__(self._stream, topics)
+            self.add_metadata(HEARTHLOG_METADATA, metadata)
             for attachment in attachments:
-                self._content.add_attachment(attachment, created)
+                self.add_attachment(attachment, created)
         except OSError:
             self.abandon()
             self.discard_unsynced()
@@ -304,29 +304,14 @@ class LogWriter:
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
         """Append one encoded message, as `write_messages` does."""
-        self._content.write_messages([(log_time, topic, data)])
-
-    def write_messages(self, messages: Sequence[tuple[int, str, bytes]]) -> None:
-        """Append encoded messages, as `LogStreamWriter.write_messages` does.
-
-        Raise `OSError` if the file cannot be written.
-        """
-        self._content.write_messages(messages)
-
-    def write_columns(self, batch: Sequence[TopicBatch]) -> None:
-        """Append messages of several topics, as `LogStreamWriter.write_columns` does.
-
-        Raise `LogError` if a message cannot be encoded; see `encode_groups`. Raise `OSError` if
-        the file cannot be written.
-        """
-        self._content.write_columns(batch)
+        self.write_messages([(log_time, topic, data)])
 
     def flush(self) -> None:
         """End the chunk and pass it to the operating system.
 
         Raise `OSError` if the file cannot be written.
         """
-        self._content.flush()
+        super().flush()
         self._stream.flush()
 
     def sync(self) -> None:
@@ -344,7 +329,7 @@ class LogWriter:
 
         Raise `OSError` if the file cannot be written.
         """
-        self._content.finish(self.path.name)
+        self.end(self.path.name)
         self._stream.flush()
         self.sync()
         self._stream.close()
