@@ -60,7 +60,7 @@ class MicrophoneStream:
     ) -> None:
         self._settings = settings
         self._source = source
-        self._device = source.device
+        self.device = source.device
         self._next_frame = 0
         self._end = 0  # of the last frame, in nanoseconds of UTC
         self._drops = False  # frames, while the log accepts none
@@ -113,15 +113,10 @@ class MicrophoneStream:
         self._end = int(frames.stamps[-1]) + FRAME_NANOSECONDS
         return events
 
-    @property
-    def device(self) -> str:
-        """Name of the device in use."""
-        return self._device
-
     def device_changes(self) -> bool:
         """Update the device from the source; return whether it changed."""
-        before, self._device = self._device, self._source.device
-        return before != self._device
+        before, self.device = self.device, self._source.device
+        return before != self.device
 
     def change_models(
         self, changes: list[ModelChange], frames: Frames | None, now: int
@@ -153,7 +148,7 @@ class MicrophoneStream:
     def describe(self) -> LogDescription:
         """Describe the logs of this microphone."""
         features, models = self.pipeline.feature_set, self.models
-        info = stream_info(self.pipeline.microphone, self._device, features, models.model)
+        info = stream_info(self.pipeline.microphone, self.device, features, models.model)
         secondary = {name: loaded.model for name, loaded in models.secondary().items()}
         return describe_log(
             self._settings, info, features, models.model, secondary, self.pipeline.embedding
@@ -282,7 +277,7 @@ class RecordingSession:
         for name, stream in self._streams.items():
             for labelling, (model, classifier) in stream.models.in_use.items():
                 of_it = labelling == LIVE or is_by_names(model)
-                if of_it and (why := stream.pipeline.lacking_embeddings(classifier)):
+                if of_it and (why := classifier.lacking_embeddings(stream.pipeline.embedding)):
                     say(f"{name}: model {model.name}: {why}")
 
     def add(self, microphone: str, event: Event) -> None:

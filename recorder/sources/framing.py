@@ -225,12 +225,17 @@ class Framer:
     """Cuts the sound of one microphone into frames, over all runs of its capture process.
 
     Samples of a frame are contiguous: after a loss the next frame begins with the first new sample.
+
+    Attributes
+    ----------
+    last_stamp : int
+        Stamp of the last frame in nanoseconds of UTC; 0 before the first one.
     """
 
     def __init__(self) -> None:
         self._next_frame = 0
         self._end: int | None = None  # of the last frame, on CLOCK_MONOTONIC
-        self._last_stamp = 0
+        self.last_stamp = 0
         self._end_offset = 0  # CLOCK_REALTIME less CLOCK_MONOTONIC at that end, in nanoseconds
         self._reason = ""
         self._rate = float(SAMPLE_RATE)
@@ -250,11 +255,6 @@ class Framer:
     def ppm(self) -> float:
         """Deviation of the microphone's clock, in parts per million; positive is faster."""
         return self._clock.ppm
-
-    @property
-    def last_stamp(self) -> int:
-        """Stamp of the last frame in nanoseconds of UTC; 0 before the first one."""
-        return self._last_stamp
 
     def begin(
         self,
@@ -357,7 +357,7 @@ class Framer:
         self._next_frame += count
         self._end = int(times[-1]) + FRAME_NANOSECONDS
         self._end_offset = self._wall_offset
-        self._last_stamp = int(stamps[-1])
+        self.last_stamp = int(stamps[-1])
         return [complete] if gap is None else [gap, complete]
 
     def _times(self, count: int) -> Int64:

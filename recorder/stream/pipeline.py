@@ -70,6 +70,8 @@ class Pipeline:
 
     Attributes
     ----------
+    embedding : EmbeddingSource or None
+        The network behind the embeddings; None without embeddings.
     last_frames : Frames or None
         Frames of the last push, after the infrasound filter.
     """
@@ -91,11 +93,11 @@ class Pipeline:
         self.last_frames: Frames | None = None
         self.last_reports: list[SourceHealth] = []
         live = {} if classifier is None else {LIVE: classifier}
-        self._source = embedding if embedder is None else embedder.source
+        self.embedding = embedding if embedder is None else embedder.source
         self._embeddings = None if embedder is None else MicrophoneEmbeddings(embedder, features)
         self._recent_embeddings = NO_EMBEDDINGS
         self._streams = {
-            labelling: LabelStream(microphone, labelling, one, self._source)
+            labelling: LabelStream(microphone, labelling, one, self.embedding)
             for labelling, one in (live | dict(secondary or {})).items()
         }
         window, width = features.window_frames, features.width
@@ -103,7 +105,7 @@ class Pipeline:
         self._features = features.extractor()
         statistics = RollingStatistics(window, width)
         self._feature_messages = FeatureMessages(microphone, statistics, statistics_every)
-        self.most_ahead = 0 if self._source is None else DELAY_FRAMES
+        self.most_ahead = 0 if self.embedding is None else DELAY_FRAMES
         self._privacy_filter = (
             PrivacyFilter(private, width, window, self.most_ahead) if private else None
         )
@@ -123,11 +125,6 @@ class Pipeline:
     @property
     def _live(self) -> LabelStream | None:
         return self._streams.get(LIVE)
-
-    @property
-    def embedding(self) -> EmbeddingSource | None:
-        """The network behind the embeddings; None without embeddings."""
-        return self._source
 
     @property
     def classes(self) -> tuple[str, ...] | None:
@@ -332,12 +329,12 @@ class Pipeline:
         earlier = self._streams.pop(labelling, None)
         closing = [] if earlier is None else earlier.close(stamp)
         if classifier is not None:
-            stream = LabelStream(self.microphone, labelling, classifier, self._source)
+            stream = LabelStream(self.microphone, labelling, classifier, self.embedding)
             self._streams[labelling] = stream
             unlabelled = 0 if earlier is None else frame - earlier.labeller.timing.delay
             self._follow(stream, frame, unlabelled)
         opening = self.notice_messages("model", stamp, _from_frame(labelling, model, frame))
-        if classifier is not None and (lacking := self.lacking_embeddings(classifier)):
+        if classifier is not None and (lacking := classifier.lacking_embeddings(self.embedding)):
             opening += self.notice_messages("model", stamp, Notice(WARNING, lacking))
         if unknown := self.unknown_private():
             names = ", ".join(map(repr, unknown))
@@ -346,10 +343,6 @@ class Pipeline:
             )
             opening += self.notice_messages("model", stamp, Notice(WARNING, text))
         return [*held, *closing], opening
-
-    def lacking_embeddings(self, classifier: Classifier) -> str:
-        """Return which embeddings a model needs and does not get; empty if none is missing."""
-        return classifier.lacking_embeddings(self._source)
 
     def unknown_private(self) -> list[str]:
         """Return the private classes that the model in use lacks."""
