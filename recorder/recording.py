@@ -29,7 +29,7 @@ from hearthlog.recorder.recording_session import (
     RecordingSession,
     RecordingSummary,
 )
-from hearthlog.recorder.sources.audio_files import FileSource, LongBlocks
+from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
@@ -66,8 +66,8 @@ def record_files(
         recovered = recover_active(settings.output, settings.node)
         sources = {settings.microphone[0].name: source}
         # Clip notices are stamped with their block, so blocks stay short if clips are kept.
-        joins = not source.realtime and settings.keep_audio == "off"
-        summary = _record(settings, sources, stop, reload_requests, state=state, joins_blocks=joins)
+        source.joins_blocks = not source.realtime and settings.keep_audio == "off"
+        summary = _record(settings, sources, stop, reload_requests, state=state)
     summary.recovered = recovered
     return summary
 
@@ -257,8 +257,6 @@ def _record(  # noqa: PLR0913, PLR0917
     reload_requests: ReloadRequests | None,
     lock: FolderLock | None = None,
     state: RecorderState | None = None,
-    *,
-    joins_blocks: bool = False,
 ) -> RecordingSummary:
     with ExitStack() as stack:
         # A long-running recorder continues without a scenario that no longer works.
@@ -278,8 +276,6 @@ def _record(  # noqa: PLR0913, PLR0917
         session.report_missing_embeddings()
         manager = ServiceManager(sources)
         try:
-            if joins_blocks:
-                sources = {name: LongBlocks(source) for name, source in sources.items()}
             for microphone, event in merged_events(sources, stop):
                 session.add(microphone, event)
                 manager.add(microphone, event)

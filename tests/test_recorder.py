@@ -20,7 +20,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import OK, READING, Frames, Gap, SourceHealth
-from hearthlog.recorder.sources.audio_files import FileSource, LongBlocks
+from hearthlog.recorder.sources.audio_files import FileSource, long_blocks
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
@@ -181,7 +181,7 @@ def test_messages_of_long_blocks_are_those_of_short_ones(tmp_path, model_file, p
         return sorted(pushed, key=lambda m: (m.log_time, m.topic))
 
     short = messages(source.events(Event()))
-    joined = list(LongBlocks(FileSource([tmp_path / "noise.wav"], START)).events(Event()))
+    joined = list(long_blocks(FileSource([tmp_path / "noise.wav"], START).events(Event())))
     assert lengths(joined) == [1200, 300]
     assert messages(joined) == short
     reports = [decode(m.data, DIAGNOSTICS) for m in short if m.topic == "/diagnostics"]
@@ -204,7 +204,7 @@ def test_long_blocks_end_at_gaps_and_where_the_source_fails():
                     yield Gap(end, end, "a gap", 0)
             raise SourceError("the file is damaged")
 
-    events = LongBlocks(Source()).events(Event())
+    events = long_blocks(Source().events(Event()))
     assert lengths(itertools.islice(events, 7)) == [400, 1200, 200]
     with pytest.raises(SourceError, match="damaged"):
         next(events)

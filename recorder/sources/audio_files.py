@@ -19,7 +19,6 @@ from hearthlog.recorder.events import (
     Event,
     Frames,
     Gap,
-    SoundSource,
     SourceHealth,
 )
 from hearthlog.recorder.sources.decoding import check_channels, read_audio
@@ -92,6 +91,7 @@ class FileSource:
         self._paths = paths
         self._start = start
         self.realtime = realtime
+        self.joins_blocks = False
         self._channels = channels
         self._channel = channel
         self._problem = ""
@@ -120,9 +120,14 @@ class FileSource:
     def events(self, stop: Flag) -> Iterator[Event]:
         """Yield the frames, the gaps between files, and the health of the source.
 
-        The health comes every ten seconds of sound. Raise `SourceError` if a file cannot be opened
-        any more, or if all files together are shorter than a frame.
+        With `joins_blocks`, as of `long_blocks`. The health comes every ten seconds of sound. Raise
+        `SourceError` if a file cannot be opened any more, or if all files together are shorter than
+        a frame.
         """
+        events = self._events(stop)
+        return long_blocks(events) if self.joins_blocks else events
+
+    def _events(self, stop: Flag) -> Iterator[Event]:
         began = time.monotonic()
         next_frame, end, report = 0, self._start, 0
         for item in _finite_runs(takewhile(lambda _: not stop.is_set(), self._frames())):
@@ -207,44 +212,30 @@ class FileSource:
         return late >= step
 
 
-class LongBlocks:
-    """Wraps a source to yield its frames in blocks of a minute.
+def long_blocks(events: Iterator[Event]) -> Iterator[Event]:
+    """Join frames to blocks of a minute; reports between frames become the `reports` of the frames.
 
-    Parameters
-    ----------
-    source : SoundSource
-        Its reports between frames become the `reports` of the frames.
+    Pending events come before an error.
     """
-
-    def __init__(self, source: SoundSource) -> None:
-        self._source = source
-
-    @property
-    def device(self) -> str:
-        """Name of the source."""
-        return self._source.device
-
-    def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield the events of the source; pending events come before an error."""
-        held = list[Frames | SourceHealth]()
-        frames = 0
-        try:
-            for event in self._source.events(stop):
-                if isinstance(event, Frames):
-                    frames += len(event.stamps)
-                elif isinstance(event, Gap) or not held:
-                    yield from _joined(held)
-                    held, frames = [], 0
-                    yield event
-                    continue
-                held.append(event)
-                if frames >= _LONG_FRAMES:
-                    yield from _joined(held)
-                    held, frames = [], 0
-        except SourceError:
-            yield from _joined(held)
-            raise
+    held = list[Frames | SourceHealth]()
+    frames = 0
+    try:
+        for event in events:
+            if isinstance(event, Frames):
+                frames += len(event.stamps)
+            elif isinstance(event, Gap) or not held:
+                yield from _joined(held)
+                held, frames = [], 0
+                yield event
+                continue
+            held.append(event)
+            if frames >= _LONG_FRAMES:
+                yield from _joined(held)
+                held, frames = [], 0
+    except SourceError:
         yield from _joined(held)
+        raise
+    yield from _joined(held)
 
 
 def _joined(events: Sequence[Frames | SourceHealth]) -> Iterator[Event]:

@@ -42,7 +42,6 @@ from hearthlog.recorder.stream.stages import (
     FeatureMessages,
     LabelStream,
     MicrophoneEmbeddings,
-    RollingStatistics,
     direction_messages,
     embedding_messages,
 )
@@ -103,8 +102,7 @@ class Pipeline:
         window, width = features.window_frames, features.width
         self._infrasound = InfrasoundFilter()
         self._features = features.extractor()
-        statistics = RollingStatistics(window, width)
-        self._feature_messages = FeatureMessages(microphone, statistics, statistics_every)
+        self._feature_messages = FeatureMessages(microphone, window, width, statistics_every)
         self.most_ahead = 0 if self.embedding is None else DELAY_FRAMES
         self._privacy_filter = (
             PrivacyFilter(private, width, window, self.most_ahead) if private else None
@@ -387,21 +385,15 @@ class Pipeline:
 
     def _push_gap(self, gap: Gap) -> list[EncodedMessage]:
         held = self._close_filter()
-        self._infrasound.restart()
-        self._features.restart()
-        if self._directions is not None:
-            self._directions.restart()
-        if self._embeddings is not None:
-            self._embeddings.restart()
-        self._embedding_filter.restart()
-        self._feature_messages.restart()
+        stages = self._infrasound, self._features, self._embedding_filter, self._feature_messages
+        for stage in (*stages, self._floor, self._directions, self._embeddings):
+            if stage is not None:
+                stage.restart()
         self._recent = None
         self._recent_floors = None
         self._last_floor = np.empty(0)
         self._recent_directions = NOWHERE
         self._recent_embeddings = NO_EMBEDDINGS
-        if self._floor is not None:
-            self._floor.restart()
         data = encode_gap(self.microphone, gap.start, gap.end, gap.reason, gap.frames_lost)
         return [
             *held,
