@@ -59,7 +59,7 @@ def examine_live(folder: Path) -> list[State]:
     check_allowed(folder)
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; name the one that the recorder writes to")
-    locks = node_locks(folder)
+    locks = list(node_locks(folder))
     logs: dict[str, list[Path]] = {lock.node: [] for lock in locks}
     with suppress(LogError):
         for log in find_logs(folder):

@@ -33,7 +33,6 @@ from hearthlog.recorder.retention import (
 from hearthlog.recorder.stream.messages import EncodedMessage, diagnostics, notice_line
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.messages.topics import ROSOUT
 from hearthlog.schemas.new_files import (
     hand_over,
     locked_folder,
@@ -298,10 +297,7 @@ def report_messages(node: str, stamp: int, report: DiskReport) -> list[EncodedMe
     text = report.problem or report.done or "nothing to delete"
     health = SourceHealth(stamp, level, text, report.values)
     lines = [notice_line("disk", stamp, notice) for notice in report.notices()]
-    return [
-        diagnostics(f"{node} disk", health),
-        *(EncodedMessage(stamp, ROSOUT, line) for line in lines),
-    ]
+    return [diagnostics(f"{node} disk", health), *lines]
 
 
 def main() -> None:

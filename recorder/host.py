@@ -72,7 +72,7 @@ def machine_health(stamp: int, folder: Path, sys: Path = _SYS) -> SourceHealth:
         "temperature_celsius": None if temperature is None else f"{temperature:.1f}",
         "throttled": None if throttled is None else hex(throttled),
         "disk_free_bytes": _free_bytes(folder),
-        "memory_bytes": _memory(),
+        "memory_bytes": memory("RssAnon"),
     }
     known = {name: str(value) for name, value in values.items() if value is not None}
     problem = _problem(temperature, throttled or 0)
@@ -123,11 +123,14 @@ def _free_bytes(folder: Path) -> int | None:
     return None
 
 
-def _memory() -> int | None:
-    """Return the private memory of this process, in bytes."""
+def memory(field: str) -> int | None:
+    """Return a size in the status of this process, in bytes; `RssAnon` is its private memory.
+
+    The peak `VmHWM` is its own; that of `getrusage` would include the parent process.
+    """
     with suppress(OSError, ValueError, StopIteration):
-        lines = _STATUS.read_text(encoding="ascii").splitlines()
-        line = next(line for line in lines if line.startswith("RssAnon:"))
+        lines = _STATUS.read_text(encoding="ascii", errors="replace").splitlines()
+        line = next(line for line in lines if line.startswith(f"{field}:"))
         return int(line.split()[1]) * 1024
     return None
 

@@ -133,7 +133,7 @@ def test_the_first_line_names_the_device_and_the_model():
 
 def test_the_clock_that_was_set_back_is_a_gap_of_less_than_nothing():
     gap = Gap(START, START - 3 * 10**9, "the clock was set by -3.000 s", 0)
-    line = decode(gap_line("mic", gap), LOG)
+    line = decode(gap_line("mic", gap).data, LOG)
     assert line.msg == "gap of -3.00 s: the clock was set by -3.000 s"
 
 

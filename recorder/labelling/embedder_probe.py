@@ -5,7 +5,6 @@ also the child process: ``embedder_probe NAME FILE`` answers in one line of JSON
 """
 
 import json
-import re
 import signal
 import subprocess
 import sys
@@ -26,7 +25,7 @@ from hearthlog.models.embedding.networks import (
 )
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.errors import ModelError
-from hearthlog.recorder.host import module_command
+from hearthlog.recorder.host import memory, module_command
 from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
@@ -211,24 +210,11 @@ def main() -> None:
         answer = {
             "seconds": _window_seconds(embedder),
             "different_answers": embedder.different_answers(),
-            "megabytes": _most_megabytes(),
+            "megabytes": (memory("VmHWM") or 0) / 1024**2,
         }
     except ModelError as error:
         answer = {"error": str(error)}
     sys.stdout.write(json.dumps(answer) + "\n")
-
-
-def _most_megabytes() -> float:
-    """Return the peak memory of this process; 0 if unknown.
-
-    The value of `getrusage` would include the memory of the parent process.
-    """
-    try:
-        status = Path("/proc/self/status").read_text("ascii", "replace")
-    except OSError:
-        return 0.0
-    found = re.search(r"^VmHWM:\s+(\d+) kB$", status, re.MULTILINE)
-    return int(found[1]) / 1024 if found else 0.0
 
 
 def _window_seconds(embedder: Embedder) -> float:

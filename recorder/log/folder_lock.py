@@ -141,16 +141,12 @@ class NodeLock(NamedTuple):
     is_held: bool | None
 
 
-def node_locks(folder: Path) -> list[NodeLock]:
-    """List the locks of recorders in a folder, by name; ignore other `.lock` files.
+def node_locks(folder: Path) -> Iterator[NodeLock]:
+    """Yield the locks of recorders in a folder, by name; ignore other `.lock` files.
 
     A lock is a regular file, not a link, with the name that `FolderLock` gives it, and holds a
     process number or nothing.
     """
-    return list(_node_locks(folder))
-
-
-def _node_locks(folder: Path) -> Iterator[NodeLock]:
     for path in sorted(folder.glob(".*.lock")):
         node = path.name.removeprefix(".").removesuffix(".lock")
         if not is_node_name(node):

@@ -25,7 +25,15 @@ _INFO, _WARN, _ERROR = 20, 30, 40  # levels of rcl_interfaces/msg/Log
 _LEVELS = {OK: _INFO, WARNING: _WARN}
 
 
-def info_line(info: Any) -> bytes:
+class EncodedMessage(NamedTuple):
+    """A message to be written to the log."""
+
+    log_time: int  # in nanoseconds of UTC
+    topic: str
+    data: bytes  # CDR
+
+
+def info_line(info: Any) -> EncodedMessage:
     """Format device and model as a line of `/rosout`."""
     labels = "no model, no labels"
     if info.model:
@@ -36,25 +44,25 @@ def info_line(info: Any) -> bytes:
     )
 
 
-def segment_line(microphone: str, segment: Segment, label: str) -> bytes:
+def segment_line(microphone: str, segment: Segment, label: str) -> EncodedMessage:
     """Format a segment, with its label and duration, as a line of `/rosout`."""
     duration = _seconds(segment.end - segment.start)
     text = f"{label} for {duration} ({100 * segment.confidence:.0f} %)"
     return _line(segment.decided_at, microphone, _INFO, text)
 
 
-def gap_line(microphone: str, gap: Gap) -> bytes:
+def gap_line(microphone: str, gap: Gap) -> EncodedMessage:
     """Format a gap as a line of `/rosout`, stamped at its end."""
     text = f"gap of {_seconds(gap.end - gap.start)}: {gap.reason}"
     return _line(gap.end, microphone, _WARN, text)
 
 
-def health_line(microphone: str, health: SourceHealth) -> bytes:
+def health_line(microphone: str, health: SourceHealth) -> EncodedMessage:
     """Format the state of a source as a line of `/rosout`."""
     return _line(health.stamp, microphone, _LEVELS.get(health.level, _ERROR), health.summary)
 
 
-def notice_line(microphone: str, stamp: int, notice: Notice) -> bytes:
+def notice_line(microphone: str, stamp: int, notice: Notice) -> EncodedMessage:
     """Format a notice as a line of `/rosout`.
 
     Parameters
@@ -65,19 +73,18 @@ def notice_line(microphone: str, stamp: int, notice: Notice) -> bytes:
     return _line(stamp, microphone, _LEVELS[notice.level], notice.text)
 
 
-def _line(stamp: int, microphone: str, level: int, text: str) -> bytes:
-    return encode(
-        message(
-            message_types.LOG,
-            stamp=time_message(stamp),
-            level=level,
-            name=f"hearthlog.{microphone}",
-            msg=text,
-            file="",
-            function="",
-            line=0,
-        )
+def _line(stamp: int, microphone: str, level: int, text: str) -> EncodedMessage:
+    line = message(
+        message_types.LOG,
+        stamp=time_message(stamp),
+        level=level,
+        name=f"hearthlog.{microphone}",
+        msg=text,
+        file="",
+        function="",
+        line=0,
     )
+    return EncodedMessage(stamp, ROSOUT, encode(line))
 
 
 def _seconds(duration: int) -> str:
@@ -85,14 +92,6 @@ def _seconds(duration: int) -> str:
 
 
 LOGGED_EVERY = 20  # frames between messages of statistics, which do not overlap
-
-
-class EncodedMessage(NamedTuple):
-    """A message to be written to the log."""
-
-    log_time: int  # in nanoseconds of UTC
-    topic: str
-    data: bytes  # CDR
 
 
 def column_messages(
@@ -133,10 +132,10 @@ def stream_info(microphone: str, device: str, features: FeatureSet, model: Model
 def opening_messages(info: Any, lines: Sequence[str] = ()) -> list[EncodedMessage]:
     """Return the first messages of every file: its `AudioStreamInfo`, and the same as text."""
     stamp, microphone = nanoseconds(info.header.stamp), info.header.frame_id
-    said = [notice_line(microphone, stamp, Notice(OK, line)) for line in lines]
     return [
         EncodedMessage(stamp, topic(microphone, "info"), encode(info)),
-        *(EncodedMessage(stamp, ROSOUT, line) for line in (info_line(info), *said)),
+        info_line(info),
+        *(notice_line(microphone, stamp, Notice(OK, line)) for line in lines),
     ]
 
 

@@ -48,7 +48,7 @@ from hearthlog.recorder.stream.stages import (
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.message_types import encode_gap
-from hearthlog.schemas.messages.topics import LIVE, ROSOUT, EmbeddingSource, topic
+from hearthlog.schemas.messages.topics import LIVE, EmbeddingSource, topic
 
 if TYPE_CHECKING:
     from hearthlog.recorder.stream.directions import ArrayGeometry
@@ -369,7 +369,7 @@ class Pipeline:
         return self.release(
             [
                 diagnostics(subject, SourceHealth(stamp, *notice), self.microphone),
-                EncodedMessage(stamp, ROSOUT, notice_line(self.microphone, stamp, notice)),
+                notice_line(self.microphone, stamp, notice),
             ]
         )
 
@@ -399,7 +399,7 @@ class Pipeline:
             *held,
             *self._close(self._end),
             EncodedMessage(gap.end, topic(self.microphone, "gap"), data),
-            EncodedMessage(gap.end, ROSOUT, gap_line(self.microphone, gap)),
+            gap_line(self.microphone, gap),
         ]
 
     def _track_floor(self, features: Float32, first: int) -> Floors | None:
@@ -434,8 +434,7 @@ class Pipeline:
         messages = [diagnostics(self.microphone, with_floor, self.microphone)]
         if health.level != self._level:
             self._level = health.level
-            line = health_line(self.microphone, health)
-            messages.append(EncodedMessage(health.stamp, ROSOUT, line))
+            messages.append(health_line(self.microphone, health))
         return messages
 
 

@@ -20,7 +20,6 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column
 from hearthlog.schemas.messages.topics import (
     LIVE,
-    ROSOUT,
     EmbeddingSource,
     labelling_topic,
     topic,
@@ -271,8 +270,10 @@ class LabelStream:
             return encoded
         messages = []
         for one, segment in zip(encoded, segments, strict=True):
-            line = segment_line(self._microphone, segment, self.classes[segment.label])
-            messages += [one, EncodedMessage(segment.decided_at, ROSOUT, line)]
+            messages += [
+                one,
+                segment_line(self._microphone, segment, self.classes[segment.label]),
+            ]
         return messages
 
     def _messages(
