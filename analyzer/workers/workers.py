@@ -12,10 +12,10 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from contextvars import ContextVar
 from importlib import import_module
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Pipe
 from queue import SimpleQueue
 from threading import Lock
 from typing import Any, ParamSpec, Protocol, TypeVar
@@ -26,48 +26,6 @@ from hearthlog.recorder.host import keep_freed_blocks, module_command
 from hearthlog.schemas.blas import kernel_environment
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
 
-
-def pack_call(function: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
-    """Pickle a call."""
-    return pickle.dumps((function, args))
-
-
-def attempt(call: bytes) -> bytes:
-    """Run a call, and pickle its result or its exception."""
-    try:
-        function, args = pickle.loads(call)  # noqa: S301  sent by our own parent or client
-        return pickle.dumps((function(*args), None))
-    except Exception as error:  # noqa: BLE001  raised again where the reply is read
-        return pickle.dumps((None, _portable(error)))
-
-
-def read_reply(reply: bytes) -> Any:
-    """Return the result of a call, or raise its exception.
-
-    Raises
-    ------
-    Exception
-        The call's exception; with its traceback as a note, unless it is an error of hearthlog.
-    WorkerError
-        If the call's exception cannot be pickled.
-    """
-    value, error = pickle.loads(reply)  # noqa: S301  sent by our own worker
-    if error is not None:
-        raise error
-    return value
-
-
-def _portable(error: Exception) -> Exception:
-    """Return the error with its traceback as a note; a WorkerError if it cannot be pickled."""
-    if not isinstance(error, HearthlogError):
-        error.add_note("in a worker:\n" + "".join(traceback.format_exception(error)))
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301  made here
-    except Exception:  # noqa: BLE001  an error of any library, with anything in it
-        return WorkerError(f"{type(error).__name__}: {error}")
-    return error
-
-
 MAX_ATTEMPTS = 3  # of a task whose worker is killed
 _TIDY_SECONDS = 3.0  # for a task to remove unfinished files
 _SERVE = module_command("hearthlog.analyzer.workers")
@@ -77,8 +35,9 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-# concurrent.futures.ProcessPoolExecutor does not suffice: one killed worker fails all running
-# tasks, as does an exception that cannot be unpickled, and workers outlive a killed parent.
+# Neither concurrent.futures.ProcessPoolExecutor nor loky suffices: one killed worker fails all
+# tasks, as does an exception that cannot be unpickled; a shutdown leaves tasks no time to remove
+# their files; and workers outlive a killed parent.
 class Processes:
     """Local processes, each with a thread in this process that sends it one task after the other.
 
@@ -94,10 +53,8 @@ class Processes:
     def __init__(self, count: int, module: str | None = None) -> None:
         self.parallel = count
         self._threads = ThreadPoolExecutor(count, thread_name_prefix="worker")
-        self._mine = threading.local()
-        self._lock = threading.Lock()
-        self._alive: set[_Process] = set()
-        self._closed = False
+        self._processes = [_Process() for _ in range(count)]
+        self._idle = list(self._processes)  # the last one used is the next: it has started
         if module is not None:
             for _ in range(count):
                 self.submit(import_module, module)
@@ -111,44 +68,27 @@ class Processes:
 
         A task that has not begun is cancelled: its future raises CancelledError.
         """
-        with self._lock:
-            self._closed = True
         self._threads.shutdown(wait=False, cancel_futures=True)
-        for process in list(self._alive):
+        for process in self._processes:
             process.hang_up()
         self._threads.shutdown()
-        for process in self._alive:
+        for process in self._processes:
             process.end()
 
     def _run(self, function: Callable[..., T], args: tuple[Any, ...]) -> T:
-        call = pack_call(function, args)
-        for _ in range(MAX_ATTEMPTS):
-            process = self._process()
-            try:
-                return read_reply(process.ask(call))
-            except _LostError:
-                self._drop(process)
+        call = pickle.dumps((function, args))
+        process = self._idle.pop()
+        try:
+            for _ in range(MAX_ATTEMPTS):
+                try:
+                    return process.run(call)
+                except _LostError:
+                    process.end()
+        finally:
+            self._idle.append(process)
         raise WorkerError(
             f"the task lost its worker {MAX_ATTEMPTS} times: killed, or out of memory"
         )
-
-    def _process(self) -> "_Process":
-        """Return the process of this thread; start one if there is none."""
-        process: _Process | None = getattr(self._mine, "process", None)
-        if process is None:
-            with self._lock:
-                if self._closed:
-                    raise WorkerError("given up")
-                process = self._mine.process = _Process()
-                self._alive.add(process)
-        return process
-
-    def _drop(self, process: "_Process") -> None:
-        process.end()
-        self._mine.process = None
-        with self._lock:
-            if not self._closed:
-                self._alive.discard(process)
 
 
 class _LostError(Exception):
@@ -156,41 +96,60 @@ class _LostError(Exception):
 
 
 class _Process:
-    """A process that answers calls, until the other end of its pipe is closed."""
+    """A process that answers calls; it starts with the first call, and again after its end."""
 
     def __init__(self) -> None:
-        self._process = subprocess.Popen(  # noqa: S603  our own module
-            _SERVE,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-            env=dict.fromkeys(_THREADS, "1")
-            | kernel_environment()
-            | os.environ
-            | {"PYTHONPATH": os.pathsep.join(sys.path)},
-            process_group=0,  # Ctrl-C reaches the parent only, which then hangs up
-        )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._calls = Connection(os.dup(self._process.stdin.fileno()), readable=False)
-        self._replies = Connection(os.dup(self._process.stdout.fileno()), writable=False)
-        self._process.stdin.close()
-        self._process.stdout.close()
+        self._lock = Lock()
+        self._closed = False
+        self._process: subprocess.Popen[bytes] | None = None
 
-    def ask(self, call: bytes) -> bytes:
-        """Return the reply to a call."""
+    def run(self, call: bytes) -> Any:
+        """Return the result of a call, or raise its exception; `_LostError` if the process ends.
+
+        An exception has its traceback as a note, unless it is an error of hearthlog. One that
+        cannot be pickled is a WorkerError.
+        """
+        with self._lock:
+            if self._closed:
+                raise WorkerError("given up")
+            if self._process is None:
+                self._start()
         try:
             self._calls.send_bytes(call)
-            return self._replies.recv_bytes()
-        except (EOFError, OSError) as error:
-            raise _LostError from error
+            reply = self._replies.recv_bytes()
+        except (EOFError, OSError) as lost:
+            raise _LostError from lost
+        value, error = pickle.loads(reply)  # noqa: S301  sent by our own worker
+        if error is not None:
+            raise error
+        return value
+
+    def _start(self) -> None:
+        calls, self._calls = Pipe(duplex=False)
+        self._replies, replies = Pipe(duplex=False)
+        with calls, replies:
+            self._process = subprocess.Popen(  # noqa: S603  our own module
+                _SERVE,
+                stdin=calls.fileno(),
+                stdout=replies.fileno(),
+                env=dict.fromkeys(_THREADS, "1")
+                | kernel_environment()
+                | os.environ
+                | {"PYTHONPATH": os.pathsep.join(sys.path)},
+                process_group=0,  # Ctrl-C reaches the parent only, which then hangs up
+            )
 
     def hang_up(self) -> None:
-        """Close the pipe of calls, so that the process ends."""
-        self._calls.close()
+        """Close the pipe of calls, so that the process ends; refuse further calls."""
+        with self._lock:
+            self._closed = True
+            if self._process is not None:
+                self._calls.close()
 
     def end(self) -> None:
         """End the process, even if it hangs."""
+        if self._process is None:
+            return
         self._calls.close()
         try:
             self._process.wait(2 * _TIDY_SECONDS)
@@ -198,6 +157,7 @@ class _Process:
             self._process.kill()
             self._process.wait()
         self._replies.close()
+        self._process = None
 
 
 def serve() -> None:
@@ -213,7 +173,7 @@ def serve() -> None:
     waiting: SimpleQueue[bytes] = SimpleQueue()
     threading.Thread(target=_listen, args=(calls, waiting), daemon=True).start()
     while True:
-        replies.send_bytes(attempt(waiting.get()))
+        replies.send_bytes(_reply(waiting.get()))
 
 
 def _listen(calls: Connection, waiting: "SimpleQueue[bytes]") -> None:
@@ -225,6 +185,22 @@ def _listen(calls: Connection, waiting: "SimpleQueue[bytes]") -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(_TIDY_SECONDS)
         os._exit(1)
+
+
+def _reply(call: bytes) -> bytes:
+    """Run a call, and pickle its result or its exception."""
+    try:
+        function, args = pickle.loads(call)  # noqa: S301  sent by our own parent
+        return pickle.dumps((function(*args), None))
+    except Exception as error:  # noqa: BLE001  raised again by the parent
+        if not isinstance(error, HearthlogError):
+            error.add_note("in a worker:\n" + "".join(traceback.format_exception(error)))
+        reply = pickle.dumps((None, WorkerError(f"{type(error).__name__}: {error}")))
+        with suppress(Exception):  # an error of any library, with anything in it
+            portable = pickle.dumps((None, error))
+            pickle.loads(portable)  # noqa: S301  made here
+            reply = portable
+        return reply
 
 
 class Workers(Protocol):
