@@ -274,9 +274,9 @@ def test_a_layer_says_what_made_it(model, logs):
     log, behind = recorded_logs(logs)[:2]
     loaded = load_model(model)
     about = read_layer_metadata(relabel_path(log, loaded.name))
-    assert about.inputs.model_sha256 == loaded.sha256
-    assert about.inputs.input_sha256 == log_digest(log)
-    assert (about.inputs.before, about.inputs.behind) == ("", behind.stem)
+    assert about.model_sha256 == loaded.sha256
+    assert about.input_sha256 == log_digest(log)
+    assert (about.before, about.behind) == ("", behind.stem)
 
 
 def test_layers_are_sound(model, logs):

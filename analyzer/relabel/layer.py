@@ -10,12 +10,11 @@ from functools import lru_cache
 from itertools import chain, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.layers import Chain
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.analyzer.relabel.stream_labeller import (
     StreamLabeller,
@@ -32,10 +31,9 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.labels.labeller import FrameLabels, label_columns, segment_columns
 from hearthlog.models.labels.segments import Segment, StateRun
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.logs.files import relabel_path, stem
+from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.metadata import (
     HEARTHLOG_METADATA,
     earlier_digests,
@@ -50,13 +48,14 @@ from hearthlog.schemas.new_files import new_file, readers_of, replaced_file
 
 OpenRuns = Mapping[str, StateRun]  # open segments by microphone
 _RUN = ("label", "start", "frames", "confidence")
+_INPUTS = ("model", "model_sha256", "input_sha256", "before", "behind")
 
 
-class LayerInputs(NamedTuple):
-    """Inputs of a layer; equal inputs give equal labels and segments.
+class LayerMetadata(NamedTuple):
+    """Content of the `hearthlog` record of a layer; equal inputs give equal labels and segments.
 
-    `before` and `behind` are stems of the previous and next log; empty if there is none, or if it
-    was not decided yet whether the sound continues there.
+    The inputs are the first five. `before` and `behind` are stems of the previous and next log;
+    empty if there is none, or if it was not decided yet whether the sound continues there.
     """
 
     model: str
@@ -64,12 +63,6 @@ class LayerInputs(NamedTuple):
     input_sha256: str  # `log_digest` of the log
     before: str
     behind: str
-
-
-class LayerMetadata(NamedTuple):
-    """Content of the `hearthlog` record of a layer."""
-
-    inputs: LayerInputs
     open_at_start: OpenRuns  # the segments open at the start of the log
     open_at_end: OpenRuns
     loss: str  # unreadable parts of the log
@@ -96,44 +89,13 @@ def read_layer_metadata(layer: Path) -> LayerMetadata | None:
     try:
         with LogFile(layer) as file:
             record = {key: text for each in read_provenance(file) for key, text in each.items()}
-            microphones = {_microphone(channel.topic) for channel in file.channels.values()}
-        return LayerMetadata(
-            LayerInputs(*(record[name] for name in LayerInputs._fields)),
-            _read_runs(record["began"], microphones),
-            _read_runs(record["ended"], microphones),
-            record["lost"],
-        )
+            microphones = {channel.topic.split("/")[1] for channel in file.channels.values()}
+        inputs = (record[name] for name in _INPUTS)
+        open_runs = (_read_runs(record[name], microphones) for name in ("began", "ended"))
+        return LayerMetadata._make([*inputs, *open_runs, record["lost"]])
     except (KeyError, ValueError, TypeError, ArithmeticError, RecursionError, LogError) as error:
         why = error if isinstance(error, LogError) else f"{layer}: is no layer of `relabel`"
         raise LogError(f"{why}; move it away, and run again") from error
-
-
-def part_path(layer: Path) -> Path:
-    """Return a path for an unfinished layer: hidden, next to the layer, and unique."""
-    return layer.with_name(f".{layer.name}.{os.urandom(8).hex()}.part")
-
-
-def delete_parts(layer: Path) -> None:
-    """Delete the unfinished files of a layer left by this and other runs."""
-    for part in layer.parent.glob(f".{glob.escape(layer.name)}.*"):
-        with suppress(OSError):
-            part.unlink()
-
-
-def layer_record(
-    metadata: LayerMetadata, log: str, node: str, more: Mapping[str, str]
-) -> dict[str, str]:
-    """Make the `hearthlog` record of a layer."""
-    return provenance(
-        node,
-        log=log,
-        **more,
-        **metadata.inputs._asdict(),
-        began=_runs_text(metadata.open_at_start),
-        ended=_runs_text(metadata.open_at_end),
-        lost=metadata.loss,
-        made=_now(),
-    )
 
 
 def _now() -> str:
@@ -141,10 +103,6 @@ def _now() -> str:
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
     return f"{moment:%Y-%m-%dT%H:%M:%SZ}"
-
-
-def _microphone(topic: str) -> str:
-    return topic.split("/")[1]
 
 
 def _runs_text(runs: OpenRuns) -> str:
@@ -165,9 +123,6 @@ def _read_runs(text: str, microphones: Collection[str]) -> OpenRuns:
     return {name: StateRun(*(int(run[key]) for key in _RUN)) for name, run in fields.items()}
 
 
-_MOST_EARLIER = 1000  # logs: within so many a floor is forgotten, even if each has only a minute
-
-
 class Job(NamedTuple):
     """A log to label."""
 
@@ -181,49 +136,24 @@ class Job(NamedTuple):
     continues_layer: bool  # whether the segment open at the start comes from the previous layer
 
 
-def make_job(
-    chain: Chain, place: int, model: Model, model_path: Path, *, continues_layer: bool
-) -> Job:
-    """Make the job of one log of a chain, as if it had no layer.
-
-    Parameters
-    ----------
-    continues_layer : bool
-        Whether the segment open at the start comes from the previous layer.
-    """
-    log = chain.logs[place]
-    first = max(place - _MOST_EARLIER, 0) if continues_layer else 0
-    return Job(
-        log=log,
-        layer=relabel_path(log, model.name),
-        earlier=tuple(reversed(chain.logs[first:place])),
-        next_log=chain.logs[place + 1] if place + 1 < len(chain.logs) else None,
-        model=model_path,
-        model_sha256=model.sha256,
-        replaces=False,
-        continues_layer=continues_layer,
-    )
-
-
 def is_current(job: Job, metadata: LayerMetadata, log_sha256: str) -> bool:
     """Return whether a layer is up to date; its segment open at the start is not compared.
 
     Raise `LogError` if the layer is of another model, or of another log.
     """
-    inputs = metadata.inputs
-    if inputs.model_sha256 != job.model_sha256:
+    if metadata.model_sha256 != job.model_sha256:
         raise LogError(
-            f"{job.layer}: was made by another model of this name ({inputs.model_sha256[:12]}, not "
-            f"{job.model_sha256[:12]}); move it away, or give the model another name"
+            f"{job.layer}: was made by another model of this name ({metadata.model_sha256[:12]}, "
+            f"not {job.model_sha256[:12]}); move it away, or give the model another name"
         )
-    digest = inputs.input_sha256
+    digest = metadata.input_sha256
     if digest != log_sha256 and digest not in earlier_digests(job.log):
         raise LogError(
             f"{job.layer}: was made from another log of this name; move it away, and run again"
         )
     # If a neighbouring log was deleted since, the layer has more context than a new one would.
-    same_before = not job.earlier or stem(job.earlier[0]) == inputs.before
-    same_behind = job.next_log is None or stem(job.next_log) == inputs.behind
+    same_before = not job.earlier or stem(job.earlier[0]) == metadata.before
+    same_behind = job.next_log is None or stem(job.next_log) == metadata.behind
     return same_before and same_behind and not metadata.loss
 
 
@@ -231,84 +161,38 @@ _CHUNK_SPAN = 60 * NANOSECONDS  # readers of segments read only the minutes in w
 _PIECE_SPAN = 600 * NANOSECONDS  # labels encoded at once
 
 
-class LabelledSound(NamedTuple):
-    """Segments of a microphone in a log, as far as they are known without other layers.
+class UnfinishedLayer(NamedTuple):
+    """Labels of a log, and the segments of its microphones as far as known without other layers.
 
-    `lacks_start` is true if a segment is open at the start of the log and its earlier frames,
-    counted in the previous layer, are not added yet; `open_at_start` is None until then.
+    If the segments open at the start come from the previous layer, `open_at_start` of `metadata` is
+    empty until their earlier frames, which are counted there, are added.
     """
 
-    microphone: str
-    segments: list[Segment]
-    open_at_start: StateRun | None
-    open_at_end: StateRun | None
-    lacks_start: bool
-    frames: int  # number of labelled frames
-
-    def with_start(self, open_at_start: StateRun | None) -> "LabelledSound":
-        """Add the segment open at the end of the previous layer, if it is still missing.
-
-        Parameters
-        ----------
-        open_at_start : Run or None
-            The segment; None if none is open there.
-
-        Returns
-        -------
-        LabelledSound
-            This object if it does not lack its start; otherwise a new, complete one.
-        """
-        if not self.lacks_start:
-            return self
-        segments, open_at_end = list(self.segments), self.open_at_end
-        if segments:
-            segments[0] = segments[0]._replace(run=segments[0].run.prepend(open_at_start))
-        elif open_at_end is not None:
-            open_at_end = open_at_end.prepend(open_at_start)
-        return self._replace(
-            segments=segments,
-            open_at_start=open_at_start,
-            open_at_end=open_at_end,
-            lacks_start=False,
-        )
-
-
-class UnfinishedLayer(NamedTuple):
-    """Labels of a log, and the segments of each of its microphones."""
-
     part: Path  # file of labels of type `_row_type`, one microphone after the other
-    inputs: LayerInputs
+    metadata: LayerMetadata
     node: str
     provenance: Mapping[str, str]  # the `hearthlog` record of the log
-    sounds: Sequence[LabelledSound]
+    segments: Mapping[str, Sequence[Segment]]  # by microphone
+    frames: Mapping[str, int]  # number of labels by microphone
+    lacks_start: Sequence[str]  # microphones whose open segment lacks its earlier frames
     left_out: Mapping[str, str]  # feature sets of microphones that the model does not support
-    loss: str  # unreadable parts of the log
     lacks_embeddings: bool  # embeddings that the model requires
-
-    @property
-    def lacks_starts(self) -> bool:
-        """Whether the earlier frames of an open segment are still to be added."""
-        return any(sound.lacks_start for sound in self.sounds)
-
-    @property
-    def open_at_start(self) -> OpenRuns:
-        """The segments open at the start of the log."""
-        return {s.microphone: s.open_at_start for s in self.sounds if s.open_at_start is not None}
-
-    @property
-    def open_at_end(self) -> OpenRuns:
-        """The segments open at the end of the log."""
-        return {s.microphone: s.open_at_end for s in self.sounds if s.open_at_end is not None}
-
-    @property
-    def frames(self) -> int:
-        """Number of labelled frames."""
-        return sum(sound.frames for sound in self.sounds)
 
     def with_starts(self, open_at_start: OpenRuns) -> "UnfinishedLayer":
         """Add the missing segments that are open at the end of the previous layer."""
-        sounds = [sound.with_start(open_at_start.get(sound.microphone)) for sound in self.sounds]
-        return self._replace(sounds=sounds)
+        if not self.lacks_start:
+            return self
+        segments, open_at_end = dict(self.segments), dict(self.metadata.open_at_end)
+        for name in self.lacks_start:
+            earlier = open_at_start.get(name)
+            if segments[name]:
+                first, *others = segments[name]
+                segments[name] = [first._replace(run=first.run.prepend(earlier)), *others]
+            elif name in open_at_end:
+                open_at_end[name] = open_at_end[name].prepend(earlier)
+        starts = {name: open_at_start[name] for name in self.lacks_start if name in open_at_start}
+        metadata = self.metadata._replace(open_at_start=starts, open_at_end=open_at_end)
+        return self._replace(metadata=metadata, segments=segments, lacks_start=())
 
     def delete(self) -> None:
         """Delete the file of labels, if it exists."""
@@ -365,17 +249,121 @@ def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | None]:
 
 def _label_log(job: Job, before: _Labellers) -> tuple[UnfinishedLayer, _Labellers]:
     """Label a log; return also the labellers at its end, if the next log may continue with them."""
-    model, classifier = _loaded(job.model, job.model_sha256)
     with TemporaryDirectory(prefix="hearthlog") as folder:
         try:
-            return _label(job, job.log, before, model, classifier)
+            return _label(job, job.log, before)
         except UnreadableError:
             copy, loss = recover_copy(job.log, Path(folder))
         try:
-            layer, _ = _label(job, copy, {}, model, classifier)
-            return layer._replace(loss=loss), {}
+            layer, _ = _label(job, copy, {})
         except UnreadableError as error:
             raise LogError(str(error).replace(str(copy), str(job.log))) from error
+        return layer._replace(metadata=layer.metadata._replace(loss=loss)), {}
+
+
+@lru_cache(2)
+def _loaded(path: Path, sha256: str) -> tuple[Model, Classifier]:
+    model = load_model(path)
+    if model.sha256 != sha256:
+        raise ModelError(f"{path}: is another model here ({model.sha256[:12]}, not {sha256[:12]})")
+    return model, Classifier(model)
+
+
+def _label(job: Job, log: Path, before: _Labellers) -> tuple[UnfinishedLayer, _Labellers]:
+    """Label a log, or its saved copy, with the labellers from the end of the previous log."""
+    model, classifier = _loaded(job.model, job.model_sha256)
+    infos, left_out = infos_for_model(log, model, job.log)
+    labellers = {
+        info.microphone: _labeller_at(job, info, before.get(info.microphone), classifier)
+        for info in infos
+    }
+    open_at_start = _open_runs(labellers)
+    if job.continues_layer:  # which has counted their earlier frames
+        for name in open_at_start:
+            labellers[name].discard_open()
+    part = job.layer.with_name(f".{job.layer.name}.{os.urandom(8).hex()}.part")
+    frames = _write_labels(part, job, infos, labellers)
+    undecided = False
+    for info in infos:
+        labeller, goes_on = labellers[info.microphone], None
+        if job.next_log is not None:
+            goes_on = goes_on_in(labeller, info, job.next_log)
+            undecided |= goes_on is None
+        if not goes_on:
+            labeller.close()
+    metadata = LayerMetadata(
+        model=model.name,
+        model_sha256=model.sha256,
+        input_sha256=log_digest(job.log),
+        before=stem(job.earlier[0]) if job.earlier else "",
+        behind="" if job.next_log is None or undecided else stem(job.next_log),
+        open_at_start={} if job.continues_layer else open_at_start,
+        open_at_end=_open_runs(labellers),
+        loss="" if infos[0].complete else "it is cut off",
+    )
+    layer = UnfinishedLayer(
+        part=part,
+        metadata=metadata,
+        node=infos[0].node,
+        provenance=infos[0].metadata,
+        segments={name: each.segments for name, each in labellers.items()},
+        frames=frames,
+        lacks_start=list(open_at_start) if job.continues_layer else (),
+        left_out=left_out,
+        lacks_embeddings=any(classifier.lacking_embeddings(info.embedding) for info in infos),
+    )
+    return layer, labellers
+
+
+def _labeller_at(
+    job: Job, info: RecorderInfo, before: StreamLabeller | None, classifier: Classifier
+) -> StreamLabeller:
+    """Return the labeller from the end of the previous log, or one that gives the same labels."""
+    if before is not None and info.first_frame and before.is_followed_by(info.first_frame):
+        before.segments = []  # drop those of the previous log
+        return before
+    return warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
+
+
+def _open_runs(labellers: _Labellers) -> OpenRuns:
+    runs = {name: labeller.open_run for name, labeller in labellers.items()}
+    return {name: run for name, run in runs.items() if run is not None}
+
+
+def _write_labels(
+    part: Path, job: Job, infos: Sequence[RecorderInfo], labellers: _Labellers
+) -> dict[str, int]:
+    """Write the labels of a log to a new file; return their number by microphone."""
+    frames = dict.fromkeys(labellers, 0)
+    try:
+        with part.open("xb") as out:
+            for info in infos:
+                labeller = labellers[info.microphone]
+                for event in read_sound(info, 0, auxiliary=labeller.takes_auxiliary):
+                    labels = labeller.push(event)
+                    if labels is not None:
+                        out.write(_rows_of(labels).tobytes())
+                        frames[info.microphone] += len(labels.frames)
+    except BaseException as error:
+        with suppress(OSError):
+            part.unlink()
+        if isinstance(error, OSError):
+            raise LogError(f"{job.layer}: cannot be written ({error.strerror})") from error
+        raise
+    return frames
+
+
+def _rows_of(labels: FrameLabels) -> NDArray[np.void]:
+    rows = np.empty(len(labels.frames), _row_type(len(labels.classes)))
+    for name in rows.dtype.names or ():
+        rows[name] = getattr(labels, name)
+    return rows
+
+
+def _row_type(classes: int) -> np.dtype[np.void]:
+    """Return the row type of a label in the part file."""
+    times = [(name, np.int64) for name in ("frames", "stamps", "known_at")]
+    return np.dtype([*times, ("probabilities", np.float32, (classes,)), ("novelty", np.float32)])
 
 
 def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
@@ -394,33 +382,51 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
         If the file of the model is missing or damaged, or holds another model.
     """
     model, classifier = _loaded(job.model, job.model_sha256)
-    metadata = LayerMetadata(
-        labelled.inputs, labelled.open_at_start, labelled.open_at_end, labelled.loss
+    metadata, smoothing = labelled.metadata, model.description.smoothing
+    record = provenance(
+        labelled.node,
+        log=job.log.name,
+        feature_set=model.description.feature_set,
+        method=f"{smoothing.method}, lag {smoothing.lag_seconds:g} s",
+        **{name: getattr(metadata, name) for name in _INPUTS},
+        began=_runs_text(metadata.open_at_start),
+        ended=_runs_text(metadata.open_at_end),
+        lost=metadata.loss,
+        made=_now(),
     )
-    smoothing = model.description.smoothing
-    more = {
-        "feature_set": model.description.feature_set,
-        "method": f"{smoothing.method}, lag {smoothing.lag_seconds:g} s",
-    }
-    topics = [layer_topics(s.microphone, model.name, classifier.classes) for s in labelled.sounds]
-    segments = [
-        _segments_of(segments.name, sound, classifier.classes)
-        for (_, segments), sound in zip(topics, labelled.sounds, strict=True)
-    ]
+    topics = {name: layer_topics(name, model.name, classifier.classes) for name in labelled.frames}
     put = replaced_file if job.replaces else new_file
     try:
         with put(job.layer, readers=readers_of(job.log)) as temporary, temporary.open("xb") as out:
-            writer = LogStreamWriter(out, list(chain.from_iterable(topics)), _CHUNK_SPAN)
-            labels = _read_labels(labelled, [topic.name for topic, _ in topics], classifier.classes)
-            for batch in _in_pieces([*labels, *segments]):
+            writer = LogStreamWriter(out, list(chain.from_iterable(topics.values())), _CHUNK_SPAN)
+            for batch in _in_pieces(_batches(labelled, topics, classifier.classes)):
                 writer.write_columns(batch)
-            record = layer_record(metadata, job.log.name, labelled.node, more)
             writer.add_metadata(HEARTHLOG_METADATA, record)
             writer.end(job.layer.name)
     except LogError:
         if read_layer_metadata(job.layer) != metadata:  # otherwise another run was quicker
             raise
-    delete_parts(job.layer)
+    for part in job.layer.parent.glob(f".{glob.escape(job.layer.name)}.*"):  # also of other runs
+        with suppress(OSError):
+            part.unlink()
+
+
+def _batches(
+    labelled: UnfinishedLayer, topics: Mapping[str, tuple[Topic, Topic]], classes: Sequence[str]
+) -> list[TopicBatch]:
+    """Return the labels of each microphone, from the part file, and then the segments."""
+    stored, first = labelled.part.read_bytes(), 0
+    labels, segments = [], []
+    for name, (label, segment) in topics.items():
+        rows = np.frombuffer(stored, _row_type(len(classes)), labelled.frames[name], first)
+        first += rows.nbytes
+        rows = rows[rows["known_at"].argsort(kind="stable")]  # a sound card's time may jump back
+        fields = label_columns(rows, classes, name)
+        labels.append(TopicBatch(label.name, rows["known_at"].copy(), fields))
+        own = labelled.segments[name]
+        times = np.array([each.decided_at for each in own], np.int64)
+        segments.append(TopicBatch(segment.name, times, segment_columns(own, classes, name)))
+    return [*labels, *segments]
 
 
 def _in_pieces(batches: Sequence[TopicBatch]) -> Iterator[list[TopicBatch]]:
@@ -438,138 +444,3 @@ def _part(batch: TopicBatch, rows: slice) -> TopicBatch:
         for path, column in batch.fields.items()
     }
     return TopicBatch(batch.topic, batch.log_times[rows], fields)
-
-
-def _read_labels(
-    labelled: UnfinishedLayer, topics: Sequence[str], classes: Sequence[str]
-) -> list[TopicBatch]:
-    """Read the labels of each microphone from the part file."""
-    stored, first = labelled.part.read_bytes(), 0
-    batches = []
-    for topic, sound in zip(topics, labelled.sounds, strict=True):
-        rows = np.frombuffer(stored, _row_type(len(classes)), sound.frames, first)
-        first += rows.nbytes
-        rows = rows[rows["known_at"].argsort(kind="stable")]  # a sound card's time may jump back
-        fields = label_columns(rows, classes, sound.microphone)
-        batches.append(TopicBatch(topic, rows["known_at"].copy(), fields))
-    return batches
-
-
-def _segments_of(topic: str, sound: LabelledSound, classes: Sequence[str]) -> TopicBatch:
-    times: Int64 = np.array([segment.decided_at for segment in sound.segments], np.int64)
-    return TopicBatch(topic, times, segment_columns(sound.segments, classes, sound.microphone))
-
-
-@lru_cache(2)
-def _loaded(path: Path, sha256: str) -> tuple[Model, Classifier]:
-    model = load_model(path)
-    if model.sha256 != sha256:
-        raise ModelError(f"{path}: is another model here ({model.sha256[:12]}, not {sha256[:12]})")
-    return model, Classifier(model)
-
-
-class _Begun(NamedTuple):
-    """State of a microphone in a log, before its first frame."""
-
-    info: RecorderInfo
-    labeller: StreamLabeller
-    open_at_start: StateRun | None
-    lacks_start: bool
-
-
-def _label(
-    job: Job, log: Path, before: _Labellers, model: Model, classifier: Classifier
-) -> tuple[UnfinishedLayer, _Labellers]:
-    """Label a log, or its saved copy."""
-    infos, left_out = infos_for_model(log, model, job.log)
-    begun = [_begin(job, info, before.get(info.microphone), classifier) for info in infos]
-    part = part_path(job.layer)
-    frames = _write_labels(part, job, begun)
-    following = [_goes_on(job, each) for each in begun]
-    ends = zip(begun, frames, following, strict=True)
-    sounds = [_end(each, count, goes_on=bool(goes_on)) for each, count, goes_on in ends]
-    earlier = stem(job.earlier[0]) if job.earlier else ""
-    behind = "" if job.next_log is None or None in following else stem(job.next_log)
-    layer = UnfinishedLayer(
-        part=part,
-        inputs=LayerInputs(model.name, model.sha256, log_digest(job.log), earlier, behind),
-        node=infos[0].node,
-        provenance=infos[0].metadata,
-        sounds=sounds,
-        left_out=left_out,
-        loss="" if infos[0].complete else "it is cut off",
-        lacks_embeddings=any(classifier.lacking_embeddings(info.embedding) for info in infos),
-    )
-    return layer, {each.info.microphone: each.labeller for each in begun}
-
-
-def _begin(
-    job: Job, info: RecorderInfo, before: StreamLabeller | None, classifier: Classifier
-) -> _Begun:
-    """Return the labeller from the end of the previous log, or one that gives the same labels."""
-    first = info.first_frame
-    if before is not None and first is not None and before.is_followed_by(first):
-        labeller = before
-        labeller.segments = []  # drop those of the previous log
-    else:
-        labeller = warm_up(info, job.earlier, classifier, states_only=job.continues_layer)
-    open_at_start = labeller.open_run
-    lacks_start = job.continues_layer and open_at_start is not None
-    if lacks_start:
-        labeller.discard_open()
-        open_at_start = None
-    return _Begun(info, labeller, open_at_start, lacks_start)
-
-
-def _goes_on(job: Job, begun: _Begun) -> bool | None:
-    return None if job.next_log is None else goes_on_in(begun.labeller, begun.info, job.next_log)
-
-
-def _end(begun: _Begun, frames: int, *, goes_on: bool) -> LabelledSound:
-    if not goes_on:
-        begun.labeller.close()
-    return LabelledSound(
-        microphone=begun.info.microphone,
-        segments=begun.labeller.segments,
-        open_at_start=begun.open_at_start,
-        open_at_end=begun.labeller.open_run,
-        lacks_start=begun.lacks_start,
-        frames=frames,
-    )
-
-
-def _write_labels(part: Path, job: Job, begun: Sequence[_Begun]) -> list[int]:
-    """Write the labels of a log to a new file; return the number of each microphone."""
-    try:
-        with part.open("xb") as out:
-            return [_write_sound(out, each) for each in begun]
-    except BaseException as error:
-        with suppress(OSError):
-            part.unlink()
-        if isinstance(error, OSError):
-            raise LogError(f"{job.layer}: cannot be written ({error.strerror})") from error
-        raise
-
-
-def _write_sound(out: BinaryIO, begun: _Begun) -> int:
-    """Write the labels of one microphone, and count them."""
-    frames = 0
-    for event in read_sound(begun.info, 0, auxiliary=begun.labeller.takes_auxiliary):
-        labels = begun.labeller.push(event)
-        if labels is not None:
-            out.write(_rows_of(labels).tobytes())
-            frames += len(labels.frames)
-    return frames
-
-
-def _rows_of(labels: FrameLabels) -> NDArray[np.void]:
-    rows = np.empty(len(labels.frames), _row_type(len(labels.classes)))
-    for name in rows.dtype.names or ():
-        rows[name] = getattr(labels, name)
-    return rows
-
-
-def _row_type(classes: int) -> np.dtype[np.void]:
-    """Return the row type of a label in the part file."""
-    times = [(name, np.int64) for name in ("frames", "stamps", "known_at")]
-    return np.dtype([*times, ("probabilities", np.float32, (classes,)), ("novelty", np.float32)])

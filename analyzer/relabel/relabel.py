@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
-from enum import Enum, auto
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from hearthlog.analyzer.relabel.layer import (
     complete_layer,
     is_current,
     label_logs,
-    make_job,
     read_layer_metadata,
 )
 from hearthlog.analyzer.workers import Workers
@@ -29,6 +27,7 @@ from hearthlog.schemas.logs.files import is_active, relabel_path
 from hearthlog.schemas.logs.metadata import check_version, log_digest
 
 _LONGEST_STRETCH = 8  # maximum number of contiguous logs labelled in one task
+_MOST_EARLIER = 1000  # logs: within so many a floor is forgotten, even if each has only a minute
 
 
 @dataclass
@@ -88,40 +87,29 @@ def relabel(
     return work.result
 
 
-class _State(Enum):
-    CURRENT = auto()  # the layer may stay, if it continues the previous layer
-    WAITING = auto()  # for a worker
-    RUNNING = auto()
-    LABELLED = auto()  # the layer can be completed after the previous layer
-
-
 @dataclass(eq=False)
-class _Task:
-    """A log in progress."""
+class _PendingLayer:
+    """Layer of a log, until it is complete."""
 
-    place: int  # in its chain
+    place: int  # of the log in its chain
     job: Job
-    metadata: LayerMetadata | None  # of an existing layer that may be replaced
-    state: _State
+    existing: LayerMetadata | None  # of a layer that may be replaced
+    ready: bool  # for completion after the previous layer: labelled, or the existing one is current
     labelled: UnfinishedLayer | None = None
 
 
+@dataclass(eq=False)
 class _ChainQueue:
-    """Tasks of one chain, in time order; layers are completed from its head."""
+    """Layers of one chain, in time order; they are completed from its head."""
 
-    def __init__(self, chain: Chain) -> None:
-        self.chain = chain
-        self.tasks: deque[_Task] = deque()
-        self.open_runs: OpenRuns = {}  # at the end of the last layer
-        self._last: int | None = None  # place of the last log with a complete or current layer
-
-    def follows_layer(self, task: _Task) -> bool:
-        """Return whether `open_runs` are the segments open at the start of a task's log."""
-        return self._last is not None and self._last == task.place - 1
+    chain: Chain
+    layers: deque[_PendingLayer] = field(default_factory=deque)
+    last: int | None = None  # place of the last log with a complete or current layer
+    open_runs: OpenRuns = field(default_factory=dict)  # segments open at the end of that layer
 
     def pop(self, open_at_end: OpenRuns) -> None:
-        """Remove the first task; its layer ends with these open segments."""
-        self._last, self.open_runs = self.tasks.popleft().place, open_at_end
+        """Remove the first layer, which ends with these open segments."""
+        self.last, self.open_runs = self.layers.popleft().place, open_at_end
 
 
 class _Relabelling:
@@ -133,7 +121,7 @@ class _Relabelling:
         self._model = model
         self._model_path = model_path
         self._workers = workers
-        self._running: dict[Future[Any], tuple[_ChainQueue, Sequence[_Task]]] = {}
+        self._running: dict[Future[Any], tuple[_ChainQueue, Sequence[_PendingLayer]]] = {}
         self._unfinished: dict[Path, UnfinishedLayer] = {}  # by their files
 
     def run(self, progress: Callable[[int], None]) -> None:
@@ -141,7 +129,9 @@ class _Relabelling:
         waiting = self._stretches()
         try:
             while True:
-                while len(self._running) < self._most_running and (some := next(waiting, None)):
+                parallel = self._workers.parallel
+                most = 2 * parallel if parallel > 1 else 1  # so that no worker is idle
+                while len(self._running) < most and (some := next(waiting, None)):
                     self._submit(*some)
                 progress(self.result.logs)
                 if not self._running:
@@ -152,13 +142,7 @@ class _Relabelling:
             for layer in self._unfinished.values():  # none, unless an error stopped the run
                 layer.delete()
 
-    @property
-    def _most_running(self) -> int:
-        """Return the number of tasks to submit at once, so that no worker is idle."""
-        parallel = self._workers.parallel
-        return 2 * parallel if parallel > 1 else 1
-
-    def _stretches(self) -> Iterator[tuple[_ChainQueue, Sequence[_Task]]]:
+    def _stretches(self) -> Iterator[tuple[_ChainQueue, Sequence[_PendingLayer]]]:
         """Check the logs of one chain after the other, and yield the logs to label.
 
         Contiguous logs are yielded together, since the sound before the first of them has to be
@@ -167,21 +151,21 @@ class _Relabelling:
         """
         for chain in self._chains:
             queue = _ChainQueue(chain)
-            layers = map_logs(self._look_at, list(chain.asked.values()))
-            stretch: list[_Task] = []
-            for number, (place, layer) in enumerate(zip(chain.asked, layers, strict=True)):
-                task = self._task(chain, place, layer)
-                waits = task is not None and task.state is _State.WAITING
+            found = map_logs(self._look_at, list(chain.asked.values()))
+            stretch: list[_PendingLayer] = []
+            for number, (place, layer) in enumerate(zip(chain.asked, found, strict=True)):
+                pending = self._pending(chain, place, layer)
+                waits = pending is not None and not pending.ready
                 left = len(chain.asked) - number + len(stretch)
                 longest = min(-(-left // self._workers.parallel), _LONGEST_STRETCH)
                 follows = bool(stretch) and stretch[-1].place == place - 1
                 if stretch and not (waits and follows and len(stretch) < longest):
                     yield queue, stretch
                     stretch = []
-                if task is not None:
-                    queue.tasks.append(task)
+                if pending is not None:
+                    queue.layers.append(pending)
                     if waits:
-                        stretch.append(task)
+                        stretch.append(pending)
                     self._advance(queue)
             if stretch:
                 yield queue, stretch
@@ -193,117 +177,118 @@ class _Relabelling:
         except HearthlogError as error:
             return error
 
-    def _task(
-        self, chain: Chain, place: int, layer: tuple[LayerMetadata | None, str] | HearthlogError
-    ) -> _Task | None:
-        """Decide the task of a log; None if nothing is to be done."""
+    def _pending(
+        self, chain: Chain, place: int, found: tuple[LayerMetadata | None, str] | HearthlogError
+    ) -> _PendingLayer | None:
+        """Decide what is to be done for a log; None for nothing."""
         log = chain.logs[place]
         if is_active(log):
             self.result.active.append(log)
             return None
-        job = self._job(chain, place, continues_layer=place - 1 in chain.asked)
         try:
-            if isinstance(layer, HearthlogError):
-                raise layer
-            metadata, sha256 = layer
-            current = metadata is not None and is_current(job, metadata, sha256)
+            if isinstance(found, HearthlogError):
+                raise found
+            existing, sha256 = found
+            job = self._job(chain, place, replaces=existing is not None)
+            current = existing is not None and is_current(job, existing, sha256)
         except HearthlogError as error:
             self.result.failed[log] = str(error)
             return None
-        job = job._replace(replaces=metadata is not None)
-        return _Task(place, job, metadata, _State.CURRENT if current else _State.WAITING)
+        return _PendingLayer(place, job, existing, ready=current)
 
-    def _job(self, chain: Chain, place: int, *, continues_layer: bool) -> Job:
-        return make_job(
-            chain, place, self._model, self._model_path, continues_layer=continues_layer
+    def _job(self, chain: Chain, place: int, *, replaces: bool, alone: bool = False) -> Job:
+        """Make the job of a log; `alone` if the layer before it failed."""
+        continues = place - 1 in chain.asked and not alone
+        log = chain.logs[place]
+        first = max(place - _MOST_EARLIER, 0) if continues else 0
+        return Job(
+            log=log,
+            layer=relabel_path(log, self._model.name),
+            earlier=tuple(reversed(chain.logs[first:place])),
+            next_log=chain.logs[place + 1] if place + 1 < len(chain.logs) else None,
+            model=self._model_path,
+            model_sha256=self._model.sha256,
+            replaces=replaces,
+            continues_layer=continues,
         )
 
-    def _submit(self, queue: _ChainQueue, tasks: Sequence[_Task]) -> None:
-        for task in tasks:
-            task.state = _State.RUNNING
-        future = self._workers.submit(label_logs, [task.job for task in tasks])
-        self._running[future] = queue, tasks
+    def _submit(self, queue: _ChainQueue, layers: Sequence[_PendingLayer]) -> None:
+        for layer in layers:
+            layer.ready = False
+        future = self._workers.submit(label_logs, [layer.job for layer in layers])
+        self._running[future] = queue, layers
 
     def _receive(self, future: Future[Any]) -> None:
         """Process the result of a worker."""
-        queue, tasks = self._running.pop(future)
+        queue, layers = self._running.pop(future)
         error = future.exception()
         if error is not None:
             if isinstance(error, LostClusterError) or not isinstance(error, Exception):
                 raise error
-            if len(tasks) == 1:
-                self._fail(queue, tasks[0], error)
+            if len(layers) == 1:
+                self._fail(queue, layers[0], error)
             else:
-                for task in tasks:  # one of them is the cause
-                    self._submit(queue, [task])
-        elif (layers := future.result()) is None:
-            self._note_layer(tasks[0])
+                for layer in layers:  # one of them is the cause
+                    self._submit(queue, [layer])
+        elif (results := future.result()) is None:
+            self._note_layer(layers[0])
         else:
-            for task, layer in zip(tasks, layers, strict=True):
-                if layer is None:
-                    self._submit(queue, [task])  # the error may be a temporary storage error
+            for layer, labelled in zip(layers, results, strict=True):
+                if labelled is None:
+                    self._submit(queue, [layer])  # the error may be a temporary storage error
                 else:
-                    self._take(task, layer)
+                    layer.ready, layer.labelled = True, labelled
+                    check_version(labelled.provenance, layer.job.log)
+                    self._unfinished[labelled.part] = labelled
         self._advance(queue)
 
-    def _take(self, task: _Task, labelled: UnfinishedLayer) -> None:
-        task.state, task.labelled = _State.LABELLED, labelled
-        check_version(labelled.provenance, task.job.log)
-        self._unfinished[labelled.part] = labelled
-
-    def _fail(self, queue: _ChainQueue, task: _Task, error: Exception) -> None:
+    def _fail(self, queue: _ChainQueue, layer: _PendingLayer, error: Exception) -> None:
         """Record that a log was not relabelled; the others continue."""
-        text = str(error)
+        log, text = layer.job.log, str(error)
         if not isinstance(error, HearthlogError):
-            text = f"{task.job.log}: {type(error).__name__}: {text.partition(chr(10))[0]}"
-        self.result.failed[task.job.log] = text
-        if task in queue.tasks:  # false if its layer was to be completed
-            queue.tasks.remove(task)
-        if task.labelled is not None:
-            self._delete(task.labelled)
+            text = f"{log}: {type(error).__name__}: {text.partition(chr(10))[0]}"
+        self.result.failed[log] = text
+        if layer in queue.layers:  # false if it was to be completed
+            queue.layers.remove(layer)
+        self._delete_labels(layer)
 
     def _advance(self, queue: _ChainQueue) -> None:
         """Complete layers, in time order, up to the first unlabelled log."""
-        while queue.tasks and queue.tasks[0].state in {_State.CURRENT, _State.LABELLED}:
-            task = queue.tasks[0]
-            follows = queue.follows_layer(task)
-            if task.labelled is not None:
-                if follows or not task.labelled.lacks_starts:
-                    self._complete(queue, task, task.labelled.with_starts(queue.open_runs))
+        while queue.layers and queue.layers[0].ready:
+            layer = queue.layers[0]
+            follows = queue.last == layer.place - 1  # then it begins with `open_runs`
+            if layer.labelled is None:
+                assert layer.existing is not None  # it is current
+                if follows and layer.existing.open_at_start != queue.open_runs:
+                    self._submit(queue, [layer])
                 else:
-                    self._label_alone(queue, task, task.labelled)
-            else:
-                assert task.metadata is not None  # it is current
-                if follows and task.metadata.open_at_start != queue.open_runs:
-                    self._submit(queue, [task])
-                else:
-                    self.result.current.append(task.job.layer)
-                    queue.pop(task.metadata.open_at_end)
+                    self.result.current.append(layer.job.layer)
+                    queue.pop(layer.existing.open_at_end)
+            elif follows or not layer.labelled.lacks_start:
+                layer.labelled = layer.labelled.with_starts(queue.open_runs)
+                queue.pop(layer.labelled.metadata.open_at_end)
+                future = self._workers.submit(complete_layer, layer.job, layer.labelled)
+                self._running[future] = queue, [layer]
+            else:  # the previous layer, which it should continue, failed
+                self._delete_labels(layer)
+                replaces = layer.job.replaces
+                layer.job = self._job(queue.chain, layer.place, replaces=replaces, alone=True)
+                self._submit(queue, [layer])
 
-    def _complete(self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer) -> None:
-        task.labelled = labelled
-        queue.pop(labelled.open_at_end)
-        self._running[self._workers.submit(complete_layer, task.job, labelled)] = queue, [task]
+    def _delete_labels(self, layer: _PendingLayer) -> None:
+        if layer.labelled is not None:
+            self._unfinished.pop(layer.labelled.part, None)
+            layer.labelled.delete()
+            layer.labelled = None
 
-    def _label_alone(self, queue: _ChainQueue, task: _Task, labelled: UnfinishedLayer) -> None:
-        """Label a log again, separately: the previous layer, which it should continue, failed."""
-        self._delete(labelled)
-        job = self._job(queue.chain, task.place, continues_layer=False)
-        task.job = job._replace(replaces=task.job.replaces)
-        task.labelled = None
-        self._submit(queue, [task])
-
-    def _delete(self, labelled: UnfinishedLayer) -> None:
+    def _note_layer(self, layer: _PendingLayer) -> None:
+        labelled, log = layer.labelled, layer.job.log
+        assert labelled is not None
         self._unfinished.pop(labelled.part, None)
-        labelled.delete()
-
-    def _note_layer(self, task: _Task) -> None:
-        assert task.labelled is not None
-        self._unfinished.pop(task.labelled.part, None)
-        self.result.layers.append(task.job.layer)
-        self.result.frames += task.labelled.frames
-        self.result.left_out |= task.labelled.left_out
-        if task.labelled.lacks_embeddings:
-            self.result.by_features.append(task.job.log)
-        if task.labelled.loss:
-            self.result.lost[task.job.log] = task.labelled.loss
+        self.result.layers.append(layer.job.layer)
+        self.result.frames += sum(labelled.frames.values())
+        self.result.left_out |= labelled.left_out
+        if labelled.lacks_embeddings:
+            self.result.by_features.append(log)
+        if labelled.metadata.loss:
+            self.result.lost[log] = labelled.metadata.loss
