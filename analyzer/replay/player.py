@@ -79,54 +79,6 @@ _OF_RECORDER = (CANDIDATE, SCENARIO, FEATURE_SET)  # entries that the new log do
 _MODELS = tuple(name.partition(".")[0] + "." for name in (CARD, DESCRIPTION))
 
 
-def describe(  # noqa: PLR0913, PLR0917
-    recorded: RecorderInfo,
-    features: FeatureSet,
-    model: Model | None,
-    scenarios: Mapping[str, Model],
-    output: Path,
-    replayed: Mapping[str, str],
-) -> LogDescription:
-    """Describe a new log as the recorder described the old one.
-
-    Parameters
-    ----------
-    model : Model or None
-        The model that labels the new log; None if there are no labels.
-    """
-    if model is not None and model.sha256 == recorded.model_sha256:
-        model = replace(model, name=recorded.model)  # whatever the name of its file here
-    classes = None if model is None else list(model.classes)
-    info = stream_info(recorded.microphone, recorded.device, features, model)
-    attachments = [item for item in recorded.attachments if not item.name.startswith(_MODELS)]
-    if model is not None:
-        attachments += model_attachments(model)
-    named = {scenario_labelling(name): list(one.classes) for name, one in scenarios.items()}
-    description = LogDescription(
-        root=output,
-        node=recorded.node,
-        topics=topics_of(
-            recorded.microphone,
-            features.feature_names,
-            classes,
-            named,
-            directions=recorded.has_directions,
-            embedding=recorded.embedding,
-        ),
-        infos=[info],
-        metadata={
-            **{k: v for k, v in recorded.metadata.items() if not k.startswith(_OF_RECORDER)},
-            **provenance(recorded.node),
-            **entries_of(features),
-            "model": info.model,
-            "model_sha256": info.model_sha256,
-            **replayed,
-        },
-        attachments=attachments,
-    )
-    return with_scenarios(description, recorded.microphone, scenarios)
-
-
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096
 _BESIDE = CANDIDATE, SCENARIO
@@ -165,7 +117,8 @@ class Player:
         self._result = result
         self._stop = stop
         self._progress = progress
-        self._pace = _Pace(options.rate)
+        self._paced: int | None = None  # start of the last paced frames
+        self._anchor = 0.0, 0  # a clock time, and the sound's time then
         self._info: RecorderInfo | None = None  # of the first log of this recorder run
         self._opened: Path | None = None
         self._log: RollingLog | None = None
@@ -324,18 +277,17 @@ class Player:
         assert info.first_frame is not None
         before = self._beside
         self._beside = self._scenarios(info, self._features(info, model), model)
-        classifier = None if model is None else Classifier(model)
-        closing, opening = self._pipeline.change_model(model, classifier, *info.first_frame)
+        changes = [(LIVE, model)]
         for name in self._options.scenarios:  # they may now have to exclude other classes
             own = self._beside.get(name)
             if _digest(own) != _digest(before.get(name)):
-                last, first = self._pipeline.change_model(
-                    own,
-                    None if own is None else Classifier(own),
-                    *info.first_frame,
-                    scenario_labelling(name),
-                )
-                closing, opening = [*closing, *last], [*opening, *first]
+                changes.append((scenario_labelling(name), own))
+        closing: list[EncodedMessage] = []
+        opening: list[EncodedMessage] = []
+        for labelling, new in changes:
+            classifier = None if new is None else Classifier(new)
+            last, first = self._pipeline.change_model(new, classifier, *info.first_frame, labelling)
+            closing, opening = [*closing, *last], [*opening, *first]
         self._write(closing)
         if self._log is not None:
             self._log.begin_anew(self._describe(info, model), [])
@@ -343,11 +295,39 @@ class Player:
         self._write(opening)
 
     def _describe(self, info: RecorderInfo, model: Model | None) -> LogDescription:
+        """Describe the new log as the recorder described the old one."""
         assert self._options.output is not None
-        kind = "clips" if self._options.kind == "audio" else self._options.kind
-        replayed = {"replay_of": _name(self._result.sources), "replay_from": kind}
-        features = self._pipeline.feature_set
-        return describe(info, features, model, self._beside, self._options.output, replayed)
+        if model is not None and model.sha256 == info.model_sha256:
+            model = replace(model, name=info.model)  # whatever the name of its file here
+        features, scenarios = self._pipeline.feature_set, self._beside
+        stream = stream_info(info.microphone, info.device, features, model)
+        attachments = [item for item in info.attachments if not item.name.startswith(_MODELS)]
+        if model is not None:
+            attachments += model_attachments(model)
+        description = LogDescription(
+            root=self._options.output,
+            node=info.node,
+            topics=topics_of(
+                info.microphone,
+                features.feature_names,
+                None if model is None else list(model.classes),
+                {scenario_labelling(name): list(one.classes) for name, one in scenarios.items()},
+                directions=info.has_directions,
+                embedding=info.embedding,
+            ),
+            infos=[stream],
+            metadata={
+                **{k: v for k, v in info.metadata.items() if not k.startswith(_OF_RECORDER)},
+                **provenance(info.node),
+                **entries_of(features),
+                "model": stream.model,
+                "model_sha256": stream.model_sha256,
+                "replay_of": _name(self._result.sources),
+                "replay_from": "clips" if self._options.kind == "audio" else self._options.kind,
+            },
+            attachments=attachments,
+        )
+        return with_scenarios(description, info.microphone, scenarios)
 
     def _join(self, event: Features) -> None:
         """Restart or add a gap where frames are not contiguous, as the recorder did."""
@@ -376,7 +356,7 @@ class Player:
             first, stamps = event.first + begin, event.stamps[block]
             end = int(stamps[-1]) + FRAME_NANOSECONDS
             if end > self._start:
-                self._pace.wait(int(stamps[0]), end, self._stop)
+                self._wait(int(stamps[0]), end)
             if self._stop.is_set():
                 self._result.interrupted = True
                 return False
@@ -393,6 +373,18 @@ class Player:
         if self._sha256 is None and not self._beside:
             self.converged |= len(event.stamps) >= self._pipeline.feature_set.window_frames
         return True
+
+    def _wait(self, start: int, end: int) -> None:
+        """Wait until the end of frames from `start` to `end` (ns of UTC), or until stopped."""
+        if self._options.rate is None:
+            return
+        if self._paced is None or start < self._paced:  # the clock was set back
+            self._anchor = time.monotonic(), start
+        self._paced = start
+        began, first = self._anchor
+        due = began + (end - first) / NANOSECONDS / self._options.rate
+        while (left := due - time.monotonic()) > 0 and not self._stop.wait(min(left, 1.0)):
+            pass
 
     def _write(self, messages: list[EncodedMessage]) -> None:
         messages = self._count(messages)
@@ -422,27 +414,6 @@ class Player:
             self._log.finish(messages)
             self._result.logs += self._log.finished
             self._log = None
-
-
-class _Pace:
-    """Waits until the time of a sound; `rate` is that of `ReplayOptions`."""
-
-    def __init__(self, rate: float | None) -> None:
-        self._rate = rate
-        self._last: int | None = None
-        self._anchor = 0.0, 0  # a clock time, and the sound's time then
-
-    def wait(self, start: int, end: int, stop: Flag) -> None:
-        """Wait until the end of frames from `start` to `end` (ns of UTC), or until stopped."""
-        if self._rate is None:
-            return
-        if self._last is None or start < self._last:  # the clock was set back
-            self._anchor = time.monotonic(), start
-        self._last = start
-        began, first = self._anchor
-        due = began + (end - first) / NANOSECONDS / self._rate
-        while (left := due - time.monotonic()) > 0 and not stop.wait(min(left, 1.0)):
-            pass
 
 
 def _is_new_run(info: RecorderInfo, last: RecorderInfo, next_frame: int) -> bool:
