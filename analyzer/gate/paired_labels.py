@@ -23,20 +23,14 @@ from hearthlog.analyzer.gate.recent_time import (
     unlearned_time,
 )
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
-from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller, infos_for_model
-from hearthlog.analyzer.replay.recorded import Features, read_recorded
+from hearthlog.analyzer.logs.spans import Spans, joined
+from hearthlog.analyzer.relabel.stream_labeller import infos_for_model, label_span
 from hearthlog.models.classes import SILENCE, find_class, translation
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.recorder.events import Gap
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
-
-_FLOOR_WARM_UP = 150 * NANOSECONDS
-_LABELS_WARM_UP = 5 * NANOSECONDS
-_BEHIND = 5 * NANOSECONDS  # sound after the part that influences its last labels
+from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 
 class PairedFrames(NamedTuple):
@@ -103,49 +97,11 @@ class TwoModels:
         return joined_frames([self._label(info, part, weight) for info in wanted])
 
     def _label(self, info: RecorderInfo, part: LogSpan, weight: float) -> PairedFrames:
-        start, end = part.start - _FLOOR_WARM_UP, part.end + _BEHIND
-        sound = [
-            event
-            for batch in read_recorded(info, start, end, sound_only=True)
-            for event in batch.events
-            if isinstance(event, Features | Gap)
-        ]
-        first, second = (
-            _labelled(
-                sound,
-                part,
-                StreamLabeller(one, part.start - _LABELS_WARM_UP, info.microphone, info.embedding),
-            )
-            for one in self._classifiers
-        )
+        first, second = label_span(info, self._classifiers, part.start, part.end)
         stamps, a, b = np.intersect1d(first.stamps, second.stamps, return_indices=True)
-        after, weights = self._numbers[second.labels[b]], np.full(len(stamps), weight)
-        return PairedFrames(stamps, first.labels[a], after, first.confidence[a], weights)
-
-
-class _Labelled(NamedTuple):
-    stamps: Int64
-    labels: Indices
-    confidence: Float32
-
-
-def _labelled(
-    sound: Sequence[Features | Gap], part: LogSpan, labeller: StreamLabeller
-) -> _Labelled:
-    pieces = [piece for event in sound if (piece := labeller.push(event)) is not None]
-    labeller.close()
-    segments = labeller.segments
-    if not (pieces and segments):
-        none = np.empty(0, np.int64)
-        return _Labelled(none, none.astype(np.intp), none.astype(np.float32))
-    times = np.array([(segment.start, segment.end) for segment in segments], np.int64)
-    names = np.array([segment.label for segment in segments], np.intp)
-    stamps = np.concatenate([one.stamps for one in pieces])
-    rows = rows_at(Spans(times[:, 0], times[:, 1]), stamps)
-    kept = (stamps >= part.start) & (stamps < part.end) & (rows >= 0)
-    labels = names[rows[kept]]
-    probabilities = np.concatenate([one.probabilities for one in pieces])[kept]
-    return _Labelled(stamps[kept], labels, probabilities[np.arange(len(labels)), labels])
+        before, after = first.classes[a], self._numbers[second.classes[b]]
+        confidence = first.probabilities[a, before]
+        return PairedFrames(stamps, before, after, confidence, np.full(len(stamps), weight))
 
 
 A_DAY = " a day"

@@ -7,8 +7,12 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
 
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, read_recorder_infos
+from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.analyzer.replay.recorded import Features, read_recorded
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
@@ -17,6 +21,7 @@ from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Segment, StateRun
 from hearthlog.recorder.events import Gap
+from hearthlog.schemas.arrays import Float32, Indices, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import is_local
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
@@ -148,6 +153,7 @@ class StreamLabeller:
 
 _WARM_UP = 30 * NANOSECONDS
 _FLOOR_WARM_UP = 150 * NANOSECONDS  # a minute, plus the four seconds of steadiness that follow
+_SETTLING = 5 * NANOSECONDS  # before a span until labels settle, after it until they are decided
 _NEVER = (1 << 63) - 1
 _FRAMES = 12_000  # ten minutes at once: the process keeps the memory of their arrays
 _LONGEST_LOSS_TEXT = 1000  # characters
@@ -196,14 +202,14 @@ def infos_for_model(
 
 
 def read_sound(
-    info: RecorderInfo, start: int, *, auxiliary: bool = False
+    info: RecorderInfo, start: int, end: int = _NEVER, *, auxiliary: bool = False
 ) -> Iterator[Features | Gap]:
-    """Read the features and gaps of a log from a time on.
+    """Read the features and gaps of a log.
 
     Parameters
     ----------
-    start : int
-        Log time, in nanoseconds of UTC.
+    start, end : int
+        Log times, in nanoseconds of UTC; `end` is excluded.
 
     Raises
     ------
@@ -211,7 +217,7 @@ def read_sound(
         If it is damaged, or was not written by a recorder, or its feature set is not installed.
     """
     try:
-        sound = read_recorded(info, start, _NEVER, sound_only=True, auxiliary=auxiliary)
+        sound = read_recorded(info, start, end, sound_only=True, auxiliary=auxiliary)
         for batch in sound:
             for event in batch.events:
                 if isinstance(event, Gap):
@@ -345,6 +351,63 @@ def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> 
     if other is None or other.first_frame is None:
         return None if is_active(next_log) else False
     return _same_sound(other, info) and labeller.is_followed_by(other.first_frame)
+
+
+class SpanLabels(NamedTuple):
+    """Labels of the frames of a span that are in a segment.
+
+    Attributes
+    ----------
+    stamps : np.ndarray [shape=(n,)], int64
+        Starts of the frames in nanoseconds of UTC.
+    classes : np.ndarray [shape=(n,)], intp
+        Class of the segment around each frame.
+    probabilities : np.ndarray [shape=(n, C)], float32
+    """
+
+    stamps: Int64
+    classes: Indices
+    probabilities: Float32
+
+
+def label_span(
+    info: RecorderInfo, classifiers: Sequence[Classifier], start: int, end: int
+) -> list[SpanLabels]:
+    """Label a span of a log with each of several classifiers, reading the features once.
+
+    The labels are those of a recorder as far as 150 s of sound before the span, of which 5 s are
+    labelled, and 5 s after it decide them.
+
+    Parameters
+    ----------
+    start, end : int
+        Nanoseconds of UTC; `end` is excluded.
+
+    Raises
+    ------
+    LogError
+        If the log is damaged, or was not written by a recorder, or its feature set is not
+        installed.
+    """
+    sound = list(read_sound(info, start - _FLOOR_WARM_UP, end + _SETTLING, auxiliary=True))
+    label_from, microphone = start - _SETTLING, info.microphone
+    labellers = (StreamLabeller(c, label_from, microphone, info.embedding) for c in classifiers)
+    return [_labels_between(start, end, labeller, sound) for labeller in labellers]
+
+
+def _labels_between(
+    start: int, end: int, labeller: StreamLabeller, sound: Sequence[Features | Gap]
+) -> SpanLabels:
+    pieces = [piece for event in sound if (piece := labeller.push(event)) is not None]
+    labeller.close()
+    if not (pieces and labeller.segments):
+        return SpanLabels(np.empty(0, np.int64), np.empty(0, np.intp), np.empty((0, 0), np.float32))
+    starts, ends, labels = np.array([(s.start, s.end, s.label) for s in labeller.segments]).T
+    stamps = np.concatenate([piece.stamps for piece in pieces])
+    rows = rows_at(Spans(starts, ends), stamps)
+    kept = (stamps >= start) & (stamps < end) & (rows >= 0)
+    probabilities = np.concatenate([piece.probabilities for piece in pieces])
+    return SpanLabels(stamps[kept], labels[rows[kept]], probabilities[kept])
 
 
 def _read_infos(path: Path) -> list[RecorderInfo]:
