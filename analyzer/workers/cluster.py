@@ -6,7 +6,7 @@ import logging
 import pickle
 import time
 import warnings
-from collections.abc import Callable, Collection, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
@@ -24,71 +24,6 @@ if TYPE_CHECKING:
 
 
 _SILENT_SECONDS = 20.0  # timeout after which a scheduler counts as gone
-
-
-class Members:
-    """Current workers of a cluster."""
-
-    def __init__(self, client: "Client") -> None:
-        self._client = client
-        self._ours = version("hearthlog")
-        self._asking: dict[str, asyncio.Task[None]] = {}
-        self._versions: dict[str, str] = {}  # by address, of current workers
-        self.threads: dict[str, int] = {}  # by address, of usable workers
-        self.manned = asyncio.Event()  # set while there are usable workers
-        self.refused: dict[str, str] = {}  # by address, versions of other workers; kept
-
-    async def look(self) -> None:
-        """Query the scheduler for its workers, and new workers for their version.
-
-        Raise `OSError, TimeoutError` if the scheduler does not answer.
-        """
-        scheduler: Any = self._client.scheduler
-        identity = await asyncio.wait_for(scheduler.identity(n_workers=-1), _SILENT_SECONDS)
-        workers = identity["workers"]
-        for address in self._versions.keys() - workers.keys():
-            del self._versions[address]
-        for address in workers.keys() - self._versions.keys() - self._asking.keys():
-            # Not awaited: a hanging worker must not hide a hanging scheduler.
-            self._asking[address] = asyncio.create_task(self._ask(address))
-        self.threads = {
-            address: about["nthreads"]
-            for address, about in workers.items()
-            if self._versions.get(address) == self._ours
-        }
-        if self.threads:
-            self.manned.set()
-        else:
-            self.manned.clear()
-
-    async def settle(self) -> None:
-        """Wait until all current workers have reported their version, and query again."""
-        if self._asking:
-            await asyncio.wait(self._asking.values(), timeout=_SILENT_SECONDS)
-        await self.look()
-
-    def any_of(self, addresses: Collection[str]) -> bool:
-        """Return whether one of some workers is still usable."""
-        return not self.threads.keys().isdisjoint(addresses)
-
-    async def _ask(self, address: str) -> None:
-        try:
-            # A function of the standard library, so that a worker without hearthlog can answer.
-            (theirs,) = (
-                await self._client.run(version, "hearthlog", workers=[address], on_error="return")
-            ).values()
-        except (OSError, ValueError):  # it has left
-            return
-        finally:
-            del self._asking[address]
-        if isinstance(theirs, str | PackageNotFoundError):  # else it could not answer this time
-            self._versions[address] = theirs if isinstance(theirs, str) else ""
-        if isinstance(theirs, PackageNotFoundError):
-            self.refused[address] = "no hearthlog"
-        elif isinstance(theirs, str) and theirs != self._ours:
-            self.refused[address] = f"hearthlog {theirs}"
-
-
 _CONNECT_SECONDS = 10.0
 _WORKERS_SECONDS = 30.0  # wait for workers that are started together with the run
 _CLOSE_SECONDS = 3.0
@@ -136,7 +71,7 @@ def connected(scheduler: str) -> Iterator["Cluster"]:
             with suppress(Exception):  # the rest of a lost connection ends with the process
                 client.close(timeout=_CLOSE_SECONDS)
     for worker, has in cluster.refused.items():
-        what = f"the Dask worker has {has}, this is {version('hearthlog')}: not used"
+        what = f"the Dask worker has {has}, this is {cluster.version}: not used"
         warnings.warn(HearthlogWarning(what, worker, each=True), stacklevel=3)
 
 
@@ -167,7 +102,12 @@ class Cluster:
         self._client, self._scheduler = client, scheduler
         running: Any = client.loop
         self.loop: asyncio.AbstractEventLoop = running.asyncio_loop  # used by the client alone
-        self._members = Members(client)
+        self.version = version("hearthlog")
+        self.refused: dict[str, str] = {}  # by address, versions of other workers; kept
+        self._versions: dict[str, str] = {}  # by address, of current workers
+        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._threads: dict[str, int] = {}  # by address, of usable workers
+        self._manned = asyncio.Event()  # set while there are usable workers
         self._watching: asyncio.Task[LostClusterError]
         self._sent: dict[int, tuple[Any, asyncio.Task[Any]]] = {}  # by array id
         self._open: set[Future[Any]] = set()
@@ -187,14 +127,9 @@ class Cluster:
             self.loop.call_soon_threadsafe(self._watching.cancel)
 
     @property
-    def refused(self) -> dict[str, str]:
-        """Versions of unused workers, by address."""
-        return self._members.refused
-
-    @property
     def parallel(self) -> int:
         """Number of threads of all usable workers at the last query; at least 1."""
-        return max(sum(self._members.threads.values()), 1)
+        return max(sum(self._threads.values()), 1)
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
         """Run a function on any worker of the cluster.
@@ -222,42 +157,81 @@ class Cluster:
 
     async def _wait_for_workers(self) -> None:
         deadline = time.monotonic() + _WORKERS_SECONDS
-        while not self._members.threads and time.monotonic() < deadline:
-            await self._members.look()
-            await self._members.settle()
+        while not self._threads and time.monotonic() < deadline:
+            await self._look()
+            if self._asking:  # all current workers report their version
+                await asyncio.wait(self._asking.values(), timeout=_SILENT_SECONDS)
+            await self._look()
             for worker, has in self.refused.items():
-                ours = version("hearthlog")
                 raise WorkerError(
-                    f"the Dask worker at {worker} has {has}, this is {ours}; install {ours} there"
+                    f"the Dask worker at {worker} has {has}, this is {self.version}; install "
+                    f"{self.version} there"
                 )
-            await asyncio.sleep(0 if self._members.threads else _LOOK_SECONDS / 10)
-        if not self._members.threads:
+            await asyncio.sleep(0 if self._threads else _LOOK_SECONDS / 10)
+        if not self._threads:
             raise WorkerError(
                 f"the Dask scheduler at {self._scheduler} has no workers; start some with: "
                 f"dask worker {self._scheduler}"
             )
 
-    async def _watch(self) -> LostClusterError:
-        """Query the cluster until it is lost, and return the error."""
+    async def _look(self) -> None:
+        """Query the scheduler for its workers, and new workers for their version.
+
+        Raise `OSError, TimeoutError` if the scheduler does not answer.
+        """
+        scheduler: Any = self._client.scheduler
+        identity = await asyncio.wait_for(scheduler.identity(n_workers=-1), _SILENT_SECONDS)
+        workers = identity["workers"]
+        for address in self._versions.keys() - workers.keys():
+            del self._versions[address]
+        for address in workers.keys() - self._versions.keys() - self._asking.keys():
+            # Not awaited: a hanging worker must not hide a hanging scheduler.
+            self._asking[address] = asyncio.create_task(self._ask(address))
+        self._threads = {
+            address: about["nthreads"]
+            for address, about in workers.items()
+            if self._versions.get(address) == self.version
+        }
+        if self._threads:
+            self._manned.set()
+        else:
+            self._manned.clear()
+
+    async def _ask(self, address: str) -> None:
         try:
-            what = await self._look_on()
+            # A function of the standard library, so that a worker without hearthlog can answer.
+            (theirs,) = (
+                await self._client.run(version, "hearthlog", workers=[address], on_error="return")
+            ).values()
+        except (OSError, ValueError):  # it has left
+            return
+        finally:
+            del self._asking[address]
+        if isinstance(theirs, PackageNotFoundError):
+            self._versions[address], self.refused[address] = "", "no hearthlog"
+        elif isinstance(theirs, str):  # else it could not answer this time
+            self._versions[address] = theirs
+            if theirs != self.version:
+                self.refused[address] = f"hearthlog {theirs}"
+
+    async def _watch(self) -> LostClusterError:
+        """Query the cluster once a second until it is lost, and return the error."""
+        what, manned = _GONE, time.monotonic()
+        try:
+            while self._client.status == "running":
+                await self._look()
+                now = time.monotonic()
+                manned = now if self._threads else manned
+                if now - manned > _DESERTED_SECONDS:
+                    minutes = f"{_DESERTED_SECONDS / 60:.0f} minutes"
+                    what = f"has had no workers for {minutes}; start some"
+                    break
+                await asyncio.sleep(_LOOK_SECONDS)
         except TimeoutError:
             what = "does not answer; see what keeps it"
         except Exception:  # noqa: BLE001  whatever a broken connection raises
             what = _GONE
         return self._lost(what)
-
-    async def _look_on(self) -> str:
-        """Query the cluster once a second; return the reason for its end."""
-        manned = time.monotonic()
-        while self._client.status == "running":
-            await self._members.look()
-            now = time.monotonic()
-            manned = now if self._members.threads else manned
-            if now - manned > _DESERTED_SECONDS:
-                return f"has had no workers for {_DESERTED_SECONDS / 60:.0f} minutes; start some"
-            await asyncio.sleep(_LOOK_SECONDS)
-        return _GONE
 
     def _lost(self, what: str) -> LostClusterError:
         return LostClusterError(
@@ -282,8 +256,8 @@ class Cluster:
 
         with suppress(KilledWorker):
             for _ in range(_LOSSES):
-                await self._members.manned.wait()
-                allowed = list(self._members.threads)
+                await self._manned.wait()
+                allowed = list(self._threads)
                 try:
                     return await self._attempt(function, args, allowed)
                 except (CancelledError, CommClosedError):
@@ -295,7 +269,8 @@ class Cluster:
         self, function: Callable[..., T], args: tuple[Any, ...], allowed: list[str]
     ) -> T:
         """Run a task on some workers; raise CancelledError if all of them have left."""
-        places = [n for n, arg in enumerate(args) if _is_large(arg)]
+        arrays = [(n, arg) for n, arg in enumerate(args) if isinstance(arg, np.ndarray)]
+        places = [n for n, array in arrays if array.nbytes >= _SENT_ONCE]
         sent = [await self._send(args[place], allowed) for place in places]
         others = [None if n in places else arg for n, arg in enumerate(args)]
         name = getattr(function, "__name__", "task").strip("_<>")
@@ -312,7 +287,7 @@ class Cluster:
         try:
             while not gathering.done():
                 await asyncio.wait({gathering}, timeout=_LOOK_SECONDS)
-                if not gathering.done() and not self._members.any_of(allowed):
+                if not gathering.done() and self._threads.keys().isdisjoint(allowed):
                     raise CancelledError
             return gathering.result()
         finally:
@@ -328,10 +303,6 @@ class Cluster:
             return await asyncio.shield(self._sent[id(array)][1])
         except (OSError, TimeoutError, ValueError) as error:  # a worker left meanwhile
             raise CancelledError from error
-
-
-def _is_large(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.nbytes >= _SENT_ONCE
 
 
 def _caller() -> Callable[..., Any]:
