@@ -218,10 +218,9 @@ def import_labels(
     if folded:
         often = [label for label, _ in counts.most_common() if label in folded]
         agree([Folded(label, folded[label], counts[label]) for label in often])
-    named = _named(path, placed, {**certain, **folded}, left_out)
-    heard = _heard(path, named, coverage, left_out)
+    usable = _usable(path, placed, {**certain, **folded}, coverage, left_out)
     by_log: dict[Path, list[Mark]] = {}
-    for _, mark in _without_overlaps(path, heard, left_out):
+    for _, mark in _without_overlaps(path, usable, left_out):
         for log, start, end in coverage[mark.microphone].split(mark.start, mark.end):
             by_log.setdefault(log, []).append(mark._replace(start=start, end=end))
     return Imported(by_log, left_out, moved)
@@ -275,29 +274,22 @@ def _placed(
             yield mark
 
 
-def _named(
-    path: Path, placed: Iterable[PlacedMark], names: Mapping[str, str], left_out: SkippedLabels
+def _usable(
+    path: Path,
+    placed: Iterable[PlacedMark],
+    names: Mapping[str, str],
+    coverage: Mapping[str, Coverage],
+    left_out: SkippedLabels,
 ) -> Iterator[PlacedMark]:
-    """Yield marks with class names as labels."""
+    """Yield the marks within recorded time, with class names as labels."""
     for each in placed:
         name = names.get(each.mark.label)
         if name is None:
             left_out.add(_unnamed(path, each))
-        else:
-            yield each._replace(mark=each.mark._replace(label=name))
-
-
-def _heard(
-    path: Path,
-    placed: Iterable[PlacedMark],
-    coverage: Mapping[str, Coverage],
-    left_out: SkippedLabels,
-) -> Iterator[PlacedMark]:
-    """Yield the marks within recorded time."""
-    for each in placed:
-        mark = each.mark
+            continue
+        mark = each.mark._replace(label=name)
         if coverage[mark.microphone].split(mark.start, mark.end):
-            yield each
+            yield each._replace(mark=mark)
         else:
             reason = (
                 f"{mark.label} lies outside of what {mark.microphone} heard; `hearthlog info` "

@@ -26,6 +26,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     LabelCodec,
     LineError,
     made_text,
+    scan,
 )
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.errors import listed
@@ -155,29 +156,24 @@ def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineErro
     if unknown:
         names = listed([repr(name[:64]) for name in document.tiers[:20]])
         raise DataError(f"{path}: no tier {unknown[0][:64]!r}; there is {names or 'none'}")
-    for identity, each in document.annotations.items():
-        try:
-            start, end = (
-                _seconds(path, each, document.slots.get(slot)) for slot in (each.start, each.end)
-            )
-        except LineError as error:
-            yield error
-            continue
-        yield FileLabel(
-            each.line,
+
+    def label(where: str, entry: tuple[str, _Annotation]) -> FileLabel:
+        identity, each = entry
+        start, end = (_seconds(where, each, document.slots.get(s)) for s in (each.start, each.end))
+        return FileLabel(
             start,
             end,
             each.label,
             microphone=each.tier.get("PARTICIPANT", ""),
             reviewer=each.tier.get("ANNOTATOR", ""),
-            made=document.origins["made"].get(identity, ""),
-            corrects=document.origins["corrects"].get(identity, ""),
+            **{kind: texts.get(identity, "") for kind, texts in document.origins.items()},
             zero=document.start,
         )
 
+    yield from scan(path, ((each[1].line, each) for each in document.annotations.items()), label)
 
-def _seconds(path: Path, annotation: _Annotation, milliseconds: str | None) -> str:
-    where = f"{path}:{annotation.line}"
+
+def _seconds(where: str, annotation: _Annotation, milliseconds: str | None) -> str:
     if not milliseconds:
         reason = f"{annotation.label[:64]!r} has no time; align it in ELAN"
         raise LineError(where, "label without a time", reason)

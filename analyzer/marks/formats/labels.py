@@ -2,10 +2,10 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import Coverage
@@ -87,7 +87,6 @@ class FileLabel(NamedTuple):
         Length of the labelled recording, in seconds.
     """
 
-    place: int | str
     start: str
     end: str
     label: str
@@ -97,6 +96,7 @@ class FileLabel(NamedTuple):
     corrects: str = ""
     zero: str = ""
     length: str = ""
+    place: int | str = 0
 
 
 class Choice(NamedTuple):
@@ -129,6 +129,29 @@ class LabelCodec(NamedTuple):
 
     read: Callable[[Path, str, Choice], Iterator[FileLabel | LineError]]
     write: Callable[[Path, Sequence[Mark], Mapping[str, Coverage]], str]
+
+
+def scan(
+    path: Path,
+    entries: Iterable[tuple[int | str, Any]],
+    parse: Callable[[str, Any], FileLabel | None],
+) -> Iterator[FileLabel | LineError]:
+    """Parse the entries of a file, with their places.
+
+    Parameters
+    ----------
+    parse : callable
+        Returns the label of an entry, given its place for errors; None for an entry that is
+        skipped. Raises `LineError` for an entry that is no label.
+    """
+    for place, entry in entries:
+        try:
+            label = parse(place_text(path, place), entry)
+        except LineError as error:
+            yield error
+        else:
+            if label is not None:
+                yield label._replace(place=place)
 
 
 class PlacedMark(NamedTuple):

@@ -16,6 +16,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     LineError,
     made_text,
     place_text,
+    scan,
 )
 from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.frames import seconds_text, time_text
@@ -108,20 +109,20 @@ def _of_task(path: Path, place: str, task: Mapping[str, Any]) -> Iterator[FileLa
         if annotation.get("was_cancelled") is True:
             continue
         reviewer, made = _completed(annotation) if kind == "annotations" else ("", "")
-        for i, item in enumerate(annotation["result"], 1):
-            label = _of_item(path, f"{within}, result {i}", item)
-            if isinstance(label, LineError):
-                yield label
-            elif label is not None:
+        items = ((f"{within}, result {i}", item) for i, item in enumerate(annotation["result"], 1))
+        for label in scan(path, items, _item_label):
+            if isinstance(label, FileLabel):
                 yield label._replace(
                     microphone=microphone,
                     zero=start,
                     reviewer=label.reviewer or reviewer,
                     made=label.made or made,
                 )
+            else:
+                yield label
 
 
-def _of_item(path: Path, place: str, item: Any) -> FileLabel | LineError | None:
+def _item_label(where: str, item: Any) -> FileLabel | None:
     """Parse an item; None for one without a label (a rating, a remark, a relation)."""
     kind = item.get("type") if isinstance(item, dict) else None
     if not isinstance(kind, str) or not kind.endswith(_TYPE):
@@ -129,21 +130,16 @@ def _of_item(path: Path, place: str, item: Any) -> FileLabel | LineError | None:
     value = item.get("value")
     names = value.get(_TYPE) if isinstance(value, dict) else None
     if kind != _TYPE or not isinstance(names, list) or not {"start", "end"} <= value.keys():
-        reason = f"{kind[:64]!r} is no label of a span of sound"
-        return LineError(place_text(path, place), UNREADABLE, reason)
+        raise LineError(where, UNREADABLE, f"{kind[:64]!r} is no label of a span of sound")
     if len(names) > 1:
-        reason = f"has {len(names)} labels; choose one"
-        return LineError(place_text(path, place), "label of several names", reason)
+        raise LineError(where, "label of several names", f"has {len(names)} labels; choose one")
     meta = item.get("meta")
     origin = meta if isinstance(meta, dict) else {}
     return FileLabel(
-        place,
         _text(value["start"]),
         _text(value["end"]),
         _text(names[0]) if names else "",
-        reviewer=_text(origin.get("reviewer")),
-        made=_text(origin.get("made")),
-        corrects=_text(origin.get("corrects")),
+        **{name: _text(origin.get(name)) for name in ("reviewer", "made", "corrects")},
         length=_text(item.get("original_length")),
     )
 

@@ -3,7 +3,8 @@
 import csv
 import io
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 from hearthlog.analyzer.errors import DataError
@@ -19,6 +20,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     is_seconds,
     made_text,
     place_text,
+    scan,
     with_point,
 )
 from hearthlog.analyzer.marks.marks import Mark
@@ -69,27 +71,26 @@ def read_table(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | Li
     first = _first_line(text)
     delimiter = max("\t;,", key=first.count)
     number_of = str if delimiter == "," else with_point
-    columns: dict[str, int] | None = None
-    width = 0
+    rows = csv_rows(path, text, delimiter, quoted=delimiter != "\t")
+    top = next(rows, None)
+    if top is None:
+        return
+    where = place_text(path, top[0])
+    if isinstance(top[1], csv.Error):
+        raise DataError(f"{where}: is not CSV ({top[1]})")
+    header = [value.strip() for value in top[1]]
+    named = not any(is_seconds(number_of(value)) for value in header)
+    names = header if named else [str(i) for i in range(1, len(header) + 1)]
+    columns, width = _find(where, names, choice.columns, named=named), len(header)
     seen: set[tuple[str, ...]] = set()
-    for number, record in csv_rows(path, text, delimiter, quoted=delimiter != "\t"):
-        where = place_text(path, number)
+
+    def label(where: str, record: list[str] | csv.Error) -> FileLabel | None:
         if isinstance(record, csv.Error):
-            if columns is None:
-                raise DataError(f"{where}: is not CSV ({record})")
-            yield LineError(where, UNREADABLE, f"is not CSV ({record})")
-            continue
+            raise LineError(where, UNREADABLE, f"is not CSV ({record})")
         values = [value.strip() for value in record]
-        if columns is None:
-            named = not any(is_seconds(number_of(value)) for value in values)
-            names = values if named else [str(i) for i in range(1, len(values) + 1)]
-            columns, width = _find(where, names, choice.columns, named=named), len(values)
-            if named:
-                continue
         if any(values[width:]):
             reason = f"has {len(values)} fields, the first line {width}"
-            yield LineError(where, UNREADABLE, reason)
-            continue
+            raise LineError(where, UNREADABLE, reason)
         row = {
             name: values[i] if i < len(values) else ""  # trailing empty fields may be missing
             for name, i in columns.items()
@@ -97,23 +98,15 @@ def read_table(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | Li
         if _SELECTION in row:
             identity = tuple(row.values())
             if row[_SELECTION] and identity in seen:
-                continue
+                return None
             seen.add(identity)
         if delimiter != "\t":
             row |= {name: without_disarming(row[name]) for name in row.keys() & _TEXTS}
-        yield _label(where, number, row, number_of)
-
-
-def _label(
-    where: str, number: int, row: Mapping[str, str], number_of: Callable[[str], str]
-) -> FileLabel | LineError:
-    start, end, duration = (number_of(row.get(name, "")) for name in _NUMBERS)
-    try:
+        start, end, duration = (number_of(row.get(name, "")) for name in _NUMBERS)
         end = end or add_seconds(where, start, duration)
-    except LineError as error:
-        return error
-    others = (row.get(name, "") for name in COLUMNS[3:])
-    return FileLabel(number, start, end, *others)
+        return FileLabel(start, end, *(row.get(name, "") for name in COLUMNS[3:]))
+
+    yield from scan(path, rows if named else chain([top], rows), label)
 
 
 def _find(
@@ -193,96 +186,21 @@ def write_csv(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage
     return text.getvalue()
 
 
-_BAND = ("0.000", "8000.000")  # Hz, for sound at 16 kHz
-_RAVEN_COLUMNS = (
-    "Selection",
-    "View",
-    "Channel",
-    "Begin Time (s)",
-    "End Time (s)",
-    "Low Freq (Hz)",
-    "High Freq (Hz)",
-    "Annotation",
-    "Microphone",
-    "Reviewer",
-    "Made",
-    "Corrects",
-)
-
-
-def write_raven(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Return a Raven table with all fields of the marks as columns, which Raven preserves.
-
-    Parameters
-    ----------
-    coverage : mapping of str to Coverage
-        By microphone; times are written as seconds since its first frame.
-    """
-    channels = {name: i for i, name in enumerate(sorted({mark.microphone for mark in marks}), 1)}
-    lines = ["\t".join(_RAVEN_COLUMNS)]
-    for number, mark in enumerate(marks, 1):
-        zero = coverage[mark.microphone].starts[0]
-        fields = [
-            str(number),
-            "Spectrogram 1",
-            str(channels[mark.microphone]),
-            seconds_text(mark.start - zero),
-            seconds_text(mark.end - zero),
-            *_BAND,
-            mark.label,
-            mark.microphone,
-            mark.reviewer,
-            made_text(mark),
-            mark.corrects,
-        ]
-        lines.append("\t".join(fields))
-    return "".join(f"{line}\n" for line in lines)
-
-
 def read_audacity(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
     """Yield the labels of an Audacity label track; times may have decimal commas.
 
     Raise `DataError` if the text has too many lines.
     """
-    for number, line in numbered_lines(path, text):
-        if line.startswith("\\"):  # frequencies of a spectral selection
-            continue
-        start, end, label, *_ = [*(field.strip() for field in line.split("\t")), "", ""]
-        if not end:
-            reason = "is not start, end and label with tabs between them"
-            yield LineError(place_text(path, number), UNREADABLE, reason)
-            continue
-        yield FileLabel(number, with_point(start), with_point(end), label)
+    return scan(path, numbered_lines(path, text), _audacity_label)
 
 
-def write_audacity(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
-    """Return an Audacity label track, which has no fields for microphones and reviewers.
-
-    Parameters
-    ----------
-    marks : sequence of Mark
-        At least one; all of one microphone.
-    coverage : mapping of str to Coverage
-        By microphone; times are written as seconds since its first frame.
-
-    Raises
-    ------
-    DataError
-        If the marks are of several microphones.
-    """
-    microphones = sorted({mark.microphone for mark in marks})
-    if len(microphones) > 1:
-        names = ", ".join(microphones)
-        raise DataError(f"{path}: is for one microphone: choose one with --microphone ({names})")
-    zero = coverage[microphones[0]].starts[0]
-    return "".join(
-        f"{seconds_text(mark.start - zero)}\t{seconds_text(mark.end - zero)}\t{mark.label}\n"
-        for mark in marks
-    )
-
-
-_SPEAKER = "SPEAKER"
-_FIELDS = 9, 10  # the last field, lookahead of a system, was added later
+def _audacity_label(where: str, line: str) -> FileLabel | None:
+    if line.startswith("\\"):  # frequencies of a spectral selection
+        return None
+    start, end, label, *_ = [*(field.strip() for field in line.split("\t")), "", ""]
+    if not end:
+        raise LineError(where, UNREADABLE, "is not start, end and label with tabs between them")
+    return FileLabel(with_point(start), with_point(end), label)
 
 
 def read_rttm(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
@@ -290,38 +208,79 @@ def read_rttm(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | Lin
 
     Raise `DataError` if the text has too many lines.
     """
-    for number, line in numbered_lines(path, text):
-        fields, where = line.split(), place_text(path, number)
-        if fields[0].startswith(";;"):
-            continue
-        if len(fields) not in _FIELDS:
-            yield LineError(where, UNREADABLE, "is no line of RTTM, which has 9 or 10 fields")
-        elif fields[0] == _SPEAKER:
-            _, microphone, _, onset, duration, _, _, label, *_ = fields
-            try:
-                end = add_seconds(where, onset, duration)
-            except LineError as error:
-                yield error
-                continue
-            yield FileLabel(number, onset, end, label, microphone)
+    return scan(path, numbered_lines(path, text), _rttm_label)
+
+
+def _rttm_label(where: str, line: str) -> FileLabel | None:
+    fields = line.split()
+    if fields[0].startswith(";;"):
+        return None
+    if len(fields) not in _RTTM_FIELDS:
+        raise LineError(where, UNREADABLE, "is no line of RTTM, which has 9 or 10 fields")
+    if fields[0] != "SPEAKER":
+        return None
+    _, microphone, _, onset, duration, _, _, label, *_ = fields
+    return FileLabel(onset, add_seconds(where, onset, duration), label, microphone)
+
+
+_RTTM_FIELDS = 9, 10  # the last field, lookahead of a system, was added later
+_RTTM = "SPEAKER {microphone} 1 {start} {duration} <NA> <NA> {label} <NA> <NA>\n"
+_AUDACITY = "{start}\t{end}\t{label}\n"
+_RAVEN_COLUMNS = {
+    "Selection": "{number}",
+    "View": "Spectrogram 1",
+    "Channel": "{channel}",
+    "Begin Time (s)": "{start}",
+    "End Time (s)": "{end}",
+    "Low Freq (Hz)": "0.000",
+    "High Freq (Hz)": "8000.000",  # for sound at 16 kHz
+    "Annotation": "{label}",
+    "Microphone": "{microphone}",
+    "Reviewer": "{reviewer}",
+    "Made": "{made}",
+    "Corrects": "{corrects}",
+}
+
+
+def _lines(line: str, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
+    """Format a line for each mark, with seconds since the first frame of its microphone."""
+    names = sorted({mark.microphone for mark in marks})
+    lines = []
+    for number, mark in enumerate(marks, 1):
+        zero = coverage[mark.microphone].starts[0]
+        fields = mark._asdict() | {
+            "number": number,
+            "channel": names.index(mark.microphone) + 1,
+            "start": seconds_text(mark.start - zero),
+            "end": seconds_text(mark.end - zero),
+            "duration": seconds_text(mark.end - mark.start),
+            "made": made_text(mark),
+        }
+        lines.append(line.format_map(fields))
+    return "".join(lines)
+
+
+def write_raven(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
+    """Return a Raven table with all fields of the marks as columns, which Raven preserves."""
+    line = "\t".join(_RAVEN_COLUMNS.values())
+    return "\t".join(_RAVEN_COLUMNS) + "\n" + _lines(f"{line}\n", marks, coverage)
+
+
+def write_audacity(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:
+    """Return an Audacity label track, which has no fields for microphones and reviewers.
+
+    Raise `DataError` if the marks are of several microphones.
+    """
+    microphones = sorted({mark.microphone for mark in marks})
+    if len(microphones) > 1:
+        names = ", ".join(microphones)
+        raise DataError(f"{path}: is for one microphone: choose one with --microphone ({names})")
+    return _lines(_AUDACITY, marks, coverage)
 
 
 def write_rttm(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Return RTTM text with one line per mark.
-
-    Parameters
-    ----------
-    coverage : mapping of str to Coverage
-        By microphone; times are written as seconds since its first frame.
-    """
-    lines = []
-    for mark in marks:
-        onset = seconds_text(mark.start - coverage[mark.microphone].starts[0])
-        duration = seconds_text(mark.end - mark.start)
-        lines.append(
-            f"{_SPEAKER} {mark.microphone} 1 {onset} {duration} <NA> <NA> {mark.label} <NA> <NA>\n"
-        )
-    return "".join(lines)
+    """Return RTTM text with one line per mark."""
+    return _lines(_RTTM, marks, coverage)
 
 
 CODECS: Mapping[str, LabelCodec] = {
