@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -119,6 +119,49 @@ def audio_by_name(folder: Path) -> dict[str, Path]:
         if is_audio(path.name):
             found.setdefault(path.name, path)
     return found
+
+
+def clips_by_name(
+    paths: Iterable[Path],
+    pattern: re.Pattern[str],
+    group: str,
+    licence: str,
+    categories: Mapping[str, str] | None = None,
+) -> Iterator[CollectionClip]:
+    """Yield clips with their source and category, or a text for it, in the file name."""
+    for path in paths:
+        found = pattern.fullmatch(path.name)
+        source, text = found.group("source", "category") if found else ("", "")
+        category = categories[text] if categories and found else text
+        reason = "" if found else "not named as a clip of the collection"
+        sounds = (CategorySpan((category,)),)
+        yield CollectionClip(path, sounds, f"{group}_{source}", licence, left_out=reason)
+
+
+class TimedFile(NamedTuple):
+    """A file in tables of timed sounds, and the line that lists it first."""
+
+    where: str
+    sounds: list[CategorySpan]
+
+
+def read_timed_sounds(
+    paths: Iterable[Path], columns: Sequence[str], names: Mapping[str, str] | None = None
+) -> dict[str, TimedFile]:
+    """Read tables of timed sounds, separated by tabs, by file name.
+
+    The columns are those of file, start, end and category; a line without a category names a file
+    alone. `names` has the names of categories that the tables give as ids. Raise `DataError` as
+    `read_table` and `read_seconds` do.
+    """
+    files: dict[str, TimedFile] = {}
+    for path in paths:
+        for where, (file, start, end, category) in read_table(path, columns, "\t"):
+            sounds = files.setdefault(file, TimedFile(where, [])).sounds
+            if category:
+                name = (names or {}).get(category, category)
+                sounds.append(CategorySpan((name,), *read_seconds(where, start, end)))
+    return files
 
 
 def read_seconds(where: str, *texts: str) -> list[float]:
@@ -259,23 +302,16 @@ def read_desed(folder: Path) -> Iterator[CollectionClip]:
 
     Raise `DataError` if a table of the collection cannot be read, or there is none with times.
     """
-    sounds: dict[str, dict[CategorySpan, None]] = {}
-    wheres: dict[str, str] = {}
-    for path in _desed_tables(folder):
-        for where, (name, onset, offset, category) in read_table(path, _DESED_COLUMNS, "\t"):
-            wheres.setdefault(name, where)
-            heard = sounds.setdefault(name, {})
-            if category:
-                heard[CategorySpan((category,), *read_seconds(where, onset, offset))] = None
+    files = read_timed_sounds(_desed_tables(folder), _DESED_COLUMNS)
     audio = audio_by_name(folder / "audio")
-    for name, heard in sounds.items():
+    for name, (where, sounds) in files.items():
         found = _DESED_NAME.fullmatch(name)
         group, start, end = found.groups() if found else ("", "0", "0")
-        path = path_inside(wheres[name], folder / "audio", name)
-        first, last = read_seconds(wheres[name], start, end)
+        path = path_inside(where, folder / "audio", name)
+        first, last = read_seconds(where, start, end)
         yield CollectionClip(
             audio.get(path.name, path),
-            tuple(heard),
+            tuple(dict.fromkeys(sounds)),
             f"youtube_{group}",
             "unstated (sound of YouTube)",
             last - first,
@@ -297,7 +333,7 @@ def _desed_tables(folder: Path) -> list[Path]:
     return found
 
 
-_VOCALSOUND_NAME = re.compile(r"([fm]\d+)_\d+_([a-z]+)\.wav")
+_VOCALSOUND_NAME = re.compile(r"(?P<source>[fm]\d+)_\d+_(?P<category>[a-z]+)\.wav")
 
 
 def read_vocalsound(folder: Path) -> Iterator[CollectionClip]:
@@ -315,16 +351,9 @@ def read_vocalsound(folder: Path) -> Iterator[CollectionClip]:
         audio = folder / "audio_44k"
     listing = folder / "datafiles" / "all.json"
     names = {path.name for path in audio.iterdir() if is_audio(path.name)}
-    for name in sorted(names.union(_vocalsound_names(listing) if listing.exists() else ())):
-        found = _VOCALSOUND_NAME.fullmatch(name)
-        speaker, category = found.groups() if found else ("", "")
-        yield CollectionClip(
-            audio / name,
-            (CategorySpan((category,)),),
-            f"vocalsound_{speaker}",
-            "CC BY-SA 4.0",
-            left_out="" if found else "not named as a clip of the collection",
-        )
+    names.update(_vocalsound_names(listing) if listing.exists() else ())
+    paths = (audio / name for name in sorted(names))
+    return clips_by_name(paths, _VOCALSOUND_NAME, "vocalsound", "CC BY-SA 4.0")
 
 
 def _vocalsound_names(path: Path) -> Iterator[str]:
@@ -362,24 +391,18 @@ def read_audioset_strong(folder: Path) -> Iterator[CollectionClip]:
     tables = sorted(folder.glob("*_strong.tsv"))
     if not tables:
         raise DataError(f"{folder}: no audioset_train_strong.tsv or audioset_eval_strong.tsv in it")
-    sounds: dict[str, list[CategorySpan]] = {}
-    wheres: dict[str, str] = {}
-    for path in tables:
-        for where, (segment, start, end, label) in read_table(path, _AUDIOSET_COLUMNS, "\t"):
-            wheres.setdefault(segment, where)
-            heard = sounds.setdefault(segment, [])
-            heard.append(CategorySpan((names.get(label, label),), *read_seconds(where, start, end)))
+    files = read_timed_sounds(tables, _AUDIOSET_COLUMNS, names)
     audio = _audioset_audio(folder)
-    for segment, heard in sounds.items():
+    for segment, (where, sounds) in files.items():
         found = _AUDIOSET_SEGMENT.fullmatch(segment)
         if found is None:
-            raise DataError(f"{wheres[segment]}: {segment[:64]!r} is no segment of AudioSet")
+            raise DataError(f"{where}: {segment[:64]!r} is no segment of AudioSet")
         video, start = found.groups()
         first = float(start)
         paths = (audio.get((video, time)) for time in (first, first / 1000, None))
         yield CollectionClip(
-            next(filter(None, paths), path_inside(wheres[segment], folder, segment)),
-            tuple(heard),
+            next(filter(None, paths), path_inside(where, folder, segment)),
+            tuple(sounds),
             f"youtube_{video}",
             "unstated (sound of YouTube)",
             _AUDIOSET_SECONDS,
@@ -403,11 +426,9 @@ def _audioset_audio(folder: Path) -> dict[tuple[str, float | None], Path]:
     return audio
 
 
-_RAVDESS_NAME = re.compile(r"03-0[12]-(0[1-8])-0[12]-0[12]-0[12]-(\d\d)\.wav")
-_RAVDESS_EMOTIONS = (
-    *("neutral", "calm", "happy", "sad"),
-    *("angry", "fearful", "disgust", "surprised"),
-)
+_RAVDESS_NAME = re.compile(r"03-0[12]-(?P<category>0[1-8])-0[12]-0[12]-0[12]-(?P<source>\d\d)\.wav")
+_EMOTIONS = "neutral", "calm", "happy", "sad", "angry", "fearful", "disgust", "surprised"
+_RAVDESS_EMOTIONS = {f"{number:02}": name for number, name in enumerate(_EMOTIONS, 1)}
 
 
 def read_ravdess(folder: Path) -> Iterator[CollectionClip]:
@@ -419,20 +440,11 @@ def read_ravdess(folder: Path) -> Iterator[CollectionClip]:
 
     The category is the emotion.
     """
-    for path in files_below(folder):
-        if is_audio(path.name):
-            found = _RAVDESS_NAME.fullmatch(path.name)
-            emotion, actor = found.groups() if found else ("", "")
-            yield CollectionClip(
-                path,
-                (CategorySpan((_RAVDESS_EMOTIONS[int(emotion) - 1] if emotion else "",)),),
-                f"ravdess_{actor}",
-                "CC BY-NC-SA 4.0",
-                left_out="" if found else "not named as a clip of the collection",
-            )
+    paths = (path for path in files_below(folder) if is_audio(path.name))
+    return clips_by_name(paths, _RAVDESS_NAME, "ravdess", "CC BY-NC-SA 4.0", _RAVDESS_EMOTIONS)
 
 
-_EMODB_NAME = re.compile(r"(\d\d)[ab]\d\d([WLEAFTN])[a-z]?\.wav")
+_EMODB_NAME = re.compile(r"(?P<source>\d\d)[ab]\d\d(?P<category>[WLEAFTN])[a-z]?\.wav")
 _EMODB_EMOTIONS = {
     "W": "anger",
     "L": "boredom",
@@ -453,17 +465,8 @@ def read_emodb(folder: Path) -> Iterator[CollectionClip]:
 
     The category is the emotion.
     """
-    for path in sorted((folder / "wav").iterdir()):
-        if is_audio(path.name):
-            found = _EMODB_NAME.fullmatch(path.name)
-            actor, letter = found.groups() if found else ("", "")
-            yield CollectionClip(
-                path,
-                (CategorySpan((_EMODB_EMOTIONS.get(letter, ""),)),),
-                f"emodb_{actor}",
-                "unstated",
-                left_out="" if found else "not named as a clip of the collection",
-            )
+    paths = sorted(path for path in (folder / "wav").iterdir() if is_audio(path.name))
+    return clips_by_name(paths, _EMODB_NAME, "emodb", "unstated", _EMODB_EMOTIONS)
 
 
 _VOXCELEB_PERSON = re.compile(r"id\d{5}")
