@@ -1,11 +1,13 @@
 """Export of audio clips as WAV files, and of segments as an Audacity label track."""
 
 import wave
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
+
+import numpy as np
 
 from hearthlog.analyzer.export.exporter import (
     Exporter,
@@ -18,7 +20,7 @@ from hearthlog.analyzer.logs.clips import CLIP_FIELDS, SAMPLE_BYTES, LoggedClip,
 from hearthlog.analyzer.logs.selection import Damages, LogSelection, TypedColumns
 from hearthlog.schemas.errors import LogError, Progress, printable
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns, iterate_columns
+from hearthlog.schemas.logs.columns import iterate_columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.message_types import RAW_AUDIO
 from hearthlog.schemas.messages.topics import topic as topic_of
@@ -50,21 +52,21 @@ class WavFiles:
         """
         try:
             for piece in pieces:
-                self._write(clips_of(piece.columns))
+                for clip in clips_of(piece.columns):
+                    self._append(clip)
         except (LogError, OSError):
             with suppress(OSError):
                 self.finish()
             raise
 
-    def _write(self, clips: Iterable[LoggedClip]) -> None:
-        for clip in clips:
-            if self._file is None or not self._follows(clip):
-                self.finish()
-                self._file = wave.open(str(self._name(clip.start)), "wb")  # noqa: SIM115
-                self._file.setparams((clip.channels, SAMPLE_BYTES, clip.rate, 0, "NONE", ""))
-            self._file.writeframesraw(clip.data)
-            self._last = clip
-            self._size += len(clip.data)
+    def _append(self, clip: LoggedClip) -> None:
+        if self._file is None or not self._follows(clip):
+            self.finish()
+            self._file = wave.open(str(self._name(clip.start)), "wb")  # noqa: SIM115
+            self._file.setparams((clip.channels, SAMPLE_BYTES, clip.rate, 0, "NONE", ""))
+        self._file.writeframesraw(clip.data)
+        self._last = clip
+        self._size += len(clip.data)
 
     def finish(self) -> None:
         """Complete the open file."""
@@ -114,25 +116,17 @@ class LabelTrack:
         Raise `LogError` if a required field is missing.
         """
         for piece in pieces:
-            self._write(piece.columns)
-
-    def _write(self, columns: Columns) -> None:
-        starts = columns["header.stamp"]
-        if self._zero is None:
-            self._zero = int(starts.min())
-        ends = (starts + columns["duration"] - self._zero) / NANOSECONDS
-        rows = zip(
-            ((starts - self._zero) / NANOSECONDS).tolist(),
-            ends.tolist(),
-            columns["label"].tolist(),
-            strict=True,
-        )
-        lines = [
-            f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(printable(label).split())}\n"
-            for start, end, label in rows
-            if end > 0  # otherwise the segment ended before the span and was logged in it
-        ]
-        self._stream.write("".join(lines).encode())
+            starts, lengths = (piece.columns[name] for name in ("header.stamp", "duration"))
+            if self._zero is None:
+                self._zero = int(starts.min())
+            times = np.stack([starts, starts + lengths], axis=1) - self._zero
+            labels = piece.columns["label"].tolist()
+            lines = [
+                f"{max(start, 0):.6f}\t{max(end, 0):.6f}\t{' '.join(printable(label).split())}\n"
+                for (start, end), label in zip((times / NANOSECONDS).tolist(), labels, strict=True)
+                if end > 0  # otherwise the segment ended before the span and was logged in it
+            ]
+            self._stream.write("".join(lines).encode())
 
     def finish(self) -> None:
         """Do nothing: the file is complete after each write."""

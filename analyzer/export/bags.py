@@ -388,7 +388,9 @@ def _check_topics(files: Sequence[FileCounts]) -> None:
     """Check that every topic is described equally in all files."""
     known: dict[str, tuple[object, str]] = {}
     for file in files:
-        for name, identity in _identities(file):
+        for name, topic in file.topics.items():
+            about = topic.channel_metadata
+            identity = topic.type, about["offered_qos_profiles"], about["topic_type_hash"]
             other, where = known.setdefault(name, (identity, file.name))
             if other != identity:
                 raise LogError(
@@ -396,9 +398,3 @@ def _check_topics(files: Sequence[FileCounts]) -> None:
                     f"{file.name}, which rosbag2 has no way to say; export with --format rosbag2 "
                     "and --output a part that is of one"
                 )
-
-
-def _identities(file: FileCounts) -> Iterator[tuple[str, object]]:
-    for name, topic in file.topics.items():
-        about = topic.channel_metadata
-        yield name, (topic.type, about["offered_qos_profiles"], about["topic_type_hash"])
