@@ -64,8 +64,7 @@ def test_probabilities_are_those_of_scikit_learn(classes, count, spread):
     fitted = make_pipeline(rounded_to_steps(StandardScaler(), PAPER.steps), machine).fit(
         rounded(statistics(data)).astype(np.float64), data.target
     )
-    learned = LearnedSvm(fitted, unseen(classes)[:0], PAPER.steps)
-    decision = learned.decide(unseen(classes), classes)
+    decision, _ = LearnedSvm(fitted).decide(unseen(classes))
     expected = softmax(model.description.inverse_temperature * decision)
 
     ours = Classifier(model).probabilities(unseen(classes))

@@ -1,8 +1,8 @@
 """Methods that fit a linear head on landmark kernels, the default method among them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from hearthlog.analyzer.training.learned_inputs import (
     scaler_arrays,
 )
 from hearthlog.analyzer.training.method import Examples
-from hearthlog.analyzer.training.window_method import LearnedMachine, WindowMethod, as_room
+from hearthlog.analyzer.training.window_method import KernelMethod, LearnedMachine, as_room
 from hearthlog.analyzer.workers.workers import single_thread
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.landmarks import (
@@ -37,37 +37,19 @@ _LEAST = 1e-6  # of the largest eigenvalue: smaller ones are rounding errors
 
 
 @dataclass(frozen=True)
-class LandmarkMethod(WindowMethod):
+class LandmarkMethod(KernelMethod):
     """Multinomial logistic regression on a Nyström map of the inputs."""
 
     cost: float = 10 / 3
     gamma: float = 0.5
     landmarks: int = 400
     steps: int = 50
+    cost_times: ClassVar[Sequence[float]] = (0.3, 1.0, 3.0)
 
     @property
     def libraries(self) -> tuple[str, ...]:
         """Distributions with an influence on the result."""
         return (*super().libraries, "scipy")
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Cost and gamma."""
-        return {"cost": self.cost, "gamma": self.gamma}
-
-    def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """Return this method with another cost or gamma; see `Method.with_parameters`."""
-        if unknown := values.keys() - {"cost", "gamma"}:
-            raise DataError(f"method {self.name} has no {min(unknown)} to choose")
-        return replace(self, **values)  # type: ignore[arg-type]
-
-    def variations(self) -> list[Self]:
-        """Return nine methods: cost times 0.3, 1 and 3, each with gamma times 0.5, 1 and 2."""
-        return [
-            replace(self, cost=self.cost * cost, gamma=self.gamma * gamma)
-            for cost in (0.3, 1.0, 3.0)
-            for gamma in (0.5, 1.0, 2.0)
-        ]
 
     def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> LearnedMachine:
         """Fit on some segments; see `Method.fit`.

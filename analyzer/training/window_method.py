@@ -1,13 +1,15 @@
 """Methods that train a scikit-learn classifier on windows."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.learned_inputs import rounded, spread_over_classes
 from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind, Machine
@@ -64,6 +66,33 @@ class WindowMethod(Method):
         """
 
 
+@dataclass(frozen=True)
+class KernelMethod(WindowMethod):
+    """A classifier with an RBF kernel: its cost and gamma can be set and searched."""
+
+    cost: float = 4.0
+    gamma: float = 1.0
+    cost_times: ClassVar[Sequence[float]] = (0.25, 1.0, 4.0)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Cost and gamma."""
+        return {"cost": self.cost, "gamma": self.gamma}
+
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """Return this method with another cost or gamma; see `Method.with_parameters`."""
+        if unknown := values.keys() - {"cost", "gamma"}:
+            raise DataError(f"method {self.name} has no {min(unknown)} to choose")
+        return replace(self, **values)  # type: ignore[arg-type]
+
+    def variations(self) -> list[Self]:
+        """Return nine methods: three costs, each with gamma times 0.5, 1 and 2."""
+        return [
+            replace(self, cost=self.cost * cost, gamma=self.gamma * gamma)
+            for cost, gamma in product(self.cost_times, (0.5, 1.0, 2.0))
+        ]
+
+
 def as_room(kind: ClassifierKind) -> dict[str, Any]:
     """Return the fields of a method with the inputs of method `room`."""
     return {
@@ -93,7 +122,7 @@ class LearnedMachine:
         arrays: Mapping[str, NDArray[Any]],
         parameters: Mapping[str, Any],
     ) -> None:
-        self._machine = machine
+        self.machine = machine
         self.classes = classes
         self._arrays = arrays
         self._parameters = parameters
@@ -103,7 +132,7 @@ class LearnedMachine:
         decision = np.full((len(inputs), classes), -np.inf)
         for start in range(0, len(inputs), _ROWS_AT_ONCE):
             rows = slice(start, start + _ROWS_AT_ONCE)
-            decision[rows, self.classes] = self._machine.decide(inputs[rows])[0]
+            decision[rows, self.classes] = self.machine.decide(inputs[rows])[0]
         return decision
 
     def arrays(self) -> dict[str, NDArray[Any]]:

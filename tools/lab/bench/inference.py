@@ -143,7 +143,7 @@ def contests(work: Workload) -> dict[str, tuple[Callable[[], object], Callable[[
 def fit_scikit_learn(data: Dataset) -> CalibratedClassifierCV:
     """Fit the support vector machine of `svm`, and calibrate it as scikit-learn does."""
     examples = prepare(SVM, data)
-    machine = SVM.fit(examples).machine
+    machine = SVM.fit(examples).machine.pipeline
     machine[-1].decision_function_shape = "ovr"  # the default, which its calibration needs
     calibrated = CalibratedClassifierCV(
         FrozenEstimator(machine), method="temperature", ensemble=False
