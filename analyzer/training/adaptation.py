@@ -20,7 +20,6 @@ from hearthlog.analyzer.training.heads import in_units, regressed
 from hearthlog.analyzer.training.landmark_method import (
     ROOM,
     LandmarkMap,
-    LandmarkMethod,
     centres,
 )
 from hearthlog.analyzer.training.learned_inputs import balanced, kept_inputs
@@ -202,19 +201,6 @@ class HomeLandmarks(Method):
     inverse: float = 1.0
 
     @classmethod
-    def of_learned(cls, method: LandmarkMethod, learned: LearnedMachine) -> Self:
-        """Return the method that adapts a learned classifier, given its arrays and parameters."""
-        return cls(
-            method.name,
-            method.feature_set,
-            method.inputs,
-            method.kind,
-            copies=0,
-            base=learned.arrays(),
-            values=learned.parameters(),
-        )
-
-    @classmethod
     def of(cls, model: Model) -> Self:
         """Return the method that adapts a model of kind `rbf-landmarks`."""
         description = model.description
@@ -370,13 +356,15 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         raise DataError("the home has no segments of a class of the model")
     moved = base if is_moved(base) else learned_over(base)
     description, method = moved.description, HomeLandmarks.of(moved)
-    examples, here = prepare(method, home), np.arange(len(home))
+    examples = prepare(method, home)
     _check_new_classes(base, examples, home.classes)
     learned = method.fit(examples)
     before = description.base_inverse_temperature or description.inverse_temperature
     description = _of_classes(description, home.classes)
-    left_out = _left_out(method, examples, here, ~_is_confirmed(home), description)
-    inverse = _temperature_here(left_out, examples, here, description)
+    left_out = _left_out(method, examples, ~_is_confirmed(home, home.collection), description)
+    # Marks alone are hard cases and would make the model underconfident elsewhere.
+    tried = np.isfinite(left_out).all(axis=1)
+    inverse = home_temperature(left_out[tried], home.target[tried], before)
     smoothing = description.smoothing
     weight = min(smoothing.weight * description.inverse_temperature / inverse, MOST_WEIGHT)
     training = description.training_data.model_copy(
@@ -406,14 +394,14 @@ def adapt_model(base: Model, home: Dataset) -> Model:
         training_digests=np.union1d(learned_digests(base), segment_digests(home.windows)),
     )
     if description.embedding is not None:
-        adapted = _with_heads(adapted, base, home, inverse * left_out[here])
+        adapted = _with_heads(adapted, base, home, inverse * left_out)
     return with_directions(adapted, home.target, home.sightings)
 
 
 def _with_heads(adapted: Model, base: Model, home: Dataset, decisions: Float64) -> Model:
     """Adapt the heads of a model too, given held-out decisions of the classifier."""
     heads = base_heads(base, home.classes)
-    marked = home.embedding_windows.collection != _confirmed_number(home)
+    marked = ~_is_confirmed(home, home.embedding_windows.collection)
     learned = learn_home(heads, home.embedding_windows, marked, home.classes)
     inverse = _inverse_here(heads, home, decisions)
     mix = learned.mix.model_copy(
@@ -438,7 +426,7 @@ def _with_heads(adapted: Model, base: Model, home: Dataset, decisions: Float64) 
 def _inverse_here(heads: Heads, home: Dataset, decisions: Float64) -> float:
     """Return the inverse temperature of the mix, cross-validated over parts of a home."""
     base, sounds = heads.mix.inverse_temperature, sounds_of(home.classes)
-    marked = ~_is_confirmed(home)
+    marked = ~_is_confirmed(home, home.collection)
     tried = np.isfinite(decisions).all(axis=1) & home.is_embedded & np.isin(home.target, sounds)
     if marked.sum() < _FEWEST_SEGMENTS or not tried.any():
         return base
@@ -465,12 +453,7 @@ def _learned_without(heads: Heads, home: Dataset, seen: Indices) -> Heads:
         np.ones(len(own), bool),
         np.arange(len(own)),
     )
-    return learn_home(heads, windows, windows.collection != _confirmed_number(home), home.classes)
-
-
-def _confirmed_number(home: Dataset) -> int:
-    names = home.collection_names
-    return names.index(CONFIRMED) if CONFIRMED in names else -1
+    return learn_home(heads, windows, ~_is_confirmed(home, windows.collection), home.classes)
 
 
 def _check_new_classes(base: Model, examples: Examples, classes: Sequence[str]) -> None:
@@ -512,17 +495,16 @@ def _of_classes(description: Description, classes: Sequence[str]) -> Description
 
 
 def _left_out(
-    method: Method, examples: Examples, home: Indices, marked: Bool, description: Description
+    method: Method, examples: Examples, marked: Bool, description: Description
 ) -> Float64:
     """Return the decisions of adapted classifiers for held-out parts of a home.
 
-    NaN for segments outside the home, and for all segments if too few are marked.
+    NaN for all segments if too few are marked.
     """
-    everything, count = np.arange(len(examples.target)), len(description.classes)
+    everything, count = np.arange(len(marked)), len(description.classes)
     if marked.sum() < _FEWEST_SEGMENTS:
-        return np.full((len(everything), count), np.nan)
-    parts = [home[part] for part in _parts(marked)]
-    folds = [(np.setdiff1d(everything, part), part) for part in parts]
+        return np.full((len(marked), count), np.nan)
+    folds = [(np.setdiff1d(everything, part), part) for part in _parts(marked)]
     [decisions] = cross_validate([method], examples, count, folds, ignore_progress)
     bias = np.array([description.decision_bias.get(name, 0.0) for name in description.classes])
     return decisions + bias
@@ -534,25 +516,14 @@ def _parts(marked: Bool) -> list[Indices]:
     return [np.concatenate(pair) for pair in zip(of_marks, others, strict=True)]
 
 
-def _temperature_here(
-    left_out: Float64, examples: Examples, home: Indices, description: Description
-) -> float:
-    """Return the inverse temperature of an adapted model, cross-validated over parts of a home.
-
-    Marks alone are hard cases and would make the model underconfident elsewhere.
-    """
-    before = description.base_inverse_temperature or description.inverse_temperature
-    tried = home[np.isfinite(left_out[home]).all(axis=1)]
-    return home_temperature(left_out[tried], examples.target[tried], before)
-
-
-def _is_confirmed(home: Dataset) -> Bool:
-    names = np.array(home.collection_names)
-    confirmed: Bool = names[home.collection] == CONFIRMED
-    return confirmed
+def _is_confirmed(home: Dataset, collection: Indices) -> Bool:
+    """Return which of a home's segments or windows keep the label of the model."""
+    names = home.collection_names
+    return collection == (names.index(CONFIRMED) if CONFIRMED in names else -1)
 
 
 def _confirmed(home: Dataset) -> dict[str, int]:
     """Count the segments of each class that keep the label of the model."""
-    counts = np.bincount(home.target[_is_confirmed(home)], minlength=len(home.classes))
+    confirmed = home.target[_is_confirmed(home, home.collection)]
+    counts = np.bincount(confirmed, minlength=len(home.classes))
     return {name: int(count) for name, count in zip(home.classes, counts, strict=True) if count}

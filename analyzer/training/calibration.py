@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.dataset import Dataset, source_counts
 from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.analyzer.training.scores import calibration_error, score
 from hearthlog.analyzer.workers.workers import in_parallel
@@ -116,8 +116,7 @@ def trained_elsewhere(data: Dataset, folds: Sequence[Fold]) -> Bool:
     """
     taught = np.zeros(len(data), bool)
     for seen, unseen in folds:
-        pairs = np.unique(np.stack([data.target[seen], data.group[seen]]), axis=1)
-        sources = np.bincount(pairs[0], minlength=len(data.classes))
+        sources = source_counts(data.target[seen], data.group[seen], len(data.classes))
         taught[unseen] = sources[data.target[unseen]] >= _FEWEST_SOURCES
     if UNKNOWN in data.classes:
         taught &= data.target != data.classes.index(UNKNOWN)

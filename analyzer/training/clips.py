@@ -410,9 +410,7 @@ class ClipEmbeddings(NamedTuple):
 
     def part(self, rows: slice) -> "ClipEmbeddings":
         """Return a subset of the windows."""
-        return ClipEmbeddings(
-            self.values[rows], self.version[rows], self.taught[rows], self.starts[rows]
-        )
+        return ClipEmbeddings._make(column[rows] for column in self)
 
 
 class ClipEmbedder:
@@ -454,9 +452,8 @@ def clip_embeddings(
     digest = hashlib.blake2b(np.ascontiguousarray(frames).tobytes(), digest_size=8).digest()
     rng = np.random.default_rng([_EMBEDDING_SEED + seed, int.from_bytes(digest, "little")])
     sound, parts = frames.ravel().astype(np.float64), []
-    padded = _padded(
-        sound, 10.0 ** (_PADDING_DBFS / 20.0) * rng.standard_normal(_padding_samples(sound))
-    )
+    count = len(sound) + 2 * _HALF  # with half a window on both sides
+    padded = _padded(sound, 10.0 ** (_PADDING_DBFS / 20.0) * rng.standard_normal(count))
     taught = np.empty(0, np.intp) if silence else _taught(padded, len(sound), _HOP)
     middles = np.union1d(taught, segments * FRAME_SAMPLES + _HALF)
     parts.append(
@@ -466,7 +463,7 @@ def clip_embeddings(
     )
     if not silence:
         echoing, level = other_room(frames, rng, silence=False)
-        noise = steady_noise(_padding_samples(sound), level, rng)
+        noise = steady_noise(count, level, rng)
         of_room = _noise_of(noise)
         padded = _padded(echoing, noise)
         padded = np.clip(np.rint(padded * 32767.0), -32768, 32767) / 32768.0
@@ -475,22 +472,8 @@ def clip_embeddings(
             padded, middles, lambda window: embed(of_room.reduced(window)), IN_A_ROOM
         )
         parts.append(in_room)
-        shorts = [embed(window) for window in _short_parts(sound, rng)]
-        count = len(shorts)
-        parts.append(
-            ClipEmbeddings(
-                np.stack(shorts),
-                np.full(count, SHORT),
-                np.ones(count, bool),
-                np.zeros(count, np.intp),
-            )
-        )
+        parts.append(_of_version([embed(one) for one in _short_parts(sound, rng)], SHORT))
     return ClipEmbeddings(*map(np.concatenate, zip(*parts, strict=True)))
-
-
-def _padding_samples(sound: Float64) -> int:
-    """Return the samples of a sound padded by half a window on both sides."""
-    return len(sound) + 2 * _HALF
 
 
 def _padded(sound: Float64, noise: Float64) -> Float64:
@@ -515,14 +498,15 @@ def _taught(padded: Float64, count: int, hop: int) -> Indices:
 
 def _embedded(padded: Float64, middles: Indices, embed: Embeds, version: int) -> ClipEmbeddings:
     windows = [_window(padded[middle : middle + _WINDOW]) for middle in middles.tolist()]
-    values, count = [embed(window) for window in windows], len(middles)
-    if not values:  # as wide as any
+    if not windows:  # as wide as any
         return _embedded(padded, np.zeros(1, np.intp), embed, version).part(slice(0))
+    return _of_version([embed(window) for window in windows], version)
+
+
+def _of_version(values: Sequence[Int8], version: int) -> ClipEmbeddings:
+    count = len(values)
     return ClipEmbeddings(
-        np.stack(values),
-        np.full(count, version),
-        np.ones(count, bool),
-        np.zeros(count, np.intp),
+        np.stack(values), np.full(count, version), np.ones(count, bool), np.zeros(count, np.intp)
     )
 
 

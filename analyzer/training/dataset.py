@@ -84,6 +84,9 @@ class Recording(NamedTuple):
     embedded: ClipEmbeddings | None = None
 
 
+Segment = tuple[Recording, int]  # with the first frame
+
+
 class EmbeddingWindows(NamedTuple):
     """Embedded windows for training heads.
 
@@ -108,14 +111,7 @@ class EmbeddingWindows(NamedTuple):
 
     def rows(self, chosen: Indices | Bool) -> "EmbeddingWindows":
         """Return a subset of the windows."""
-        return EmbeddingWindows(
-            self.values[chosen],
-            self.target[chosen],
-            self.group[chosen],
-            self.collection[chosen],
-            self.tried[chosen],
-            self.recording[chosen],
-        )
+        return EmbeddingWindows._make(column[chosen] for column in self)
 
 
 _NO_NUMBERS = np.empty(0, np.intp)
@@ -201,14 +197,21 @@ class Dataset:
     @property
     def amounts(self) -> dict[str, Amount]:
         """Amount of each class."""
+        sources = source_counts(self.target, self.group, len(self.classes))
         return {
             name: Amount(
-                sources=len(np.unique(self.group[self.target == i])),
+                sources=int(sources[i]),
                 segments=int((self.target == i).sum()),
                 seconds=round(self.seconds.get(name, 0.0), 3),
             )
             for i, name in enumerate(self.classes)
         }
+
+
+def source_counts(target: Indices, group: Indices, classes: int) -> Indices:
+    """Return the number of source groups of each class."""
+    pairs = np.unique(np.stack([target, group]), axis=1)
+    return np.bincount(pairs[0], minlength=classes)
 
 
 def build_dataset(  # noqa: PLR0913, PLR0917
@@ -331,7 +334,7 @@ def cut_recordings(
     skipped: Counter[str] = Counter()
     seconds: dict[str, float] = {}
     left_out: list[SkippedClip] = []
-    chosen: list[_Chosen] = []
+    chosen: list[Segment] = []
     embedded_recordings: list[tuple[Recording, Indices]] = []
     spans: list[tuple[int, int]] = []
     rows = [np.empty((0, 3), np.intp)]
@@ -359,7 +362,7 @@ def cut_recordings(
             continue
         spans += [item.span] if item.span else []
         seconds[name] = seconds.get(name, 0.0) + len(item.features) * FRAME_SECONDS
-        chosen += [_Chosen(item, start) for start in starts.tolist()]
+        chosen += [(item, start) for start in starts.tolist()]
         weights.append(np.full(len(starts), item.weight))
         rows.append(np.tile(key, (len(starts), 1)))
     target, group_of, collection_of = np.concatenate(rows).T
@@ -383,7 +386,7 @@ def cut_recordings(
         collections=dict(used),
         skipped={why: count for why, count in sorted(skipped.items()) if why},
         spans=np.array(spans, np.int64).reshape(-1, 2),
-        sightings=[one.recording.sighting for one in segments],
+        sightings=[recording.sighting for recording, _ in segments],
         left_out=left_out,
         embedded=embedded,
         is_embedded=is_embedded,
@@ -391,19 +394,12 @@ def cut_recordings(
     )
 
 
-class _Chosen(NamedTuple):
-    """A segment of a recording."""
-
-    recording: Recording
-    start: int
-
-
-def _cut(segments: Sequence[_Chosen], features: FeatureSet) -> tuple[Float32, Float64]:
+def _cut(segments: Sequence[Segment], features: FeatureSet) -> tuple[Float32, Float64]:
     """Return the features of segments, unchanged and in other rooms, and the floors.
 
     Shapes are (1 + k, n, window_frames, d) and (1 + k, n, b); NaN for a missing copy.
     """
-    count = 1 + max((len(segment.recording.copies) for segment in segments), default=0)
+    count = 1 + max((len(recording.copies) for recording, _ in segments), default=0)
     shape = (count, len(segments), features.window_frames, features.width)
     windows = np.full(shape, np.nan, np.float32)
     floors = np.zeros((count, len(segments), features.bands))
@@ -444,7 +440,7 @@ def _joined(embedded: Sequence[tuple[Recording, Indices]]) -> EmbeddingWindows:
     return EmbeddingWindows(values, target, group, collection, tried, recording).rows(kept)
 
 
-def _embedded(segments: Sequence["_Chosen"]) -> tuple[Int8, Bool]:
+def _embedded(segments: Sequence[Segment]) -> tuple[Int8, Bool]:
     """Return the embeddings of segments, zeros where missing, and which segments have one."""
     rows: list[tuple[int, Int8]] = []
     for number, (recording, start) in enumerate(segments):

@@ -1,15 +1,15 @@
 """Linear heads on embeddings, and their mixture with a classifier."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
 from sklearn.metrics import f1_score
 
 from hearthlog.analyzer.training.calibration import Fold, inverse_temperature
-from hearthlog.analyzer.training.dataset import Dataset, EmbeddingWindows
+from hearthlog.analyzer.training.dataset import Dataset, EmbeddingWindows, source_counts
 from hearthlog.analyzer.training.manifest import BUILTIN
 from hearthlog.models.classes import FLUSHING_WATER, OTHER, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.evidence import UNIT, UNTAUGHT, EmbeddingHeads, mixed, sounds_of
@@ -59,8 +59,7 @@ def learn_heads(
     """
     sound = np.array([name != SILENCE for name in classes])[windows.target]
     chosen = sound if seen is None else sound & seen
-    pairs = np.unique(np.stack([windows.target[chosen], windows.group[chosen]]), axis=1)
-    sources = np.bincount(pairs[0], minlength=len(classes))
+    sources = source_counts(windows.target[chosen], windows.group[chosen], len(classes))
     rows = windows.rows(chosen & (sources >= FEWEST_SOURCES)[windows.target])
     width, count = windows.values.shape[1], len(classes)
     weights = np.zeros((len(inputs), width, count))
@@ -211,7 +210,6 @@ class _Sums:
 HEAD_WEIGHT = 1.0
 MACHINE_WEIGHT = 0.75
 _SUREST = 4.0  # maximum inverse temperature: without errors the sample was too small
-CLASS_EXPONENT = 0.2
 _NAMES_BESIDE = 0.5  # weight of names next to both heads
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.25, 0.2  # of a step of a quarter of a logit
 _NAMES_BIAS = {FLUSHING_WATER: 2.5, OTHER: 1.5}  # classes that names alone miss
@@ -369,43 +367,38 @@ def best_mix(data: Dataset, taken: HeadInputs, ways: Sequence[Tried]) -> BestMix
             mix = mix.model_copy(update={"names": names})
             of_names = _of_names_alone(data, mix)
             by_heads = [one + of_names for one in by_heads]
-        left_out = _left_out(data, mix, ways, by_heads)
+        left_out = [_nested(data, mix, way, one) for way, one in zip(ways, by_heads, strict=True)]
         tried.append(BestMix(mix, inputs, by_heads, left_out))
         scores.append(_right(data, left_out) + advantage)
     return tried[int(np.argmax(scores))]
 
 
-class _Candidate(NamedTuple):
-    """Linear heads and names for a mix; `inputs` are those of the heads."""
+def _candidates(
+    data: Dataset, taken: HeadInputs
+) -> Iterator[tuple[tuple[slice, ...], list[NamesHead], float]]:
+    """Yield the mixes to compare: inputs of linear heads, names, and their advantage in score.
 
-    inputs: tuple[slice, ...]
-    names: list[NamesHead]
-    advantage: float = 0.0
-
-
-def _candidates(data: Dataset, taken: HeadInputs) -> list[_Candidate]:
-    """Return the mixes to compare; a class of few sources cannot be scored without names."""
-    every = taken.inputs
+    A class of few sources cannot be scored without names.
+    """
     rejecting = rejecting_head(taken, data.classes)
     names = names_head(taken, data.classes)
     by_rejecting = [] if rejecting is None else [rejecting]
     known = [n for n, name in enumerate(data.classes) if name not in {SILENCE, UNKNOWN}]
     if names is not None and (_sources(data)[known] < FEWEST_SOURCES).any():
         beside = names.model_copy(update={"weight": _NAMES_BESIDE})
-        found = [_Candidate(every, [*by_rejecting, beside])]
+        yield taken.inputs, [*by_rejecting, beside], 0.0
     else:
-        found = [_Candidate(every, [])]
-        found += [_Candidate(every, by_rejecting)] if by_rejecting else []
+        yield taken.inputs, [], 0.0
+        if by_rejecting:
+            yield taken.inputs, by_rejecting, 0.0
     if names is not None and OTHER in data.classes:
-        found.append(_Candidate(every[:1], [*by_rejecting, names], _FOR_NAMES))
-    return found
+        yield taken.inputs[:1], [*by_rejecting, names], _FOR_NAMES
 
 
 def _sources(data: Dataset) -> Indices:
     """Return the number of sources of the head windows by class."""
     windows = data.embedding_windows
-    pairs = np.unique(np.stack([windows.target, windows.group]), axis=1)
-    return np.bincount(pairs[0], minlength=len(data.classes))
+    return source_counts(windows.target, windows.group, len(data.classes))
 
 
 def learn_mixture(
@@ -425,12 +418,6 @@ def learn_mixture(
     mix = best.mix.model_copy(update={"inverse_temperature": inverse})
     heads = learn_heads(data.embedding_windows, data.classes, best.inputs)
     return Mixture(mix, heads, best.left_out[0], None if collections is None else best.left_out[1])
-
-
-def _left_out(
-    data: Dataset, mix: EmbeddingMix, ways: Sequence[Tried], by_heads: Sequence[Float64]
-) -> list[Float64]:
-    return [_nested(data, mix, way, one) for way, one in zip(ways, by_heads, strict=True)]
 
 
 def _plain(taken: HeadInputs, inputs: Sequence[slice]) -> EmbeddingMix:
@@ -524,21 +511,10 @@ def _inverse_temperature(
 
 def _right(data: Dataset, results: Sequence[Float64]) -> float:
     """Return the mean macro F1 over cross-validation schemes."""
-    numbers = np.unique(data.target)
-    return float(
-        np.mean(
-            [
-                f1_score(
-                    data.target,
-                    one.argmax(axis=1),
-                    labels=numbers,
-                    average="macro",
-                    zero_division=0,
-                )
-                for one in results
-            ]
-        )
-    )
+    options: dict[str, Any] = {"average": "macro", "zero_division": 0}
+    numbers, truth = np.unique(data.target), data.target
+    scores = [f1_score(truth, one.argmax(axis=1), labels=numbers, **options) for one in results]
+    return float(np.mean(scores))
 
 
 def _log_sum(values: Float64) -> Float64:

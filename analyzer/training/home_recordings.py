@@ -90,6 +90,11 @@ class HomeSound:
         return ENROLLED in self.log.parts
 
     @property
+    def confirmed(self) -> list[ReviewedSpan]:
+        """Reviewed spans for training: labels without a mark in them are correct."""
+        return [span for span in self.reviewed if span.chosen != RANDOM]
+
+    @property
     def drawn(self) -> list[tuple[int, int]]:
         """Spans drawn at random, which are excluded from training."""
         return [(span.start, span.end) for span in self.reviewed if span.chosen == RANDOM]
@@ -399,20 +404,13 @@ def teaching(sound: HomeSound) -> HomeSound:
 
     These are marks that a reviewer could not decide, and marks that touch a span drawn at random.
     """
-    return replace(sound, marks=_teaching(sound.marks, sound.reviewed))
-
-
-def _teaching(marks: Iterable[Mark], reviewed: Iterable[ReviewedSpan]) -> list[Mark]:
-    drawn = [span for span in reviewed if span.chosen == RANDOM]
-    return [
+    marks = [
         mark
-        for mark in marks
+        for mark in sound.marks
         if class_name(mark.label) != UNKNOWN
-        and not any(
-            mark.microphone == span.microphone and mark.start < span.end and span.start < mark.end
-            for span in drawn
-        )
+        and not any(mark.start < end and start < mark.end for start, end in sound.drawn)
     ]
+    return replace(sound, marks=marks)
 
 
 def _is_quiet(recording: Recording, features: FeatureSet, gate: float) -> bool:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.training.adaptation import base_classes
 from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, Recording, cut_recordings
 from hearthlog.analyzer.training.home_recordings import (
@@ -175,7 +174,7 @@ def _counted(
         counts.by_embedding[sound.embedding] += len(sound.marks)
         counts.left_out += len(sound.marks) - len(taught.marks)
         counts.short += sum(is_short_silence(mark, features) for mark in taught.marks)
-        counts.looked_at |= any(span.chosen != RANDOM for span in sound.reviewed)
+        counts.looked_at |= bool(sound.confirmed)
         yield taught
 
 

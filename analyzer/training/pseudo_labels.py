@@ -10,7 +10,6 @@ import numpy as np
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, labelling_of
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
-from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.training.dataset import CONFIRMED, HOP_FRAMES, Recording, spread
 from hearthlog.analyzer.training.direction_samples import evidence_of
 from hearthlog.analyzer.training.home_recordings import (
@@ -67,11 +66,14 @@ def confirmed_segments(
     Raise `LogError` if the reviewed labelling cannot be read.
     """
     confirmed: list[Candidates] = []
-    reviewed = [span for span in sound.reviewed if span.chosen != RANDOM]
-    for name in sorted({span.corrects or LIVE for span in reviewed}):
+    for name in sorted({span.corrects or LIVE for span in sound.confirmed}):
         labelling = _labelling(sound, name)
         if labelling is not None and sound.values.shape[1]:
-            spans = [(span.start, span.end) for span in reviewed if (span.corrects or LIVE) == name]
+            spans = [
+                (span.start, span.end)
+                for span in sound.confirmed
+                if (span.corrects or LIVE) == name
+            ]
             target = _classes_of(sound, labelling, classes)
             target = np.where(sound.inside(spans), target, -1)
             confirmed.append(_cut(sound, target, classes, segment_frames))

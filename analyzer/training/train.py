@@ -397,17 +397,13 @@ def _scenario_fields(scenario: Scenario, data: Dataset) -> dict[str, Any]:
         "classes": list(data.classes),
         "scenario_name": scenario.name,
         "scenario": {name: list(labels) for name, labels in scenario.classes.items()},
-        "training_data": _training_data(data),
+        "training_data": TrainingData(
+            sha256=data.digest,
+            classes=data.amounts,
+            home_spans=merged_spans(data.spans),
+            collections=[
+                PublicCollection(name=name, licence=licence, clips=clips)
+                for (name, licence), clips in sorted(data.collections.items())
+            ],
+        ),
     }
-
-
-def _training_data(data: Dataset) -> TrainingData:
-    return TrainingData(
-        sha256=data.digest,
-        classes=data.amounts,
-        home_spans=merged_spans(data.spans),
-        collections=[
-            PublicCollection(name=name, licence=licence, clips=clips)
-            for (name, licence), clips in sorted(data.collections.items())
-        ],
-    )

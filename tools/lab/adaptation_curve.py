@@ -150,7 +150,8 @@ def _scores(method: LandmarkMethod, classes: int, split: _Split, *arrays: Any) -
     examples = Examples(*arrays)
     target = examples.target
     base = method.fit(examples, split.others)
-    again = HomeLandmarks.of_learned(method, base)
+    fields = method.name, method.feature_set, method.inputs, method.kind
+    again = HomeLandmarks(*fields, copies=0, base=base.arrays(), values=base.parameters())
     # The base has numbers for what it learned; what only the home has comes behind.
     order = np.concatenate([base.classes, np.setdiff1d(np.arange(classes), base.classes)])
     at_home = examples._replace(
