@@ -4,7 +4,7 @@ import re
 import tempfile
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -342,7 +342,11 @@ def write_marks(  # noqa: PLR0913
     if scenario:
         check_scenario_name(scenario)
     path = review_path(log)
-    with _locked(path):
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(locked_folder(path.parent))
+        except OSError as error:
+            raise LogError(f"{path}: cannot be written ({error.strerror})") from error
         layer = _read_layer(path)
         kept, before = layer.get(scenario, _NOTHING)
         for span in deleted:
@@ -367,17 +371,6 @@ def _by_topic(layer: Mapping[str, Reviewed]) -> dict[Key, Sequence[Mark | Review
         spans[labelling, message_types.SEGMENT] = spans[labelling, message_types.MARK] = marks
         spans[labelling, message_types.REVIEWED] = reviewed
     return spans
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Lock the folder against other writers of review layers."""
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(locked_folder(path.parent))
-        except OSError as error:
-            raise LogError(f"{path}: cannot be written ({error.strerror})") from error
-        yield
 
 
 def _checked(marks: Iterable[Mark]) -> list[Mark]:

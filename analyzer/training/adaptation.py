@@ -63,7 +63,7 @@ _HEAD_PULL = 10.0  # regularisation to zero, for standardised inputs
 _NEW_HEAD_PULL = 1.0  # of a new class, which has no base weights
 _CONFIRMED_WEIGHT = 1 / 3  # weight of a window with a confirmed label; a mark has 1
 _SHARE = 0.5  # applied part of the correction: marks have few sources, and other sounds lie between
-_BELOW = 2.0  # initial offset of a new class below the mean of the others
+_BELOW = 2.0  # initial offset of a new class below the mean of the others, a logarithm
 
 
 class Heads(NamedTuple):
@@ -177,10 +177,6 @@ _LANDMARK_PULL = 1.0  # regularisation to zero of the correction of weights
 _NEW_LANDMARK_PULL = 0.1  # of a new class, which has no base weights
 _LANDMARK_WEIGHT = 3.0  # weight of the base's output for a landmark; a window of a mark has 1
 _HOME_LANDMARKS = 200  # maximum number from the windows of the home
-_LANDMARK_SHARE = (
-    0.5  # applied part of the correction: marks have few sources, and other sounds lie between
-)
-_LANDMARK_BELOW = 2.0  # initial offset of a new class below the mean of the others, a logarithm
 _IMITATION_COST = 30.0  # fits probabilities more closely than labels, which have errors
 _SMOOTHED = 1 / 3  # of an SVM's frame weight: an SVM is less sure between its vectors
 _ROWS_AT_ONCE = 256
@@ -233,7 +229,7 @@ class HomeLandmarks(Method):
         map_ = LandmarkMap(arrays, parameters)
         kernels = np.concatenate([map_.kernels(arrays["landmarks"]), map_.kernels(inputs)])
         before = self.inverse * (kernels[:, :count] @ base_weights + base_bias)
-        constant = before.mean() - _LANDMARK_BELOW
+        constant = before.mean() - _BELOW
         before = np.pad(before, ((0, 0), (0, new)), constant_values=constant)
         mapped = kernels @ map_.root
         mean = mapped[:count].mean(axis=0)
@@ -246,7 +242,7 @@ class HomeLandmarks(Method):
             np.where(np.arange(old + new) < old, _LANDMARK_PULL, _NEW_LANDMARK_PULL),
             free=False,
         )
-        taken = np.where(np.arange(old + new) < old, _LANDMARK_SHARE, 1.0) / self.inverse
+        taken = np.where(np.arange(old + new) < old, _SHARE, 1.0) / self.inverse
         slopes, constants = taken * slopes / scale, taken * constants
         weights, bias = map_.root @ slopes, constants - mean @ slopes
         weights[:count, :old] += base_weights

@@ -38,25 +38,8 @@ def spread_over_classes(target: Indices, weight: Float64, most: int, seed: int) 
     return shuffled[np.sort(np.argsort(rank, kind="stable")[:most])]
 
 
-def class_costs(target: Indices) -> Float64:
-    """Return class weights inverse to window counts, as scikit-learn's `balanced`.
-
-    Parameters
-    ----------
-    target : np.ndarray [shape=(n,)], intp
-        Numbers of the classes of windows.
-
-    Returns
-    -------
-    np.ndarray [shape=(C,)], float64
-    """
-    counts = np.bincount(target)
-    costs: Float64 = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
-    return costs
-
-
 def balanced(target: Indices, weight: Float64) -> Float64:
-    """Return window weights scaled inversely to the size of the class.
+    """Return window weights scaled inversely to the size of the class, as scikit-learn does.
 
     Parameters
     ----------
@@ -68,7 +51,9 @@ def balanced(target: Indices, weight: Float64) -> Float64:
     -------
     np.ndarray [shape=(n,)], float64
     """
-    weighted: Float64 = weight * class_costs(target)[target]
+    counts = np.bincount(target)
+    costs = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
+    weighted: Float64 = weight * costs[target]
     return weighted
 
 
