@@ -218,6 +218,9 @@ def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(hom
     assert [each.label for each in lesson_recordings(home)] == [other[2]]
     found = confirmed_segments(sound(home), load_model(model_file).classes)
     assert all(b <= one[0] or a >= one[1] for a, b in (each.span for each in found.recordings))
+    spans = home_lessons([home], load_model(model_file)).segments.spans
+    assert len(spans) > 1
+    assert all(b <= one[0] or a >= one[1] for a, b in spans.tolist())
 
 
 def test_a_long_mark_is_not_more_than_a_few_short_ones(home, model_file):

@@ -92,11 +92,11 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
     counts, window = _Counts(), features.window_frames
     for folder in folders:
         space = model.description.embedding_space
-        read = read_reviewed_sound(folder, features, scenario, space)
-        sounds = list(_counted(read, counts, features))
-        marked += marked_recordings(sounds, folder, features, model.description.gate)
+        sounds = list(read_reviewed_sound(folder, features, scenario, space))
+        taught = [counts.add(sound, features) for sound in sounds]
+        marked += marked_recordings(taught, folder, features, model.description.gate)
         candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
-    taught, notes, unlearned = _with_new_classes(marked, model, features)
+    learned, notes, unlearned = _with_new_classes(marked, model, features)
     marked = [one for one in marked if one.label not in unlearned]
     notes += counts.notes()
     if note := counts.embedding_note(model):
@@ -113,9 +113,9 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
             kept += unreviewed_sounds(folders, model, _seldom_kept(kept, model), scenario)
         if in_room and not counts.looked_at:
             notes.append(_NOT_LOOKED_AT)
-    segments = cut_recordings([*marked, *_as_unknown(kept, model, taught)], taught, features)
+    segments = cut_recordings([*marked, *_as_unknown(kept, model, learned)], learned, features)
     if CONFIRMED in segments.collection_names and HOME not in segments.collection_names:
-        segments = cut_recordings([], taught, features)
+        segments = cut_recordings([], learned, features)
     nothing = "none of the marks can be learned from" if counts.marks else "nothing is marked"
     return HomeTrainingSet(segments, notes, "" if len(segments) else nothing)
 
@@ -129,6 +129,16 @@ class _Counts:
         self.short = 0  # pauses marked as silence
         self.looked_at = False
         self.by_embedding: Counter[EmbeddingSpace | None] = Counter()  # marks
+
+    def add(self, sound: HomeSound, features: FeatureSet) -> HomeSound:
+        """Count the marks of a sound; return it with those that are used for training."""
+        taught = teaching(sound)
+        self.marks += len(sound.marks)
+        self.by_embedding[sound.embedding] += len(sound.marks)
+        self.left_out += len(sound.marks) - len(taught.marks)
+        self.short += sum(is_short_silence(mark, features) for mark in taught.marks)
+        self.looked_at |= bool(sound.confirmed)
+        return taught
 
     def notes(self) -> list[str]:
         """Return lines on the marks that are not used for training."""
@@ -162,20 +172,6 @@ class _Counts:
             f"{left} of {self.marks} marks lie in logs without embeddings of {wanted.network} as "
             f"{model.name} takes them{theirs}: they teach by features alone"
         )
-
-
-def _counted(
-    sounds: Iterable[HomeSound], counts: _Counts, features: FeatureSet
-) -> Iterator[HomeSound]:
-    """Drop and count the marks that are excluded from training."""
-    for sound in sounds:
-        taught = teaching(sound)
-        counts.marks += len(sound.marks)
-        counts.by_embedding[sound.embedding] += len(sound.marks)
-        counts.left_out += len(sound.marks) - len(taught.marks)
-        counts.short += sum(is_short_silence(mark, features) for mark in taught.marks)
-        counts.looked_at |= bool(sound.confirmed)
-        yield taught
 
 
 def _with_new_classes(
