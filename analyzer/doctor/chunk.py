@@ -16,10 +16,15 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.record_walk import Record
-from hearthlog.schemas.arrays import Bytes, Int64
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs.columns import definition_fault
 from hearthlog.schemas.logs.writer import ENCODING, PROFILE, SCHEMA_ENCODING
-from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads, iterate_records
+from hearthlog.schemas.mcap.raw_messages import (
+    RawMessages,
+    gather_heads,
+    index_messages,
+    iterate_records,
+)
 from hearthlog.schemas.mcap.records import (
     CHUNK_INDEX,
     CHUNK_INDEX_TAIL,
@@ -108,6 +113,8 @@ class CheckedDefinitions(Definitions):
     def read(self, opcode: int, offset: int, content: bytes) -> int | None:
         """Read and check a schema or a channel; return the number of a new channel.
 
+        Only the first definition of each number is kept.
+
         Parameters
         ----------
         offset : int
@@ -115,92 +122,82 @@ class CheckedDefinitions(Definitions):
         """
         record = parse_strictly(self._findings, opcode, offset, content)
         if isinstance(record, Schema):
-            self._add_schema(record, offset, len(content))
-        elif isinstance(record, Channel) and self._add_channel(record, offset, len(content)):
-            return record.id
+            known, name = record.id in self.schemas, record.name
+        elif isinstance(record, Channel):
+            known, name = record.id in self.channels, record.topic
+        else:
+            return None
+        if isinstance(record, Schema) and record.id == 0:
+            self._error("schema-id", f"schema {name} has the number 0", offset)
+        elif known:
+            if not self.add(record):
+                what = f"{name_of(opcode).lower()} {record.id} ({name})"
+                self._error("redefined", f"{what} differs from the first of its number", offset)
+        elif self._keeps(len(content), offset):
+            self.add(record)
+            if isinstance(record, Channel):
+                self._check_channel(record, offset)
+                return record.id
+            self._check_schema(record, offset)
         return None
+
+    def _error(self, rule: str, what: str, offset: int) -> None:
+        self._findings.error(rule, what, RECOVER, offset=offset)
 
     def _keeps(self, size: int, offset: int) -> bool:
         """Whether another definition fits into the limit."""
         self._size += size
         if self._size > _TOTAL_LIMIT:
-            what = "more schemas and channels than hearthlog reads"
-            self._findings.error("too-large", what, RECOVER, offset=offset)
+            self._error("too-large", "more schemas and channels than hearthlog reads", offset)
         return self._size <= _TOTAL_LIMIT
 
-    def _add_schema(self, schema: Schema, offset: int, size: int) -> None:
-        """Check a schema; keep only the first with its number."""
-        error = self._findings.error
-        if schema.id == 0:
-            error("schema-id", f"schema {schema.name} has the number 0", RECOVER, offset=offset)
-            return
-        if schema.id in self.schemas:
-            if not self.add(schema):
-                what = f"schema {schema.id} ({schema.name}) differs from the first of its number"
-                error("redefined", what, RECOVER, offset=offset)
-            return
-        if not self._keeps(size, offset):
-            return
-        self.add(schema)
+    def _check_schema(self, schema: Schema, offset: int) -> None:
         if not schema.encoding and schema.data:
             what = f"schema {schema.name} has data, but no encoding"
-            error("schema-encoding", what, RECOVER, offset=offset)
-        if schema.encoding in ROS_ENCODINGS:
-            self._check_definition(schema, offset)
-        elif self.profile == PROFILE:
+            self._error("schema-encoding", what, offset)
+        if schema.encoding not in ROS_ENCODINGS:
             what = f"schema {schema.name} is {schema.encoding!r}, neither ros2msg nor ros2idl"
             self._profile("profile-schema", what, offset)
-
-    def _add_channel(self, channel: Channel, offset: int, size: int) -> bool:
-        """Check a channel; keep only the first with its number, and return whether it is new."""
-        error = self._findings.error
-        topic = f"channel {channel.id} ({channel.topic})"
-        if channel.id in self.channels:
-            if not self.add(channel):
-                what = f"{topic} differs from the first of its number"
-                error("redefined", what, RECOVER, offset=offset)
-            return False
-        if not self._keeps(size, offset):
-            return False
-        self.add(channel)
-        is_defined = channel.schema_id in {0, *self.schemas}
-        if not is_defined and not self.incomplete:
-            what = f"{topic} has schema {channel.schema_id}, which is not defined before it"
-            error("schema-missing", what, RECOVER, offset=offset)
-        if not channel.message_encoding:
-            error("channel-encoding", f"{topic} has no message encoding", RECOVER, offset=offset)
-        elif self.profile == PROFILE:
-            if channel.message_encoding != ENCODING:
-                what = f"{topic} is encoded as {channel.message_encoding!r}, not as {ENCODING}"
-                self._profile("profile-channel", what, offset)
-            elif not channel.schema_id:
-                self._profile("profile-channel", f"{topic} has no schema", offset)
-        if self.profile == PROFILE and "offered_qos_profiles" not in channel.metadata:
-            self._profile("profile-qos", f"{topic} has no offered_qos_profiles", offset)
-        return True
-
-    def _profile(self, rule: str, what: str, offset: int) -> None:
-        """Report a violation of the profile: an error in files of hearthlog, else a warning."""
-        report = self._findings.error if self.ours else self._findings.warning
-        report(rule, what, "its profile, ros2, asks for that", offset=offset)
-
-    def _check_definition(self, schema: Schema, offset: int) -> None:
-        error = self._findings.error
+            return
         if not _TYPE_NAME.fullmatch(schema.name):
             what = f"schema {schema.name!r} is not named as a ROS message type"
-            error("schema-name", what, RECOVER, offset=offset)
+            self._error("schema-name", what, offset)
         if fault := definition_fault(schema.name, schema.encoding, schema.data):
-            error("schema-definition", fault, "its messages can be copied only", offset=offset)
+            advice = "its messages can be copied only"
+            self._findings.error("schema-definition", fault, advice, offset=offset)
+
+    def _check_channel(self, channel: Channel, offset: int) -> None:
+        topic = f"channel {channel.id} ({channel.topic})"
+        if channel.schema_id not in {0, *self.schemas} and not self.incomplete:
+            what = f"{topic} has schema {channel.schema_id}, which is not defined before it"
+            self._error("schema-missing", what, offset)
+        if not channel.message_encoding:
+            self._error("channel-encoding", f"{topic} has no message encoding", offset)
+        elif channel.message_encoding != ENCODING:
+            what = f"{topic} is encoded as {channel.message_encoding!r}, not as {ENCODING}"
+            self._profile("profile-channel", what, offset)
+        elif not channel.schema_id:
+            self._profile("profile-channel", f"{topic} has no schema", offset)
+        if "offered_qos_profiles" not in channel.metadata:
+            self._profile("profile-qos", f"{topic} has no offered_qos_profiles", offset)
+
+    def _profile(self, rule: str, what: str, offset: int) -> None:
+        """Report a violation of the profile `ros2`: an error in files of hearthlog."""
+        if self.profile == PROFILE:
+            report = self._findings.error if self.ours else self._findings.warning
+            report(rule, what, "its profile, ros2, asks for that", offset=offset)
 
 
 BATCH_SIZE = 4 << 20  # bytes
 
 
-class ChunkContent(NamedTuple):
-    """The records of a chunk.
+class MessageBatch(NamedTuple):
+    """Some messages, still encoded.
 
     Attributes
     ----------
+    records : bytes
+        Their records, and others.
     starts : np.ndarray [shape=(n,)], int64
         Bytes in `records` at which messages begin, ascending.
     heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
@@ -211,44 +208,37 @@ class ChunkContent(NamedTuple):
     starts: Int64
     heads: NDArray[np.void]
 
-
-class MessageBatch(NamedTuple):
-    """Some messages, still encoded."""
-
-    buffer: Bytes  # [shape=(b,)], uint8: contains their records
-    starts: Int64  # [shape=(n,)], int64: starts of their records in the buffer
-    heads: NDArray[np.void]  # [shape=(n,)], of dtype `MESSAGE_HEAD`
-
     def by_channel(
         self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]
     ) -> Iterator[RawMessages]:
         """Group the messages by channel, without messages of undefined channels."""
+        buffer = np.frombuffer(self.records, np.uint8)
         for identity in np.flatnonzero(np.bincount(self.heads["channel"])).tolist():
             if identity in channels:
                 channel = channels[identity]
                 rows = self.heads["channel"] == identity
                 offsets = self.starts[rows] + MESSAGE_HEAD.itemsize
                 schema = schemas.get(channel.schema_id)
-                yield RawMessages(channel, schema, self.buffer, offsets, self.heads[rows])
+                yield RawMessages(channel, schema, buffer, offsets, self.heads[rows])
 
 
-def batches(chunks: Sequence[ChunkContent]) -> Iterator[MessageBatch]:
+def batches(chunks: Sequence[MessageBatch]) -> Iterator[MessageBatch]:
     """Yield the messages of some chunks in batches of a few megabytes, whatever the chunk size.
 
     Parameters
     ----------
-    chunks : sequence of ChunkContent
+    chunks : sequence of MessageBatch
         At least one.
     """
     firsts = np.cumsum([0, *(len(chunk.records) for chunk in chunks[:-1])]).tolist()
-    buffer = np.frombuffer(b"".join(chunk.records for chunk in chunks), np.uint8)
+    records = b"".join(chunk.records for chunk in chunks)
     starts = np.concatenate([c.starts + first for c, first in zip(chunks, firsts, strict=True)])
     heads = np.concatenate([chunk.heads for chunk in chunks])
     number = np.cumsum(heads["length"]) // BATCH_SIZE
     for rows in np.split(np.arange(len(starts)), np.flatnonzero(np.diff(number)) + 1):
         if len(rows):
             some = slice(rows[0], rows[-1] + 1)
-            yield MessageBatch(buffer, starts[some], heads[some])
+            yield MessageBatch(records, starts[some], heads[some])
 
 
 class Chunk:
@@ -261,7 +251,7 @@ class Chunk:
         definitions: CheckedDefinitions,
         budget: "RecordBudget",
     ) -> None:
-        self.content: ChunkContent | None = None  # None if the chunk is too damaged to be read
+        self.content: MessageBatch | None = None  # None if the chunk is too damaged to be read
         self.whole = False  # whether `content` has all of its messages
         self.offset = record.offset
         self._length = record.length
@@ -321,16 +311,12 @@ class Chunk:
         """
         if not self.whole:
             return
-        counts = [len(e) // INDEX_ENTRIES.itemsize for e in self._indexes.values()]
         entries = np.frombuffer(b"".join(self._indexes.values()), INDEX_ENTRIES)
-        channels = np.repeat([*self._indexes], counts)
-        order = np.argsort(entries["offset"], kind="stable")
-        entries, channels = entries[order], channels[order]
-        self._find_records(entries["offset"])
+        self._find_records(np.sort(entries["offset"]))
         if self.content is not None and self.whole:
-            self._check_times()
-        if self.content is not None and self.whole and not cut:
-            self._check_index(entries, channels)
+            self._check_times(self.content.heads["log_time"].astype(np.uint64))
+            if not cut:
+                self._check_index(self.content)
 
     def index_content(self) -> bytes | None:
         """Return the expected chunk index, without opcode and length.
@@ -365,7 +351,7 @@ class Chunk:
             opcode, length = HEAD.unpack_from(records, start)
             first = start + HEAD.size
             new |= self._other(opcode, start, records[first : first + length])
-        self.content = ChunkContent(records, starts, gather_heads(records, starts))
+        self.content = MessageBatch(records, starts, gather_heads(records, starts))
         check_channels(self._findings, self._definitions, self.content, new, self.offset)
 
     def _other(self, opcode: int, start: int, content: bytes) -> dict[int, int]:
@@ -382,10 +368,8 @@ class Chunk:
             return {} if channel is None else {channel: start}
         return {}
 
-    def _check_times(self) -> None:
-        assert self.content is not None
+    def _check_times(self, times: NDArray[np.uint64]) -> None:
         assert self._head is not None
-        times = self.content.heads["log_time"].astype(np.uint64)
         claimed = self._head.start, self._head.end
         span = (int(times.min()), int(times.max())) if len(times) else (0, 0)
         if claimed != span:
@@ -393,32 +377,23 @@ class Chunk:
             what += f", and spans {span[0]} to {span[1]} ns"
             self._error("chunk-times", what, REINDEX)
 
-    def _check_index(self, entries: NDArray[np.void], channels: Int64) -> None:
-        """Compare the message indexes, in the order of their offsets, with the messages."""
-        assert self.content is not None
-        heads, starts = self.content.heads, self.content.starts
+    def _check_index(self, content: MessageBatch) -> None:
+        """Compare the message indexes with the ones that a writer would write."""
+        made = index_messages(content.records, content.starts)
+        if self._indexes == made:
+            return
         if not self._indexes:
-            if self._definitions.ours and len(heads):
+            if self._definitions.ours and made:
                 self._error("message-index", "a chunk has no message index", REINDEX)
             return
-        if (
-            len(entries) == len(heads)
-            and (
-                (entries["offset"] == starts)
-                & (entries["time"] == heads["log_time"])
-                & (channels == heads["channel"])
-            ).all()
-        ):
-            return
-        right = np.intersect1d(
-            _keys(channels, entries["time"], entries["offset"]),
-            _keys(heads["channel"], heads["log_time"], starts),
-        )
-        what = (
-            f"the message indexes of a chunk leave out {len(heads) - len(right)} of its "
-            f"{len(heads)} messages and have {len(entries) - len(right)} entries that are wrong"
-        )
-        self._error("message-index", what, REINDEX)
+        entries, expected = _entries(self._indexes), _entries(made)
+        if not np.array_equal(entries, expected):
+            right = len(np.intersect1d(entries, expected))
+            what = (
+                f"the message indexes of a chunk leave out {len(expected) - right} of its "
+                f"{len(expected)} messages and have {len(entries) - right} entries that are wrong"
+            )
+            self._error("message-index", what, REINDEX)
 
     def _error(self, rule: str, what: str, advice: str = RECOVER) -> None:
         self._findings.error(rule, what, advice, offset=self.offset)
@@ -490,7 +465,7 @@ def _walk(content: bytes, start: int, end: int, budget: RecordBudget) -> tuple[I
 def check_channels(
     findings: Findings,
     definitions: CheckedDefinitions,
-    content: ChunkContent,
+    content: MessageBatch,
     new: dict[int, int],
     offset: int,
 ) -> None:
@@ -515,8 +490,11 @@ def check_channels(
             findings.error("channel-missing", what, RECOVER, offset=offset)
 
 
-def _keys(channels: Int64, times: Int64, offsets: Int64) -> NDArray[np.void]:
-    """Return one comparable key for each message."""
-    keys = np.empty(len(channels), [("channel", "<u2"), ("time", "<i8"), ("offset", "<i8")])
-    keys["channel"], keys["time"], keys["offset"] = channels, times, offsets
-    return keys
+def _entries(indexes: Mapping[int, bytes]) -> NDArray[np.void]:
+    """Return one comparable row for each entry of message indexes, by offset."""
+    rows = np.frombuffer(b"".join(indexes.values()), INDEX_ENTRIES)
+    entries = np.empty(len(rows), [("channel", "<u2"), ("time", "<i8"), ("offset", "<i8")])
+    counts = [len(same) // INDEX_ENTRIES.itemsize for same in indexes.values()]
+    entries["channel"] = np.repeat(np.array([*indexes], np.int64), counts)
+    entries["time"], entries["offset"] = rows["time"], rows["offset"]
+    return entries[np.argsort(entries["offset"], kind="stable")]

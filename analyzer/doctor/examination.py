@@ -3,11 +3,11 @@
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -22,9 +22,10 @@ from hearthlog.analyzer.doctor.message_checks import (
     MessageChecks,
     MetadataChecks,
 )
-from hearthlog.analyzer.doctor.record_walk import ByteSource, RecordWalk
+from hearthlog.analyzer.doctor.record_walk import RecordWalk
 from hearthlog.analyzer.doctor.sections import DataSection, SummarySection
 from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, ignore_progress
+from hearthlog.schemas.files import LocalFile
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, millisecond_text
 from hearthlog.schemas.logs.columns import decode, faults, unreadable
 from hearthlog.schemas.logs.contents import CONTENTS_METADATA as CONTENTS
@@ -65,75 +66,70 @@ def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFi
     """
     examined = ExaminedFile(Findings(path))
     try:
-        with ByteSource(path) as source:
-            _examine(source, examined, progress)
-    except OSError as error:
-        examined.findings.error("unreadable", f"cannot be read ({error.strerror})")
+        with closing(LocalFile(path)) as file:
+            _examine(file, examined, progress)
+    except LogError as error:
+        examined.findings.error("unreadable", str(error).removeprefix(f"{path}: "))
     return examined
 
 
-class _Outline(NamedTuple):
-    """Facts from the index of a file, for reading the file from its beginning."""
-
-    offsets: list[int]  # bytes at which records begin, ascending
-    summary_start: int  # 0 if there is no summary
-    ours: bool  # whether a recorder of hearthlog wrote the file
-
-
-def _examine(source: ByteSource, examined: ExaminedFile, progress: Progress) -> None:
-    findings = examined.findings
+def _examine(file: LocalFile, examined: ExaminedFile, progress: Progress) -> None:
+    findings, size = examined.findings, file.size
     active = findings.path.name.endswith(ACTIVE_SUFFIX)
-    magic = source.take(len(MAGIC))
+    start = file.read(0, 2 * len(MAGIC))
+    magic = start[: len(MAGIC)]
     if magic != MAGIC and not (active and MAGIC.startswith(magic)):
-        what = not_mcap(source.at(0, 2 * len(MAGIC)))
+        what = not_mcap(start)
         if what == not_mcap(b""):
             what = f"{what}: it does not begin as one"
         findings.error("magic", what)
         return
-    finished = source.size > len(MAGIC) and source.tail(len(MAGIC)) == MAGIC
-    outline = _outline(findings.path, source)
-    data = DataSection(findings, _KEPT, source.size, ours=outline.ours)
-    checks = MessageChecks(data, findings) if outline.ours else ForeignMessages(data, findings)
-    walk = RecordWalk(source, findings, outline.offsets, finished=finished)
-    complete = _walk(walk, data, checks, outline, lambda offset: progress(offset / source.size))
+    tail = file.read(max(size - FOOTER_SIZE, 0), FOOTER_SIZE)
+    finished = size > len(MAGIC) and tail.endswith(MAGIC)
+    footer = read_footer(tail)
+    summary_start = 0 if footer is None else footer.summary_start
+    offsets, ours = _index_of(findings.path)
+    if HEAD.size < summary_start < size:
+        offsets.append(summary_start)
+    checks = MessageChecks if ours else ForeignMessages
+    data = DataSection(findings, _KEPT, size, checks, ours=ours)
+    walk = RecordWalk(file, findings, sorted(offsets), finished=finished)
+    complete = _walk(walk, data, summary_start, progress)
+    whole = data.whole and not walk.damaged
     if complete:
-        _check_end(source, findings)
+        _check_end(walk, findings)
     elif finished:
         findings.error("footer", "there is no Footer at the end", RECOVER)
+    elif active:
+        advice = "unless a recorder is writing it, `hearthlog recover` completes it"
+        findings.warning("unfinished", "is unfinished", advice)
     else:
-        _report_unfinished(findings, active=active)
-    for text in {
-        unknown_version(record) for record in data.metadata.get(HEARTHLOG_METADATA, [])
-    } - {""}:
+        what = "is unfinished: it was cut off"
+        findings.error("cut", what, "`hearthlog recover` completes it")
+    records = data.metadata.get(HEARTHLOG_METADATA, [])
+    for text in {unknown_version(record) for record in records} - {""}:
         findings.warning("newer", text)
-    if isinstance(checks, MessageChecks):
-        checks.finish()
-        whole = data.whole and not walk.damaged
-        MetadataChecks(data, checks, findings, finished=complete, whole=whole).check()
-        examined.ours, examined.frames = True, checks.frames
-        examined.node = data.metadata.get(HEARTHLOG_METADATA, [{}])[0].get("node", "")
-    if CONTENTS in data.metadata and complete and data.whole and not walk.damaged:
+    if isinstance(data.checks, MessageChecks):
+        data.checks.finish()
+        MetadataChecks(data, data.checks, findings, finished=complete, whole=whole).check()
+        examined.ours, examined.frames = True, data.checks.frames
+        examined.node = records[0].get("node", "") if records else ""
+    if CONTENTS in data.metadata and complete and whole:
         _check_contents(findings)
     examined.span = data.span
 
 
-def _outline(path: Path, source: ByteSource) -> _Outline:
-    """Read the index of a file, as far as it has one."""
-    footer = read_footer(source.tail(FOOTER_SIZE))
-    start = 0 if footer is None else footer.summary_start
+def _index_of(path: Path) -> tuple[list[int], bool]:
+    """Read the index of a file: offsets of records, and whether hearthlog's recorder wrote it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", HearthlogWarning)  # the checks report more details
             file = LogFile(path)
         with file:
-            ours = _is_ours(file)
-            offsets = file.chunks["offset"].tolist()
-            offsets += [location.offset for location in file.record_locations]
+            offsets = [location.offset for location in file.record_locations]
+            return file.chunks["offset"].tolist() + offsets, _is_ours(file)
     except LogError:
-        offsets, ours = [], False
-    if HEAD.size < start < source.size:
-        offsets += [start]
-    return _Outline(sorted(offsets), start, ours)
+        return [], False
 
 
 def _is_ours(file: LogFile) -> bool:
@@ -149,13 +145,7 @@ def _is_ours(file: LogFile) -> bool:
     return (is_made or len(records) > 0) and len(records) < 2 and not is_part
 
 
-def _walk(
-    walk: RecordWalk,
-    data: DataSection,
-    checks: "MessageChecks | ForeignMessages",
-    outline: _Outline,
-    at: Callable[[int], None],
-) -> bool:
+def _walk(walk: RecordWalk, data: DataSection, summary_start: int, progress: Progress) -> bool:
     """Check all records; return whether the last one is a footer."""
     summary: SummarySection | None = None
     losses = 0
@@ -163,44 +153,32 @@ def _walk(
         if walk.losses > losses:
             losses = walk.losses
             data.definitions.incomplete |= walk.skipped
-            _hand_on([*data.finish(cut=True), None], checks)
-        if (
-            summary is None
-            and not data.ended
-            and (record.opcode == Opcode.FOOTER or record.offset == outline.summary_start)
-        ):
+            data.finish(cut=True)
+            data.checks.interrupt()
+        is_summary = record.opcode == Opcode.FOOTER or record.offset == summary_start
+        if is_summary and not data.ended:
             what = "the data section has no Data End"
             data.findings.error("data-end", what, REINDEX, offset=record.offset)
             data.ended = True
         if summary is None and data.ended:
-            _hand_on(data.finish(cut=False), checks)
+            data.finish(cut=False)
             summary = SummarySection(data, data.findings, whole=data.whole and not walk.damaged)
         if summary is None:
-            _hand_on(data.add(record), checks)
-            at(record.offset)
+            data.add(record)
+            progress(record.offset / walk.size)
         elif record.opcode == Opcode.FOOTER:
             summary.finish(record)
             return True
         else:
             summary.add(record)
-    _hand_on(data.finish(cut=True), checks)
+    data.finish(cut=True)
     return False
 
 
-def _hand_on(
-    batches: Iterable[MessageBatch | None], checks: "MessageChecks | ForeignMessages"
-) -> None:
-    for batch in batches:
-        if batch is None:
-            checks.interrupt()
-        else:
-            checks.add(batch)
-
-
-def _check_end(source: ByteSource, findings: Findings) -> None:
-    offset = source.offset
-    rest = source.size - offset
-    if source.take(len(MAGIC)) != MAGIC:
+def _check_end(walk: RecordWalk, findings: Findings) -> None:
+    offset = walk.offset
+    rest = walk.size - offset
+    if walk.take(len(MAGIC)) != MAGIC:
         findings.error("magic", "the Footer is not followed by the magic", REINDEX, offset=offset)
     elif rest > len(MAGIC):
         what = f"{rest - len(MAGIC)} bytes follow the end"
@@ -222,15 +200,6 @@ def _check_contents(findings: Findings) -> None:
     elif differing := stated.differing(actual):
         what = f"metadata {CONTENTS} says otherwise than the messages: {', '.join(differing)}"
         findings.error("contents", what, DISTRUST)
-
-
-def _report_unfinished(findings: Findings, *, active: bool) -> None:
-    if active:
-        advice = "unless a recorder is writing it, `hearthlog recover` completes it"
-        findings.warning("unfinished", "is unfinished", advice)
-    else:
-        what = "is unfinished: it was cut off"
-        findings.error("cut", what, "`hearthlog recover` completes it")
 
 
 class ForeignMessages:

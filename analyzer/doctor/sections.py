@@ -2,8 +2,8 @@
 
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Collection, Iterable
+from typing import Any, Protocol
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -11,6 +11,7 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
+    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -26,7 +27,6 @@ from hearthlog.analyzer.doctor.chunk import (
     BATCH_SIZE,
     CheckedDefinitions,
     Chunk,
-    ChunkContent,
     MessageBatch,
     RecordBudget,
     batches,
@@ -40,9 +40,7 @@ from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.raw_messages import gather_heads, iterate_records
 from hearthlog.schemas.mcap.records import (
     ATTACHMENT,
-    CHUNK_INDEX,
     HEAD,
-    INDEX_OFFSET,
     MESSAGE_HEAD,
     UINT32,
     UINT64,
@@ -51,16 +49,25 @@ from hearthlog.schemas.mcap.records import (
 )
 
 _KEPT_SIZE = 1 << 20  # bytes
-_INDEX_SIZE = 4096  # bytes; records with a longer index are not compared with it
+_INDEX_SIZE = 4105  # bytes; records with a longer index are not compared with it
 _RESERVED = 0x80
-_INDEXES = {
-    Opcode.CHUNK_INDEX,
-    Opcode.ATTACHMENT_INDEX,
-    Opcode.METADATA_INDEX,
-    Opcode.STATISTICS,
-    Opcode.SUMMARY_OFFSET,
-    Opcode.FOOTER,
+# What each kind of index record lists, and the byte of the offset in its content.
+_INDEXES: dict[int, tuple[str, int]] = {
+    Opcode.CHUNK_INDEX: ("chunk", 16),
+    Opcode.ATTACHMENT_INDEX: ("attachment", 0),
+    Opcode.METADATA_INDEX: ("metadata record", 0),
 }
+_SUMMARY = {*_INDEXES, Opcode.STATISTICS, Opcode.SUMMARY_OFFSET}
+
+
+class BatchChecks(Protocol):
+    """Checks of the messages of a file, in file order."""
+
+    def add(self, batch: MessageBatch) -> None:
+        """Check the next messages."""
+
+    def interrupt(self) -> None:
+        """Record that messages are missing here, because the file is damaged."""
 
 
 class DataSection:
@@ -72,10 +79,18 @@ class DataSection:
         Names of metadata records and attachments to keep: the first two of each, up to 1 MiB.
     size : int
         Bytes of the file.
+    checks : callable
+        Returns the checks of the messages, which get them in batches of a few megabytes.
     """
 
     def __init__(
-        self, findings: Findings, names: Collection[str], size: int, *, ours: bool
+        self,
+        findings: Findings,
+        names: Collection[str],
+        size: int,
+        checks: Callable[["DataSection", Findings], BatchChecks],
+        *,
+        ours: bool,
     ) -> None:
         self.definitions = CheckedDefinitions(findings, ours=ours)
         self.header: Header | None = None
@@ -84,11 +99,7 @@ class DataSection:
         self.counts: Counter[int] = Counter()  # messages by channel
         self.span: tuple[int, int] | None = None  # first and last log time
         # Expected index content, by opcode of the index and by offset.
-        self.expected_indexes: dict[int, dict[int, bytes]] = {
-            Opcode.CHUNK_INDEX: {},
-            Opcode.ATTACHMENT_INDEX: {},
-            Opcode.METADATA_INDEX: {},
-        }
+        self.expected_indexes: dict[int, dict[int, bytes]] = {opcode: {} for opcode in _INDEXES}
         self.whole = True  # whether everything could be read
         self.loose = False  # whether there are messages outside of chunks
         self.ended = False  # whether there was a Data End
@@ -98,18 +109,13 @@ class DataSection:
         self._chunk: Chunk | None = None
         self._run = bytearray()  # messages outside of chunks
         self._run_offset = 0
-        self._parts: list[ChunkContent] = []
+        self._parts: list[MessageBatch] = []
         self._size = 0
         self._first = True
+        self.checks = checks(self, findings)
 
-    def add(self, record: Record) -> Iterator[MessageBatch | None]:
-        """Check the next record.
-
-        Yields
-        ------
-        MessageBatch or None
-            Messages, in batches of a few megabytes; None where a damaged chunk lost some.
-        """
+    def add(self, record: Record) -> None:
+        """Check the next record."""
         self._check_first(record)
         if record.opcode == Opcode.MESSAGE:
             self._add_message(record)
@@ -118,19 +124,19 @@ class DataSection:
         if record.opcode == Opcode.MESSAGE_INDEX:
             self._add_index(record)
         else:
-            yield from self._end_chunk()
+            self._end_chunk()
         if record.opcode == Opcode.CHUNK:
             self._chunk = Chunk(record, self.findings, self.definitions, self._budget)
         elif record.opcode not in {Opcode.MESSAGE, Opcode.MESSAGE_INDEX}:
             self._add_other(record)
         if self._size >= BATCH_SIZE:
-            yield from self._batches()
+            self._hand_on()
 
-    def finish(self, *, cut: bool) -> Iterator[MessageBatch | None]:
-        """Check an open chunk, and yield the remaining messages."""
+    def finish(self, *, cut: bool) -> None:
+        """Check an open chunk, and the remaining messages."""
         self._end_run()
-        yield from self._end_chunk(cut=cut)
-        yield from self._batches()
+        self._end_chunk(cut=cut)
+        self._hand_on()
 
     def _check_first(self, record: Record) -> None:
         if self._first and record.opcode != Opcode.HEADER:
@@ -141,7 +147,7 @@ class DataSection:
         self._first = False
 
     def _add_other(self, record: Record) -> None:
-        if record.opcode in _INDEXES:
+        if record.opcode in {*_SUMMARY, Opcode.FOOTER}:
             what = f"{name_of(record.opcode)} before the Data End"
             self.findings.error("data-opcode", what, RECOVER, offset=record.offset)
             return
@@ -158,8 +164,7 @@ class DataSection:
             self.header = self.header or content
             self.definitions.profile = self.header.profile
         elif isinstance(content, Metadata):
-            index = encode(MetadataIndex(record.offset, record.length, content.name))
-            self._expect_index(Opcode.METADATA_INDEX, record.offset, index)
+            self._expect_index(MetadataIndex(record.offset, record.length, content.name))
             self._keep(self.metadata, content.name, content.metadata, record)
         elif isinstance(content, Attachment):
             self._add_attachment(content, record)
@@ -176,7 +181,7 @@ class DataSection:
         names = attachment.name, attachment.media_type
         size = len(attachment.data)
         index = AttachmentIndex(record.offset, record.length, *times, size, *names)
-        self._expect_index(Opcode.ATTACHMENT_INDEX, record.offset, encode(index))
+        self._expect_index(index)
         self._keep(self.attachments, attachment.name, attachment.data, record)
         texts = sum(len(name.encode()) for name in names)
         end = ATTACHMENT.size + UINT32.size + UINT64.size + texts + size
@@ -185,10 +190,11 @@ class DataSection:
             what = f"attachment {attachment.name} has another checksum than it claims"
             self.findings.error("attachment-crc", what, RECOVER, offset=record.offset)
 
-    def _expect_index(self, opcode: int, offset: int, index: bytes) -> None:
+    def _expect_index(self, index: AttachmentIndex | MetadataIndex) -> None:
         """Store the expected index record, unless it is too long to be compared."""
-        content = index[HEAD.size :]
-        self.expected_indexes[opcode][offset] = content if len(content) < _INDEX_SIZE else b""
+        raw = encode(index)
+        content = raw[HEAD.size :] if len(raw) < _INDEX_SIZE else b""
+        self.expected_indexes[raw[0]][index.offset] = content
 
     def _keep(self, kept: dict[str, list[Any]], name: str, content: Any, record: Record) -> None:
         if name in self._names and record.length <= _KEPT_SIZE and len(kept.get(name, ())) < 2:
@@ -203,7 +209,7 @@ class DataSection:
         else:
             self._chunk.add_index(record)
 
-    def _end_chunk(self, *, cut: bool = False) -> Iterator[MessageBatch | None]:
+    def _end_chunk(self, *, cut: bool = False) -> None:
         chunk, self._chunk = self._chunk, None
         if chunk is None:
             return
@@ -215,8 +221,8 @@ class DataSection:
         if chunk.content is not None:
             self._add_messages(chunk.content)
         if not chunk.whole:
-            yield from self._batches()
-            yield None
+            self._hand_on()
+            self.checks.interrupt()
 
     def _add_message(self, record: Record) -> None:
         self.loose = True
@@ -236,11 +242,11 @@ class DataSection:
             return
         records, self._run = bytes(self._run), bytearray()
         starts = np.array([start for _, start, _ in iterate_records(records)], np.int64)
-        content = ChunkContent(records, starts, gather_heads(records, starts))
+        content = MessageBatch(records, starts, gather_heads(records, starts))
         check_channels(self.findings, self.definitions, content, {}, self._run_offset)
         self._add_messages(content)
 
-    def _add_messages(self, content: ChunkContent) -> None:
+    def _add_messages(self, content: MessageBatch) -> None:
         heads = content.heads
         if not len(heads):
             return
@@ -258,31 +264,10 @@ class DataSection:
         self._parts.append(content)
         self._size += len(content.records)
 
-    def _batches(self) -> Iterator[MessageBatch]:
+    def _hand_on(self) -> None:
         parts, self._parts, self._size = self._parts, [], 0
-        if parts:
-            yield from batches(parts)
-
-
-_ALLOWED = {
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.CHUNK_INDEX,
-    Opcode.ATTACHMENT_INDEX,
-    Opcode.STATISTICS,
-    Opcode.METADATA_INDEX,
-    Opcode.SUMMARY_OFFSET,
-}
-_OFFSETS = {  # byte of the offset within an index record
-    Opcode.CHUNK_INDEX: 16,
-    Opcode.ATTACHMENT_INDEX: 0,
-    Opcode.METADATA_INDEX: 0,
-}
-_THINGS = {
-    Opcode.CHUNK_INDEX: "chunk",
-    Opcode.ATTACHMENT_INDEX: "attachment",
-    Opcode.METADATA_INDEX: "metadata record",
-}
+        for batch in batches(parts) if parts else ():
+            self.checks.add(batch)
 
 
 class SummarySection:
@@ -311,13 +296,13 @@ class SummarySection:
     def add(self, record: Record) -> None:
         """Check the next record after the Data End."""
         opcode = record.opcode
-        if opcode not in _ALLOWED:
+        if opcode not in {*_SUMMARY, Opcode.SCHEMA, Opcode.CHANNEL}:
             if opcode < _RESERVED:
                 what = f"{name_of(opcode)} in the summary section"
                 self._findings.error("summary-opcode", what, REINDEX, offset=record.offset)
         else:
             self._group(record)
-            if opcode in _OFFSETS:
+            if opcode in _INDEXES:
                 self._add_index(record)
             else:
                 self._add_other(record)
@@ -333,14 +318,10 @@ class SummarySection:
             self._error("footer", "the Footer is too long", record.offset)
         first = min((s for o, s in self._starts.items() if o != Opcode.SUMMARY_OFFSET), default=0)
         offsets = self._starts.get(Opcode.SUMMARY_OFFSET, 0)
-        if footer.summary_start not in {first, first or offsets}:
-            what = f"the Footer says the summary begins at byte {footer.summary_start}, and it "
-            where = f"begins at {first}" if first else "is empty"
-            self._error("footer", what + where, record.offset)
-        if footer.summary_offset_start != offsets:
-            what = f"the Footer says the summary offsets begin at {footer.summary_offset_start}"
-            where = f"they begin at {offsets}" if offsets else "there are none"
-            self._error("footer", f"{what}, and {where}", record.offset)
+        if first == 0 and footer.summary_start == offsets:
+            first = offsets  # some writers count the offsets alone
+        for name, place in {"summary_start": first, "summary_offset_start": offsets}.items():
+            self._compare("footer", "the Footer says", footer, {name: place}, record.offset)
         if footer.summary_crc:
             head = HEAD.pack(Opcode.FOOTER, len(record.content)) + record.content[:16]
             if zlib.crc32(head, self._crc) != footer.summary_crc:
@@ -393,14 +374,13 @@ class SummarySection:
 
     def _add_index(self, record: Record) -> None:
         """Compare an index record with the record at its offset."""
-        at = _OFFSETS[Opcode(record.opcode)]
+        thing, at = _INDEXES[record.opcode]
         if len(record.content) < at + 8:
             parse_strictly(self._findings, record.opcode, record.offset, record.content)
             return
         (offset,) = UINT64.unpack_from(record.content, at)
         expected = self._unseen[record.opcode].pop(offset, None)
         if expected is None:
-            thing = _THINGS[Opcode(record.opcode)]
             if offset in self._data.expected_indexes[record.opcode]:
                 what = f"a second {name_of(record.opcode)} for the {thing} at byte {offset}"
                 self._error("index-twice", what, record.offset)
@@ -408,32 +388,33 @@ class SummarySection:
                 what = f"{name_of(record.opcode)} for byte {offset}, where no {thing} is"
                 self._error("index-place", what, record.offset)
             return
-        if not record.content.startswith(expected):
-            self._compare(record, expected)
-        if record.opcode == Opcode.CHUNK_INDEX:
-            first = CHUNK_INDEX.size
-            *_, size = CHUNK_INDEX.unpack_from(expected)
-            offsets = INDEX_OFFSET.iter_unpack(expected[first : first + size])
-            self._indexed |= {channel for channel, _ in offsets}
-
-    def _compare(self, record: Record, expected: bytes) -> None:
-        index = parse_strictly(self._findings, record.opcode, record.offset, record.content)
         try:
-            expected_index = parse(record.opcode, expected)
+            index = parse(record.opcode, expected) if expected else None
         except UnicodeDecodeError:  # invalid compression name of a damaged chunk, reported there
+            index = None
+        if isinstance(index, ChunkIndex):
+            self._indexed |= index.message_index_offsets.keys()
+        if record.content.startswith(expected):
             return
-        if index is None or expected_index is None:
-            return
+        stated = parse_strictly(self._findings, record.opcode, record.offset, record.content)
+        if stated is not None and index is not None:
+            values = vars(index)
+            if isinstance(stated, ChunkIndex) and not stated.message_index_offsets:
+                values.pop("message_index_offsets")  # a chunk index may omit them
+            says = f"{name_of(record.opcode)} says"
+            self._compare("index-differs", says, stated, values, record.offset)
+
+    def _compare(
+        self, rule: str, says: str, stated: McapRecord, expected: dict[str, Any], offset: int
+    ) -> None:
+        """Compare a record with the values that a writer would write."""
         differing = [
-            f"{name} {getattr(index, name)} and should say {value}"
-            for name, value in vars(expected_index).items()
-            if getattr(index, name) != value
-            # A chunk index may omit empty message indexes.
-            and (getattr(index, name) or name != "message_index_offsets")
+            f"{field} {getattr(stated, field)} and should say {value}"
+            for field, value in expected.items()
+            if getattr(stated, field) != value
         ]
         if differing:
-            what = f"{name_of(record.opcode)} says {'; '.join(differing)}"
-            self._error("index-differs", what, record.offset)
+            self._error(rule, f"{says} {'; '.join(differing)}", offset)
 
     def _add_statistics(self, statistics: Statistics, offset: int) -> None:
         self._statistics.append((offset, statistics))
@@ -463,13 +444,7 @@ class SummarySection:
         if counts := statistics.channel_message_counts:
             statistics.channel_message_counts = {k: n for k, n in counts.items() if n}
             expected["channel_message_counts"] = {k: n for k, n in data.counts.items() if n}
-        differing = [
-            f"{name} {getattr(statistics, name)} and should say {value}"
-            for name, value in expected.items()
-            if getattr(statistics, name) != value
-        ]
-        if differing:
-            self._error("statistics", f"the statistics say {'; '.join(differing)}", offset)
+        self._compare("statistics", "the statistics say", statistics, expected, offset)
 
     def _count(self, kind: type, defined: Iterable[int], stated: int) -> int:
         """Count definitions; writers may omit definitions that are only in the summary."""
@@ -497,7 +472,7 @@ class SummarySection:
             if not unseen or not (opcode in self._starts or self._data.definitions.ours):
                 continue
             first = min(unseen)
-            what = f"{len(unseen)} of kind {_THINGS[Opcode(opcode)]} are not indexed, the first at "
+            what = f"{len(unseen)} of kind {_INDEXES[opcode][0]} are not indexed, the first at "
             self._error("index-missing", f"{what}byte {first}", offset)
         if Opcode.CHUNK_INDEX in self._starts and self._data.loose:
             what = "messages outside of chunks, which the index cannot find"
