@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, McapRecord, Schema
+from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from hearthlog.analyzer.doctor.record_walk import Record
+from hearthlog.analyzer.doctor.record_walk import Record, name_of, parse_strictly
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.logs.columns import definition_fault
 from hearthlog.schemas.logs.writer import ENCODING, PROFILE, SCHEMA_ENCODING
@@ -41,56 +41,11 @@ from hearthlog.schemas.mcap.records import (
     begun_chunk_head,
     chunk_head,
     decompress,
-    encode,
-    parse,
 )
 
 ROS_ENCODINGS = (SCHEMA_ENCODING, "ros2idl")
-_SIZE_LIMIT = 16 << 20  # bytes of a record other than a chunk or an attachment
 _TOTAL_LIMIT = 64 << 20  # bytes of all schemas and channels of a file
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,2}")
-
-
-def parse_strictly(
-    findings: Findings, opcode: int, offset: int, content: bytes
-) -> McapRecord | None:
-    """Parse a record, and report a damaged or too large one.
-
-    A record is damaged if it is too short, has invalid UTF-8, or repeats a key of a map.
-
-    Parameters
-    ----------
-    offset : int
-        Byte of the file at which the record, or its chunk, begins.
-
-    Returns
-    -------
-    McapRecord or None
-        None if the record cannot be parsed, is too large for hearthlog, or is of an unknown kind.
-    """
-    if len(content) > _SIZE_LIMIT and opcode != Opcode.ATTACHMENT:
-        what = f"{name_of(opcode)} of {len(content)} bytes is larger than hearthlog reads"
-        findings.error("too-large", what, RECOVER, offset=offset)
-        return None
-    try:
-        record = parse(opcode, content)
-    except (McapError, UnicodeDecodeError) as error:
-        findings.error("fields", f"{name_of(opcode)}: {error}", RECOVER, offset=offset)
-        return None
-    if record is None or opcode == Opcode.ATTACHMENT:
-        return record
-    if not content.startswith(encode(record)[HEAD.size :]):  # later versions may append fields
-        what = f"{name_of(opcode)}: a map in it has a key twice, or another length than it says"
-        findings.error("fields", what, RECOVER, offset=offset)
-    return record
-
-
-def name_of(opcode: int) -> str:
-    """Return the name of a kind of record, such as `Chunk index`."""
-    try:
-        return Opcode(opcode).name.capitalize().replace("_", " ")
-    except ValueError:
-        return f"record of opcode {opcode}"
 
 
 class CheckedDefinitions(Definitions):

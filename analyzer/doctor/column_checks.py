@@ -1,12 +1,15 @@
 """Checks of a recorder log's topics and columns against docs/log.md."""
 
+import json
 import re
+from collections.abc import Callable, Mapping
 from itertools import repeat
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.doctor.findings import Findings
+from hearthlog.analyzer.doctor.findings import Findings, Level
 from hearthlog.models.classifiers.names import MOST_AHEAD_FRAMES
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
@@ -71,6 +74,7 @@ def topic_type(topic: str) -> str | None:
 
 
 STAMP = "header.stamp"
+_ARRAYS = {FEATURES: ("values",), STATISTICS: ("mean", "std")}
 _SUM_TOLERANCE = 1e-4
 _LABEL_LATE = MOST_AHEAD_FRAMES * FRAME_NANOSECONDS + 10_000_000  # ns; of labels by network names
 _LATE = {  # ns, including the tolerance of stamps
@@ -83,228 +87,195 @@ _LATE = {  # ns, including the tolerance of stamps
 }
 
 
-def check_stamps(
-    findings: Findings, kind: str, columns: Columns, microphone: str, *, named: bool
-) -> None:
-    """Compare log times with stamps, and `frame_id` with the microphone.
+class ColumnChecks:
+    """Checks of the messages of one topic, each on its own.
 
-    Parameters
-    ----------
-    microphone : str
-        Name; empty for a topic without a microphone.
-
-    Raises
-    ------
-    LogError
-        If a field of the type is missing.
+    Raise `LogError` if a field of the type is missing.
     """
-    times = columns.log_times
-    stamps = columns["stamp" if kind == ROSOUT else STAMP]
-    if kind in {SEGMENT, BESIDE_SEGMENT, GAP}:
-        stamps = stamps + columns["duration"]
-    late = times - stamps
-    if kind == "info" and not named:
-        late = np.minimum(late, 0)
-    if kind in _LATE:  # may be logged later, but never before its end
-        late[(late >= 0) & (late <= _LATE[kind])] = 0
-    findings.rows(
-        "stamp",
-        late != 0,
-        times,
-        lambda i: (
-            f"{columns.topic}: log time is {late[i] / 1e9:+.3f} s from the time of the message"
-        ),
-    )
-    if microphone:
-        names = columns["header.frame_id"]
-        findings.rows(
-            "frame-id",
-            np.asarray(names != microphone, bool),
-            times,
-            lambda i: f"{columns.topic}: frame_id is {names[i]!r}",
+
+    def __init__(self, findings: Findings, columns: Columns) -> None:
+        self._findings = findings
+        self._columns = columns
+        self._topic = columns.topic
+
+    def check_stamps(self, kind: str, microphone: str, *, named: bool) -> None:
+        """Compare log times with stamps, and `frame_id` with the microphone.
+
+        Parameters
+        ----------
+        microphone : str
+            Name; empty for a topic without a microphone.
+        """
+        columns = self._columns
+        stamps = columns["stamp" if kind == ROSOUT else STAMP]
+        if kind in {SEGMENT, BESIDE_SEGMENT, GAP}:
+            stamps = stamps + columns["duration"]
+        late = columns.log_times - stamps
+        if kind == "info" and not named:
+            late = np.minimum(late, 0)
+        if kind in _LATE:  # may be logged later, but never before its end
+            late[(late >= 0) & (late <= _LATE[kind])] = 0
+        self._report(
+            "stamp",
+            late != 0,
+            lambda i: f"log time is {late[i] / 1e9:+.3f} s from the time of the message",
+        )
+        if microphone:
+            names = columns["header.frame_id"]
+            wrong = np.asarray(names != microphone, bool)
+            self._report("frame-id", wrong, lambda i: f"frame_id is {names[i]!r}")
+
+    def check_content(self, kind: str, info: Mapping[str, Any] | None) -> None:
+        """Check the values of the messages of a kind.
+
+        Parameters
+        ----------
+        info : mapping or None
+            `AudioStreamInfo` of the microphone, with the classes and the names of the features.
+        """
+        classes = None if info is None else list(info["labels"])
+        if kind in _ARRAYS and info is not None:
+            for field in _ARRAYS[kind]:
+                self._check_array(field, len(info["feature_names"]))
+        elif kind == BESIDE_LABEL:
+            self._check_labels(_class_names(self._columns))
+        elif kind == LABEL and classes is not None:
+            self._check_labels(classes)
+        elif kind in {SEGMENT, BESIDE_SEGMENT}:
+            self._check_segments(classes if kind == SEGMENT else None)
+        elif kind == GAP:
+            self._check_gaps()
+        elif kind == DIRECTION:
+            azimuths = self._columns["azimuth"]
+            wrong = ~(np.abs(azimuths) <= np.float32(np.pi))
+            self._report("azimuth", wrong, lambda i: f"azimuth is {azimuths[i]}")
+            self._check_confidence(1)
+        elif kind == EMBEDDING:
+            self._check_embeddings()
+
+    def _report(
+        self,
+        rule: str,
+        wrong: NDArray[np.bool_],
+        what: Callable[[int], str],
+        level: Level = "error",
+    ) -> None:
+        times = self._columns.log_times
+        self._findings.rows(rule, wrong, times, lambda i: f"{self._topic}: {what(i)}", level)
+
+    def _check_array(self, field: str, width: int) -> None:
+        """Check that an array has one finite value per name; `std` must not be negative."""
+        values = self._columns[field]
+        if values.ndim == 1:
+            widths = np.fromiter(map(len, values), np.int64, len(values))
+        else:
+            widths = np.full(len(values), values.shape[1])
+        self._report(
+            "width",
+            widths != width,
+            lambda i: f"{field} has {widths[i]} values, and there are {width} names",
+        )
+        if values.ndim == 1 or not len(values):
+            return
+        bad = ~np.isfinite(values).all(axis=1)
+        self._report("finite", bad, lambda _: f"{field} is not finite")
+        if field == "std":
+            negative = np.asarray((values < 0).any(axis=1))
+            self._report("negative-std", negative, lambda _: "std is negative")
+
+    def _check_labels(self, classes: list[str]) -> None:
+        """Check frame labels of a model with these classes, in the order of the probabilities."""
+        columns = self._columns
+        self._check_array("probabilities", len(classes))
+        numbers = self._check_names(classes)
+        probabilities = columns["probabilities"]
+        if probabilities.ndim == 1 or probabilities.shape[1] != len(classes):
+            return
+        total = probabilities.sum(axis=1, dtype=np.float64)
+        wrong = (np.abs(total - 1) > _SUM_TOLERANCE) | (probabilities < 0).any(axis=1)
+        self._report(
+            "probabilities",
+            wrong,
+            lambda i: f"the probabilities are negative, or sum up to {total[i]:.6f}",
+        )
+        given = probabilities[np.arange(len(numbers)), np.maximum(numbers, 0)]
+        confidence = columns["confidence"]
+        self._report(
+            "confidence",
+            (numbers >= 0) & (confidence != given),
+            lambda i: (
+                f"confidence is {confidence[i]:.6f}, and the probability of the "
+                f"label {given[i]:.6f}"
+            ),
+        )
+
+    def _check_names(self, classes: list[str]) -> Int64:
+        """Return the class numbers of labels, -1 for unknown labels, which are reported."""
+        numbers_of = {label: number for number, label in enumerate(classes)}
+        labels = self._columns["label"].tolist()
+        numbers = np.fromiter(map(numbers_of.get, labels, repeat(-1)), np.int64, len(labels))
+        self._report("class", numbers < 0, lambda i: f"{labels[i]!r} is no class of the model")
+        return numbers
+
+    def _check_segments(self, classes: list[str] | None) -> None:
+        """Check segments; None allows any class."""
+        self._report("duration", self._columns["duration"] <= 0, lambda _: "has no duration")
+        self._check_confidence(1 + _SUM_TOLERANCE)
+        if classes is not None:
+            self._check_names(classes)
+
+    def _check_confidence(self, most: float) -> None:
+        confidence = self._columns["confidence"]
+        wrong = ~((confidence >= 0) & (confidence <= most))
+        self._report("confidence", wrong, lambda i: f"confidence is {confidence[i]}")
+
+    def _check_embeddings(self) -> None:
+        """Check that embeddings cover complete windows, and have one value per name."""
+        columns = self._columns
+        frames, lengths = columns["frame"], columns["frames"]
+        wrong = (lengths != WINDOW_FRAMES) | (frames % HOP_FRAMES != 0)
+        self._report(
+            "embedding-window",
+            wrong,
+            lambda i: f"is of {lengths[i]} frames from frame {frames[i]} on",
+        )
+        error = self._findings.error
+        source = EmbeddingSource.from_metadata(columns.metadata)
+        if source is None:
+            error("embedding-source", f"{self._topic}: does not say of which network it is")
+        elif columns["values"].shape[1:] != (len(source.names),):
+            what = f"{self._topic}: some messages are not of {len(source.names)} values"
+            error("values", what)
+
+    def _check_gaps(self) -> None:
+        """Report every gap, and check its duration against its lost frames.
+
+        Losses of a damaged log are exempt: they may include gaps in which the clock was set.
+        """
+        columns = self._columns
+        durations, lost, reasons = columns["duration"], columns["frames_lost"], columns["reason"]
+        on_purpose = np.array([each.split("; ")[0] in ON_PURPOSE for each in reasons], bool)
+        self._report(
+            "gap",
+            ~on_purpose,
+            lambda i: f"{durations[i] / 1e9:.3f} s, {lost[i]} frames were not heard: {reasons[i]}",
+            level="warning",
+        )
+        free = [CLOCK_SET in each or each.startswith(LOG_DAMAGED) for each in reasons]
+        frames = durations.astype(np.float64) / FRAME_NANOSECONDS
+        differ: NDArray[np.bool_] = np.abs(frames - lost.astype(np.float64)) > 1
+        self._report(
+            "gap-duration",
+            differ & ~np.array(free, bool) & (durations >= 0),
+            lambda i: f"{lost[i]} lost frames do not last {durations[i] / 1e9:.3f} s",
         )
 
 
-def check_values(findings: Findings, columns: Columns, field: str, width: int) -> None:
-    """Check that an array has one finite value per name.
-
-    Parameters
-    ----------
-    field : str
-        Path of the array; values of `std` must not be negative, either.
-
-    Raises
-    ------
-    LogError
-        If the messages have no such field.
-    """
-    values, times = columns[field], columns.log_times
-    report = findings.rows
-    if values.ndim == 1:
-        widths = np.fromiter(map(len, values), np.int64, len(values))
-    else:
-        widths = np.full(len(values), values.shape[1])
-    report(
-        "width",
-        widths != width,
-        times,
-        lambda i: f"{columns.topic}: {field} has {widths[i]} values, and there are {width} names",
-    )
-    if values.ndim == 1 or not len(values):
-        return
-    bad = ~np.isfinite(values).all(axis=1)
-    report("finite", bad, times, lambda _: f"{columns.topic}: {field} is not finite")
-    if field == "std":
-        negative = np.asarray((values < 0).any(axis=1))
-        report("negative-std", negative, times, lambda _: f"{columns.topic}: std is negative")
-
-
-def check_labels(findings: Findings, columns: Columns, classes: list[str]) -> None:
-    """Check the classes, probabilities and confidence of frame labels.
-
-    Parameters
-    ----------
-    classes : list of str
-        Classes of the model, in the order of the probabilities.
-
-    Raises
-    ------
-    LogError
-        If a field of the type is missing.
-    """
-    times, report = columns.log_times, findings.rows
-    numbers = _check_names(findings, columns, classes)
-    probabilities = columns["probabilities"]
-    if probabilities.ndim == 1 or probabilities.shape[1] != len(classes):
-        return
-    total = probabilities.sum(axis=1, dtype=np.float64)
-    wrong = (np.abs(total - 1) > _SUM_TOLERANCE) | (probabilities < 0).any(axis=1)
-    report(
-        "probabilities",
-        wrong,
-        times,
-        lambda i: f"{columns.topic}: the probabilities are negative, or sum up to {total[i]:.6f}",
-    )
-    given = probabilities[np.arange(len(times)), np.maximum(numbers, 0)]
-    confidence = columns["confidence"]
-    report(
-        "confidence",
-        (numbers >= 0) & (confidence != given),
-        times,
-        lambda i: (
-            f"{columns.topic}: confidence is {confidence[i]:.6f}, and the probability of the "
-            f"label {given[i]:.6f}"
-        ),
-    )
-
-
-def _check_names(findings: Findings, columns: Columns, classes: list[str]) -> Int64:
-    """Return the class numbers of labels, -1 for unknown labels, which are reported."""
-    numbers_of = {label: number for number, label in enumerate(classes)}
-    labels = columns["label"].tolist()
-    numbers = np.fromiter(map(numbers_of.get, labels, repeat(-1)), np.int64, len(labels))
-    findings.rows(
-        "class",
-        numbers < 0,
-        columns.log_times,
-        lambda i: f"{columns.topic}: {labels[i]!r} is no class of the model",
-    )
-    return numbers
-
-
-def check_segments(findings: Findings, columns: Columns, classes: list[str] | None) -> None:
-    """Check the durations, confidence and classes of segments.
-
-    Parameters
-    ----------
-    classes : list of str or None
-        Classes of the model; None allows any.
-
-    Raises
-    ------
-    LogError
-        If a field of the type is missing.
-    """
-    times, confidence = columns.log_times, columns["confidence"]
-    no_duration = columns["duration"] <= 0
-    findings.rows("duration", no_duration, times, lambda _: f"{columns.topic}: has no duration")
-    findings.rows(
-        "confidence",
-        ~((confidence >= 0) & (confidence <= 1 + _SUM_TOLERANCE)),
-        times,
-        lambda i: f"{columns.topic}: confidence is {confidence[i]}",
-    )
-    if classes is not None:
-        _check_names(findings, columns, classes)
-
-
-def check_directions(findings: Findings, columns: Columns) -> None:
-    """Check that azimuths are within ±π, and confidences within 0 to 1.
-
-    Raise `LogError` if a field of the type is missing.
-    """
-    times, azimuths, confidence = columns.log_times, columns["azimuth"], columns["confidence"]
-    findings.rows(
-        "azimuth",
-        ~(np.abs(azimuths) <= np.float32(np.pi)),
-        times,
-        lambda i: f"{columns.topic}: azimuth is {azimuths[i]}",
-    )
-    findings.rows(
-        "confidence",
-        ~((confidence >= 0) & (confidence <= 1)),
-        times,
-        lambda i: f"{columns.topic}: confidence is {confidence[i]}",
-    )
-
-
-def check_embeddings(findings: Findings, columns: Columns) -> None:
-    """Check that embeddings cover complete windows, and have one value per name.
-
-    Raise `LogError` if a field of the type is missing.
-    """
-    times, frames, lengths = columns.log_times, columns["frame"], columns["frames"]
-    findings.rows(
-        "embedding-window",
-        (lengths != WINDOW_FRAMES) | (frames % HOP_FRAMES != 0),
-        times,
-        lambda i: f"{columns.topic}: is of {lengths[i]} frames from frame {frames[i]} on",
-    )
-    source = EmbeddingSource.from_metadata(columns.metadata)
-    if source is None:
-        findings.error("embedding-source", f"{columns.topic}: does not say of which network it is")
-        return
-    values, width = columns["values"], len(source.names)
-    if values.shape[1:] != (width,):
-        findings.error("values", f"{columns.topic}: some messages are not of {width} values")
-
-
-def check_gaps(findings: Findings, columns: Columns) -> None:
-    """Report every gap, and check its duration against its lost frames.
-
-    Losses of a damaged log are exempt: they may include gaps in which the clock was set.
-
-    Raise `LogError` if a field of the type is missing.
-    """
-    times, durations = columns.log_times, columns["duration"]
-    lost, reasons = columns["frames_lost"], columns["reason"]
-    on_purpose = np.array([each.split("; ")[0] in ON_PURPOSE for each in reasons], bool)
-    findings.rows(
-        "gap",
-        ~on_purpose,
-        times,
-        lambda i: (
-            f"{columns.topic}: {durations[i] / 1e9:.3f} s, {lost[i]} frames were not heard: "
-            f"{reasons[i]}"
-        ),
-        level="warning",
-    )
-    free = np.array([CLOCK_SET in each or each.startswith(LOG_DAMAGED) for each in reasons], bool)
-    frames = durations.astype(np.float64) / FRAME_NANOSECONDS
-    differ: NDArray[np.bool_] = np.abs(frames - lost.astype(np.float64)) > 1
-    findings.rows(
-        "gap-duration",
-        differ & ~free & (durations >= 0),
-        times,
-        lambda i: f"{columns.topic}: {lost[i]} lost frames do not last {durations[i] / 1e9:.3f} s",
-    )
+def _class_names(columns: Columns) -> list[str]:
+    """Return the class names of a label channel's probabilities; empty if there are none."""
+    try:
+        names = json.loads(columns.metadata["probabilities_names"])
+    except (KeyError, ValueError, RecursionError):
+        return []
+    is_list = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    return names if is_list else []

@@ -1,7 +1,6 @@
 """Joint checks of one microphone's frame numbers, stamps, gaps, labels and segments."""
 
 from collections.abc import Callable, Collection
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,87 +24,6 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 # ns. Behind a sound server, stamps follow block arrival, with up to 45 % error at first.
 _STEP_TOLERANCE = FRAME_NANOSECONDS // 2
 _GAP_TOLERANCE = 1_000_000  # ns
-
-# Reports rows that break a rule: rule, rows, their log times, and a text for a row.
-Report = Callable[[str, NDArray[np.bool_], Int64, Callable[[int], str]], None]
-
-
-class Steps(NamedTuple):
-    """Differences between successive frames; arrays with one row per frame.
-
-    Attributes
-    ----------
-    rows : np.ndarray [shape=(n, 3)]
-        Log time, frame and stamp.
-    has_previous : np.ndarray [shape=(n,)], bool
-        Whether the previous frame was read.
-    numbers, elapsed : np.ndarray [shape=(n,)], int64
-        Increments of the frame number and of the stamp (ns).
-    gaps, lost : np.ndarray [shape=(n,)], int64
-        Number of gaps since the previous frame, and of frames lost in them.
-    """
-
-    rows: Int64
-    has_previous: NDArray[np.bool_]
-    numbers: Int64
-    elapsed: Int64
-    gaps: Int64
-    lost: Int64
-
-
-def check_steps(report: Report, steps: Steps) -> None:
-    """Check that frame numbers and stamps are continuous, and that gaps explain every jump."""
-    rows, has_previous, numbers, elapsed, gaps, lost = steps
-    times, frames, _ = rows.T
-    report(
-        "frame-order",
-        has_previous & (numbers <= 0),
-        times,
-        lambda i: f"frame {frames[i]} follows frame {frames[i] - numbers[i]}",
-    )
-    report(
-        "frame-jump",
-        has_previous & (numbers > 1) & (gaps == 0),
-        times,
-        lambda i: f"frame {frames[i]} comes after {numbers[i] - 1} others that no gap explains",
-    )
-    report(
-        "gap-frames",
-        has_previous & (gaps > 0) & (numbers > 0) & (numbers != lost + 1),
-        times,
-        lambda i: f"a gap of {lost[i]} frames where the numbers jump by {numbers[i] - 1}",
-    )
-    wrong = np.abs(elapsed - FRAME_NANOSECONDS) > _STEP_TOLERANCE
-    report(
-        "stamp-step",
-        has_previous & (numbers == 1) & (gaps == 0) & wrong,
-        times,
-        lambda i: f"frame {frames[i]} comes {elapsed[i] / 1e6:.3f} ms after the one before",
-    )
-
-
-def check_gaps(report: Report, steps: Steps, gaps: Int64, following: NDArray[np.intp]) -> None:
-    """Check that gaps span exactly from the end of the previous frame to the start of the next.
-
-    Parameters
-    ----------
-    gaps : np.ndarray [shape=(m, 3)], int64
-        End and start (nanoseconds of UTC), and the number of lost frames.
-    following : np.ndarray [shape=(m,)], int
-        Rows of the frames after the gaps.
-    """
-    alone = steps.gaps[following] == 1
-    stamps = steps.rows[following, 2]
-    early = stamps - steps.elapsed[following] + FRAME_NANOSECONDS - gaps[:, 1]
-    wrong = steps.has_previous[following] & (np.abs(early) > _GAP_TOLERANCE)
-    wrong |= np.abs(stamps - gaps[:, 0]) > _GAP_TOLERANCE
-    report(
-        "gap-times",
-        alone & wrong,
-        gaps[:, 0],
-        lambda _: "a gap does not lie between the frames before and behind it",
-    )
-
 
 _RATE_TOLERANCE = 2e-3  # of a sound card's clock
 _DELAY = 1_000_000_000  # ns; delay of a late block
@@ -179,12 +97,15 @@ class FrameSequence:
         """Record that messages are missing here, because the file is damaged."""
         self.finish()
         self._pending.clear()
-        self._previous = self._run = self._segment = None
-        self._heard = _NONE
+        self._forget()
 
     def begin_anew(self, time: int) -> None:
         """Start another recording, or its next log, at a log time."""
         self.settle(time)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Start anew: nothing before the next message is compared with it."""
         self._previous = self._run = self._segment = None
         self._heard = _NONE
 
@@ -213,12 +134,9 @@ class FrameSequence:
         runs = self._check_features(features, gaps)
         if STATISTICS not in self._thinned:
             self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
-        # Log time is the stamp of the last frame of the block.
-        last = directions[:, 1] + BLOCK_FRAMES - 1
-        ends = np.stack([directions[:, 0], last, directions[:, 0]], axis=1)
+        ends = _at_ends(directions, BLOCK_FRAMES - 1)
         self._check_same(features, ends, DIRECTION, None)
-        last = embeddings[:, 1] + WINDOW_FRAMES - 1
-        ends = np.stack([embeddings[:, 0], last, embeddings[:, 0]], axis=1)
+        ends = _at_ends(embeddings, WINDOW_FRAMES - 1)
         self._check_same(features, ends, EMBEDDING, None)
         if self._timing is not None:
             self._check_labels(features, labels, runs, self._timing)
@@ -261,15 +179,63 @@ class FrameSequence:
         has_previous[0] = self._previous is not None
         numbers = np.diff(rows[:, 1], prepend=before[0])
         elapsed = np.diff(rows[:, 2], prepend=before[1])
-        steps = Steps(rows, has_previous, numbers, elapsed, count, lost)
-        check_steps(self._report, steps)
-        check_gaps(self._report, steps, gaps, following)
+        self._check_steps(rows, has_previous, np.stack([numbers, elapsed, count, lost]))
+        # Gaps reach from the end of the frame before them to the start of the next.
+        behind = rows[following, 2]
+        early = behind - elapsed[following] + FRAME_NANOSECONDS - gaps[:, 1]
+        wrong = has_previous[following] & (np.abs(early) > _GAP_TOLERANCE)
+        wrong |= np.abs(behind - gaps[:, 0]) > _GAP_TOLERANCE
+        self._report(
+            "gap-times",
+            (count[following] == 1) & wrong,
+            gaps[:, 0],
+            lambda _: "a gap does not lie between the frames before and behind it",
+        )
         self._begins = (count > 0) | (numbers != 1) | ~has_previous
         self._check_rate(rows)
         self._previous = self.last = int(rows[-1, 1]), int(rows[-1, 2])
         last = np.zeros(len(rows), np.int64)
         last[following] = gaps[:, 0]
         return ((count > 0) & ~np.isin(last, self._damages[:, 0])) | (rows[:, 1] == 0)
+
+    def _check_steps(self, rows: Int64, has_previous: NDArray[np.bool_], steps: Int64) -> None:
+        """Check that frame numbers and stamps are continuous, and that gaps explain every jump.
+
+        Parameters
+        ----------
+        has_previous : np.ndarray [shape=(n,)], bool
+            Whether the previous frame was read.
+        steps : np.ndarray [shape=(4, n)], int64
+            Increments of the frame number and of the stamp (ns), number of gaps since the previous
+            frame, and frames lost in them.
+        """
+        numbers, elapsed, gaps, lost = steps
+        times, frames, _ = rows.T
+        self._report(
+            "frame-order",
+            has_previous & (numbers <= 0),
+            times,
+            lambda i: f"frame {frames[i]} follows frame {frames[i] - numbers[i]}",
+        )
+        self._report(
+            "frame-jump",
+            has_previous & (numbers > 1) & (gaps == 0),
+            times,
+            lambda i: f"frame {frames[i]} comes after {numbers[i] - 1} others that no gap explains",
+        )
+        self._report(
+            "gap-frames",
+            has_previous & (gaps > 0) & (numbers > 0) & (numbers != lost + 1),
+            times,
+            lambda i: f"a gap of {lost[i]} frames where the numbers jump by {numbers[i] - 1}",
+        )
+        wrong = np.abs(elapsed - FRAME_NANOSECONDS) > _STEP_TOLERANCE
+        self._report(
+            "stamp-step",
+            has_previous & (numbers == 1) & (gaps == 0) & wrong,
+            times,
+            lambda i: f"frame {frames[i]} comes {elapsed[i] / 1e6:.3f} ms after the one before",
+        )
 
     def _are_damaged(self, times: Int64) -> NDArray[np.bool_]:
         """Whether the log is damaged at, or right after, each log time."""
@@ -326,8 +292,7 @@ class FrameSequence:
         self, features: Int64, labels: Int64, runs: NDArray[np.bool_], timing: LabelTiming
     ) -> None:
         self._check_label_stamps(features, labels, timing.delay)
-        # Log time is the stamp of the last frame of the window.
-        ends = np.stack([labels[:, 0], labels[:, 1] + timing.delay, labels[:, 0]], axis=1)
+        ends = _at_ends(labels, timing.delay)
         self._check_same(features, ends, LABEL, self._with_label(features, ends, runs, timing))
 
     def _check_label_stamps(self, features: Int64, labels: Int64, delay: int) -> None:
@@ -420,3 +385,8 @@ class FrameSequence:
         self, rule: str, wrong: NDArray[np.bool_], times: Int64, what: Callable[[int], str]
     ) -> None:
         self._findings.rows(rule, wrong, times, lambda row: f"{self._name}: {what(row)}")
+
+
+def _at_ends(rows: Int64, delay: int) -> Int64:
+    """Move rows to the last frames of their windows, whose stamps are the log times."""
+    return np.stack([rows[:, 0], rows[:, 1] + delay, rows[:, 0]], axis=1)

@@ -13,11 +13,9 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.doctor import column_checks
 from hearthlog.analyzer.doctor.chunk import MessageBatch
 from hearthlog.analyzer.doctor.column_checks import (
     BESIDE_LABEL,
-    BESIDE_SEGMENT,
     DIRECTION,
     EMBEDDING,
     FEATURES,
@@ -26,8 +24,10 @@ from hearthlog.analyzer.doctor.column_checks import (
     LOG_NAME,
     SEGMENT,
     SHARED,
+    STAMP,
     STATISTICS,
     TYPES,
+    ColumnChecks,
     split_topic,
     topic_type,
 )
@@ -68,15 +68,17 @@ from hearthlog.schemas.salvage.recover import dropped_kinds
 
 # ns; maximum delay of one microphone's messages behind those of another
 ALLOWED_DELAY = 10 * NANOSECONDS
-_WIDTHS = {FEATURES: ("values",), STATISTICS: ("mean", "std"), LABEL: ("probabilities",)}
 _LONGEST_WINDOW = 3600.0  # seconds; no log of ours has a longer window
 
 
 def allowed_delay(data: DataSection) -> int:
     """Return the maximum delay of one microphone's messages behind those of another, in ns."""
-    channels = data.definitions.channels.values()
-    infos = [channel for channel in channels if split_topic(channel.topic)[1] == "info"]
-    return ALLOWED_DELAY if len(infos) > 1 else 0
+    return ALLOWED_DELAY if len(_channels_of("info", data)) > 1 else 0
+
+
+def _channels_of(kind: str, data: DataSection) -> list[int]:
+    channels = data.definitions.channels.items()
+    return [number for number, channel in channels if split_topic(channel.topic)[1] == kind]
 
 
 class MessageChecks:
@@ -141,27 +143,23 @@ class MessageChecks:
 
     def _settled(self) -> int | None:
         """Return the log time before which all messages were added."""
-        if self._last is None or not self._gathered_channels():
+        if self._last is None or not _channels_of(EMBEDDING, self._data):
             return self._last
         return self._last - GATHERED_SPAN
-
-    def _gathered_channels(self) -> list[int]:
-        """Return the channels whose messages may be in later chunks than others of their time."""
-        channels = self._data.definitions.channels.items()
-        return [i for i, one in channels if split_topic(one.topic)[1] == EMBEDDING]
 
     def _check_times(self, batch: MessageBatch) -> None:
         heads = batch.heads
         times = heads["log_time"]
         if self._last is None:
             self._check_begin(heads)
-        gathered = np.isin(heads["channel"], self._gathered_channels())
+        # Embeddings may be in later chunks than other messages of their time.
+        gathered = np.isin(heads["channel"], _channels_of(EMBEDDING, self._data))
         self._last = self._check_order(times[~gathered], self._last)
         self._last_gathered = self._check_order(times[gathered], self._last_gathered)
-        report = self._findings.rows
         late = heads["publish_time"] - times
-        late[self._may_be_older(heads["channel"])] = 0
-        report(
+        if not self._named:  # `cut` puts older infos at the beginning
+            late[np.isin(heads["channel"], _channels_of("info", self._data))] = 0
+        self._findings.rows(
             "publish-time",
             late != 0,
             times,
@@ -181,18 +179,6 @@ class MessageChecks:
         )
         return int(times[-1])
 
-    def _may_be_older(self, channels: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        """Return which messages may be older than their log time: `cut` puts them at the beginning.
-
-        A log with the name of a recorder's log has none of these.
-        """
-        infos = [
-            identity
-            for identity, channel in self._data.definitions.channels.items()
-            if split_topic(channel.topic)[1] == "info"
-        ]
-        return np.isin(channels, [] if self._named else infos)
-
     def _check_begin(self, heads: NDArray[np.void]) -> None:
         channel = self._data.definitions.channels.get(int(heads["channel"][0]))
         if not self.infos and (channel is None or split_topic(channel.topic)[1] != "info"):
@@ -203,7 +189,8 @@ class MessageChecks:
 
     def _check(self, kind: str, columns: Columns) -> None:
         microphone = split_topic(columns.topic)[0]
-        column_checks.check_stamps(self._findings, kind, columns, microphone, named=self._named)
+        checks = ColumnChecks(self._findings, columns)
+        checks.check_stamps(kind, microphone, named=self._named)
         if kind == DIAGNOSTICS:
             self._check_health(columns)
         if not microphone:
@@ -213,7 +200,7 @@ class MessageChecks:
         info = self.infos.get(microphone)
         if microphone not in self.frames:
             self.frames[microphone] = self._frame_sequence(microphone, info)
-        self._check_content(kind, columns, info)
+        checks.check_content(kind, info)
         rows = _sequence_rows(kind, columns)
         if rows is not None and kind == EMBEDDING:  # gathered after the missing messages
             rows = rows[rows[:, 0] > self._interrupted]
@@ -221,29 +208,6 @@ class MessageChecks:
             self.frames[microphone].add(kind, rows)
         if kind == GAP and rows is not None:
             self.frames[microphone].add_damages(rows[columns["reason"] == LOG_DAMAGED])
-
-    def _check_content(self, kind: str, columns: Columns, info: Mapping[str, Any] | None) -> None:
-        if kind in _WIDTHS and info is not None:
-            names = info["labels"] if kind == LABEL else info["feature_names"]
-            for field in _WIDTHS[kind]:
-                column_checks.check_values(self._findings, columns, field, len(names))
-        if kind == LABEL and info is not None:
-            column_checks.check_labels(self._findings, columns, list(info["labels"]))
-        if kind == BESIDE_LABEL:
-            names = _class_names(columns)
-            column_checks.check_values(self._findings, columns, "probabilities", len(names))
-            column_checks.check_labels(self._findings, columns, names)
-        if kind == BESIDE_SEGMENT:
-            column_checks.check_segments(self._findings, columns, None)
-        if kind == SEGMENT:
-            classes = None if info is None else list(info["labels"])
-            column_checks.check_segments(self._findings, columns, classes)
-        if kind == GAP:
-            column_checks.check_gaps(self._findings, columns)
-        if kind == DIRECTION:
-            column_checks.check_directions(self._findings, columns)
-        if kind == EMBEDDING:
-            column_checks.check_embeddings(self._findings, columns)
 
     def _frame_sequence(self, microphone: str, info: Mapping[str, Any] | None) -> FrameSequence:
         every, timing = statistics_every(self._data), None
@@ -264,7 +228,7 @@ class MessageChecks:
     def _check_infos(self, columns: Columns, microphone: str) -> None:
         """Store the info of a microphone; a repeated info starts another recording."""
         for row, values in enumerate(_rows(columns)):
-            info = dict(zip(columns.fields, values, strict=True)) | {column_checks.STAMP: 0}
+            info = dict(zip(columns.fields, values, strict=True)) | {STAMP: 0}
             time = int(columns.log_times[row])
             if microphone not in self.infos:
                 self.infos[microphone] = info
@@ -289,16 +253,6 @@ def statistics_every(data: DataSection) -> int | None:
     except (KeyError, TypeError, ValueError, RecursionError):
         return None
     return every if isinstance(every, int) and every > 0 else None
-
-
-def _class_names(columns: Columns) -> list[str]:
-    """Return the class names of a label channel's probabilities; empty if there are none."""
-    try:
-        names = json.loads(columns.metadata["probabilities_names"])
-    except (KeyError, ValueError, RecursionError):
-        return []
-    is_list = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    return names if is_list else []
 
 
 def _thinned_kinds(data: DataSection) -> set[str]:
@@ -342,12 +296,12 @@ def _rows(columns: Columns) -> Any:
 
 def _sequence_rows(kind: str, columns: Columns) -> Int64 | None:
     """Return the rows of a kind for `FrameSequence.add`; None for an unsupported kind."""
-    times, stamps = columns.log_times, columns[column_checks.STAMP]
+    times, stamps = columns.log_times, columns[STAMP]
     if kind == GAP:
         parts = times, stamps, columns["frames_lost"]
     elif kind == SEGMENT:
         parts = times, stamps, stamps + columns["duration"]
-    elif kind in {*_WIDTHS, DIRECTION, EMBEDDING}:
+    elif kind in {FEATURES, STATISTICS, LABEL, DIRECTION, EMBEDDING}:
         parts = times, columns["frame"], stamps
     else:
         return None
@@ -383,6 +337,7 @@ class MetadataChecks:
         self._findings = findings
         self._finished = finished
         self._whole = whole
+        self._records = data.metadata.get(HEARTHLOG_METADATA, [])
         self._channels = {c.topic: c for c in data.definitions.channels.values()}
 
     def check(self) -> None:
@@ -403,12 +358,10 @@ class MetadataChecks:
         self._findings.error(rule, what, DISTRUST)
 
     def _check_metadata(self) -> None:
-        records = self._data.metadata.get(HEARTHLOG_METADATA, [])
+        records = self._records
         if len(records) != 1:
-            self._error(
-                "metadata",
-                f"there are {len(records)} metadata records {HEARTHLOG_METADATA}, not one",
-            )
+            what = f"there are {len(records)} metadata records {HEARTHLOG_METADATA}, not one"
+            self._error("metadata", what)
             return
         if missing := sorted(_KEYS - records[0].keys()):
             self._error("metadata", f"metadata {HEARTHLOG_METADATA} lacks {', '.join(missing)}")
@@ -424,10 +377,8 @@ class MetadataChecks:
         if len(attachments.get(_CONFIGURATION, ())) == 1:
             digest = hashlib.sha256(attachments[_CONFIGURATION][0]).hexdigest()
             if records[0].get("configuration_sha256") != digest:
-                self._error(
-                    "attachments",
-                    f"{_CONFIGURATION} is not the one of metadata {HEARTHLOG_METADATA}",
-                )
+                what = f"{_CONFIGURATION} is not the one of metadata {HEARTHLOG_METADATA}"
+                self._error("attachments", what)
 
     def _check_name(self) -> None:
         """Compare a recorder-style file name with the contents."""
@@ -435,8 +386,9 @@ class MetadataChecks:
         named = LOG_NAME.fullmatch(path.name)
         if named is None:
             return
-        records = self._data.metadata.get(HEARTHLOG_METADATA, [])
-        node = records[0].get("node", named["node"]) if records else named["node"]
+        node = named["node"]
+        for record in self._records[:1]:
+            node = record.get("node", node)
         if node != named["node"]:
             self._error("name", f"the name says node {named['node']}, the file {node}")
         if self._data.span is None:
@@ -454,16 +406,13 @@ class MetadataChecks:
             self._error("name", f"the folder says {folders}, the first message {start:%Y/%m/%d}")
 
     def _check_info(self, microphone: str, info: dict[str, Any]) -> None:
-        expected: dict[str, Any] = {
-            "sample_rate": SAMPLE_RATE,
-            "frame_seconds": FRAME_SECONDS,
-        }
+        expected: dict[str, Any] = {"sample_rate": SAMPLE_RATE, "frame_seconds": FRAME_SECONDS}
         with suppress(ModelError):  # the feature set is not installed
             features = feature_set(str(info["feature_set"]))
             expected["window_seconds"] = features.window_seconds
             expected["feature_names"] = list(features.feature_names)
         is_first = microphone == next(iter(self._infos))  # the record names its model
-        for record in self._data.metadata.get(HEARTHLOG_METADATA, [])[:is_first]:
+        for record in self._records[:is_first]:
             expected |= {k: record.get(k) for k in ("feature_set", "model", "model_sha256")}
         for name, value in expected.items():
             if _plain(info[name]) != value:
@@ -477,9 +426,8 @@ class MetadataChecks:
     def _check_topics(self) -> None:
         """Compare the channels with the expected channels of a recorder."""
         expected: dict[str, Topic] = {}
-        records = self._data.metadata.get(HEARTHLOG_METADATA, [])
-        candidates = [CANDIDATE] if any(record.get("candidate") for record in records) else []
-        scenarios = [one for record in records for one in recorded_scenarios(record)]
+        candidates = [CANDIDATE] if any(each.get("candidate") for each in self._records) else []
+        scenarios = [one for record in self._records for one in recorded_scenarios(record)]
         for microphone, info in self._infos.items():
             classes = list(info["labels"]) or None
             own = [scenario_labelling(s.name) for s in scenarios if s.microphone == microphone]
@@ -529,10 +477,10 @@ class MetadataChecks:
 
     def _check_definition(self, channel: Channel, schema: Schema) -> None:
         """Compare a definition with released versions, and its hash with the channel's hash."""
-        records = self._data.metadata.get(HEARTHLOG_METADATA, [{}])
+        version = schema_version(self._records[0] if self._records else {})
         try:
             kind = message_type(schema.name, schema.encoding, schema.data)
-            what = difference(kind, schema_version(records[0]) or SCHEMA_VERSION)
+            what = difference(kind, version or SCHEMA_VERSION)
             if not what and channel.metadata.get("topic_type_hash") != type_hash_of(kind):
                 self._error("type", f"{channel.topic}: topic_type_hash is not that of {kind.name}")
         except LogError as error:

@@ -5,15 +5,18 @@ import zlib
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.records import McapRecord
 
 from hearthlog.analyzer.doctor.findings import RECOVER, Findings
 from hearthlog.schemas.files import LocalFile
 from hearthlog.schemas.mcap.raw_messages import CHUNK_HEAD_LIMIT, find_chunk_heads
-from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC
+from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, encode, parse
 
 _PIECE = 1 << 20  # bytes
 _READ_ANYWAY = 1 << 30  # bytes; a longer skip may be a sparse hole of any length
+_SIZE_LIMIT = 16 << 20  # bytes of a record other than a chunk or an attachment
 _CUT = 2 << 20  # bytes; a killed writer leaves no longer remainder
 
 
@@ -25,6 +28,48 @@ class Record(NamedTuple):
     length: int  # bytes, including opcode and length
     content: bytes
     crc: int | None  # CRC-32 of the file before the record; None if some bytes were not read
+
+
+def parse_strictly(
+    findings: Findings, opcode: int, offset: int, content: bytes
+) -> McapRecord | None:
+    """Parse a record, and report a damaged or too large one.
+
+    A record is damaged if it is too short, has invalid UTF-8, or repeats a key of a map.
+
+    Parameters
+    ----------
+    offset : int
+        Byte of the file at which the record, or its chunk, begins.
+
+    Returns
+    -------
+    McapRecord or None
+        None if the record cannot be parsed, is too large for hearthlog, or is of an unknown kind.
+    """
+    if len(content) > _SIZE_LIMIT and opcode != Opcode.ATTACHMENT:
+        what = f"{name_of(opcode)} of {len(content)} bytes is larger than hearthlog reads"
+        findings.error("too-large", what, RECOVER, offset=offset)
+        return None
+    try:
+        record = parse(opcode, content)
+    except (McapError, UnicodeDecodeError) as error:
+        findings.error("fields", f"{name_of(opcode)}: {error}", RECOVER, offset=offset)
+        return None
+    if record is None or opcode == Opcode.ATTACHMENT:
+        return record
+    if not content.startswith(encode(record)[HEAD.size :]):  # later versions may append fields
+        what = f"{name_of(opcode)}: a map in it has a key twice, or another length than it says"
+        findings.error("fields", what, RECOVER, offset=offset)
+    return record
+
+
+def name_of(opcode: int) -> str:
+    """Return the name of a kind of record, such as `Chunk index`."""
+    try:
+        return Opcode(opcode).name.capitalize().replace("_", " ")
+    except ValueError:
+        return f"record of opcode {opcode}"
 
 
 class RecordWalk:

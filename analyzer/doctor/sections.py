@@ -31,11 +31,9 @@ from hearthlog.analyzer.doctor.chunk import (
     RecordBudget,
     batches,
     check_channels,
-    name_of,
-    parse_strictly,
 )
 from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from hearthlog.analyzer.doctor.record_walk import Record
+from hearthlog.analyzer.doctor.record_walk import Record, name_of, parse_strictly
 from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.raw_messages import gather_heads, iterate_records
 from hearthlog.schemas.mcap.records import (
