@@ -1,6 +1,7 @@
 """The doctor sees every rule that is broken, and nothing where none is."""
 
 import json
+import re
 import shutil
 import struct
 import zlib
@@ -430,6 +431,7 @@ def new_definition(log):
 
 UNKNOWN = {"index-missing", "statistics"}  # what is put in as bytes is not indexed
 HOLE = {"frame-jump", "segment-hole"}  # where the gap is not known
+# Of the cases with `...`, the other consequences do not matter.
 
 DATA = {
     "no header": (lambda log: log.items.pop(0), {"header"}),
@@ -543,7 +545,7 @@ DATA = {
         features_of_nothing,
         {"cdr", "label-frames", "statistics-frames", "segment-hole"},
     ),
-    "chunks in another order": (move_last_chunk, None),
+    "chunks in another order": (move_last_chunk, {"log-time", ...}),
     "another publish time": (
         set_in(lambda log: log.messages(FEATURES)[40], publish_time=START),
         {"publish-time"},
@@ -570,9 +572,9 @@ DATA = {
     "a gap that is too long": (long_gap, {"gap-times", "gap-duration"}),
     "a stamp that jumps": (
         late_from((FEATURES, STATISTICS, LABEL, "/diagnostics"), 700, 300_000_000),
-        None,
+        {"stamp-step", ...},
     ),
-    "a slow clock": (slow_clock, None),
+    "a slow clock": (slow_clock, {"stamp-rate", ...}),
     "features of another width": (change(FEATURES, values=np.zeros(20, np.float32)), {"width"}),
     "features that are no numbers": (
         change(FEATURES, values=np.full(DEFAULT.width, np.nan, np.float32)),
@@ -608,20 +610,18 @@ DATA = {
     "a segment that lasts nothing": (segment_without_duration, {"duration", "segment-hole"}),
     "a segment that is too short": (segment_too_late, {"segment-hole"}),
 }
-SEEN = {  # by cases of which the other consequences do not matter
-    "chunks in another order": "log-time",
-    "a stamp that jumps": "stamp-step",
-    "a slow clock": "stamp-rate",
-}
 
 
 @pytest.mark.parametrize("case", DATA)
 def test_what_is_wrong_with_the_data_is_found(log, tmp_path, case):
     edit, expected = DATA[case]
     edit(log)
-    rules = errors(log.write(tmp_path / NAME))
-    if expected is None:
-        assert SEEN[case] in rules
+    assert_expected(errors(log.write(tmp_path / NAME)), expected)
+
+
+def assert_expected(rules, expected):
+    if ... in expected:
+        assert rules >= expected - {...}
     else:
         assert rules == expected
 
@@ -650,7 +650,7 @@ def altered(kind, number=0, **fields):
     """Set fields of a record that stands in the file."""
 
     def edit(records):
-        raw = nth(records, Opcode[_OPCODES[kind]], number)
+        raw = nth(records, opcode_of(kind), number)
         record = parsed(raw, kind)
         for name, value in fields.items():
             setattr(record, name, value(getattr(record, name)) if callable(value) else value)
@@ -659,19 +659,8 @@ def altered(kind, number=0, **fields):
     return edit
 
 
-_OPCODES = {
-    AttachmentIndex: "ATTACHMENT_INDEX",
-    Channel: "CHANNEL",
-    Chunk: "CHUNK",
-    ChunkIndex: "CHUNK_INDEX",
-    DataEnd: "DATA_END",
-    Footer: "FOOTER",
-    MessageIndex: "MESSAGE_INDEX",
-    MetadataIndex: "METADATA_INDEX",
-    Schema: "SCHEMA",
-    Statistics: "STATISTICS",
-    SummaryOffset: "SUMMARY_OFFSET",
-}
+def opcode_of(kind):
+    return Opcode[re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).upper()]
 
 
 def both(*edits):
@@ -736,10 +725,6 @@ def longer_record(records):
     raw.content = as_raw(chunk).content
 
 
-def without_footer(records):
-    records[:] = [raw for raw in records if raw.opcode != Opcode.FOOTER]
-
-
 def in_summary(raw):
     return lambda records: records.insert(len(records) - 1, raw)
 
@@ -795,6 +780,7 @@ def behind(records):
     records.insert(records.index(nth(records, Opcode.CHUNK)), index)
 
 
+GROUPS = {"summary-offset", "footer"}  # if a group of the summary has another length
 FILE = {
     "a checksum of the data": (altered(DataEnd, data_section_crc=1), {"data-crc"}),
     "no data end": (without_end, {"data-end"}),
@@ -812,7 +798,7 @@ FILE = {
         altered(Chunk, 2, data=lambda data: bytes(len(data))),
         {"chunk-data"},
     ),
-    "a chunk with a longer record": (longer_record, None),
+    "a chunk with a longer record": (longer_record, {"chunk-records", ...}),
     "a chunk that starts earlier": (
         both(altered(Chunk, 2, message_start_time=1), altered(ChunkIndex, 2, message_start_time=1)),
         {"chunk-times"},
@@ -839,70 +825,46 @@ FILE = {
         altered(ChunkIndex, 2, chunk_start_offset=more),
         {"index-place", "index-missing"},
     ),
-    "a chunk index twice": (again(Opcode.CHUNK_INDEX), {"index-twice", "summary-offset", "footer"}),
-    "a chunk that is not indexed": (
-        without(Opcode.CHUNK_INDEX, 3),
-        {"index-missing", "summary-offset", "footer"},
-    ),
-    "no chunk is indexed": (
-        without_all(Opcode.CHUNK_INDEX),
-        {"index-missing", "summary-offset", "footer"},
-    ),
-    "an attachment that is not indexed": (
-        without(Opcode.ATTACHMENT_INDEX),
-        {"index-missing", "summary-offset", "footer"},
-    ),
-    "metadata that is not indexed": (
-        without(Opcode.METADATA_INDEX),
-        {"index-missing", "summary-offset", "footer"},
-    ),
-    "a chunk index of another end": (
-        altered(ChunkIndex, 2, message_end_time=more),
-        {"index-differs"},
-    ),
-    "a chunk index of another size": (
-        altered(ChunkIndex, 2, uncompressed_size=more),
-        {"index-differs"},
-    ),
-    "a chunk index of another index": (
-        altered(
-            ChunkIndex,
-            2,
-            message_index_offsets=lambda places: {i: p + 1 for i, p in places.items()},
-        ),
-        {"index-differs"},
-    ),
-    "an attachment index of another size": (
-        altered(AttachmentIndex, data_size=more),
-        {"index-differs"},
-    ),
-    "an attachment index of another name": (
-        altered(AttachmentIndex, name="CONFIGURATION.json"),
-        {"index-differs"},
-    ),
-    "a metadata index of another name": (
-        altered(MetadataIndex, name="HEARTHLOG"),
-        {"index-differs"},
-    ),
+    "a chunk index twice": (again(Opcode.CHUNK_INDEX), {"index-twice", *GROUPS}),
+    **{
+        f"{what} not indexed": (edit, {"index-missing", *GROUPS})
+        for what, edit in {
+            "a chunk": without(Opcode.CHUNK_INDEX, 3),
+            "all chunks": without_all(Opcode.CHUNK_INDEX),
+            "an attachment": without(Opcode.ATTACHMENT_INDEX),
+            "metadata": without(Opcode.METADATA_INDEX),
+        }.items()
+    },
+    **{
+        f"{kind.__name__} of another {field}": (
+            altered(kind, number, **{field: value}),
+            {"index-differs"},
+        )
+        for kind, number, field, value in (
+            (ChunkIndex, 2, "message_end_time", more),
+            (ChunkIndex, 2, "uncompressed_size", more),
+            (
+                ChunkIndex,
+                2,
+                "message_index_offsets",
+                lambda old: {i: p + 1 for i, p in old.items()},
+            ),
+            (AttachmentIndex, 0, "data_size", more),
+            (AttachmentIndex, 0, "name", "CONFIGURATION.json"),
+            (MetadataIndex, 0, "name", "HEARTHLOG"),
+        )
+    },
     **{
         f"statistics of another {name}": (altered(Statistics, **{name: more}), {"statistics"})
-        for name in (
-            "message_count",
-            "schema_count",
-            "channel_count",
-            "attachment_count",
-            "metadata_count",
-            "chunk_count",
-            "message_start_time",
-            "message_end_time",
-        )
+        for name in vars(Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0))
+        if name != "channel_message_counts"
     },
     "statistics of other counts": (
         altered(Statistics, channel_message_counts=lambda counts: counts | {2: 1}),
         {"statistics"},
     ),
-    "no statistics": (without_all(Opcode.STATISTICS), {"statistics", "summary-offset", "footer"}),
-    "statistics twice": (again(Opcode.STATISTICS), {"statistics", "summary-offset", "footer"}),
+    "no statistics": (without_all(Opcode.STATISTICS), {"statistics", *GROUPS}),
+    "statistics twice": (again(Opcode.STATISTICS), {"statistics", *GROUPS}),
     "statistics first": (statistics_first, {"statistics-channels", "summary-offset"}),
     "an attachment in the summary": (
         in_summary(Raw(Opcode.ATTACHMENT, bytes(40))),
@@ -915,7 +877,7 @@ FILE = {
     ),
     "no copies of channels": (
         without_copies,
-        {"summary-copies", "statistics-channels", "summary-offset", "footer"},
+        {"summary-copies", "statistics-channels", *GROUPS},
     ),
     "another copy of a channel": (other_copy, {"summary-copy"}),
     "an offset of a group": (altered(SummaryOffset, 2, group_start=more), {"summary-offset"}),
@@ -923,7 +885,7 @@ FILE = {
     "a checksum of the summary": (altered(Footer, summary_crc=more), {"summary-crc"}),
     "a start of the summary": (altered(Footer, summary_start=lambda start: start + 1), {"footer"}),
     "a start of the offsets": (altered(Footer, summary_offset_start=more), {"footer"}),
-    "no footer": (without_footer, {"footer"}),
+    "no footer": (without_all(Opcode.FOOTER), {"footer"}),
 }
 
 
@@ -962,28 +924,27 @@ def test_a_channel_that_is_in_the_summary_alone_is_a_warning(log, tmp_path, edit
 @pytest.mark.parametrize("case", FILE)
 def test_what_is_wrong_with_the_rest_of_the_file_is_found(log, tmp_path, case):
     edit, expected = FILE[case]
-    rules = errors(log.write(tmp_path / NAME, edit))
-    if expected is None:
-        assert "chunk-records" in rules
-    else:
-        assert rules == expected
+    assert_expected(errors(log.write(tmp_path / NAME, edit)), expected)
 
 
 # Files that end early, go on too long, or are none.
 
 
 @pytest.mark.parametrize(
-    ("data", "rules"),
+    ("edit", "rules"),
     [
-        (b"", {"magic"}),
-        (b"RIFF and so on", {"magic"}),
-        (MAGIC, {"cut"}),
-        (MAGIC + MAGIC, {"footer"}),
+        (lambda _: b"", {"magic"}),
+        (lambda _: b"RIFF and so on", {"magic"}),
+        (lambda _: MAGIC, {"cut"}),
+        (lambda _: MAGIC + MAGIC, {"footer"}),
+        (lambda data: data + b"more", {"after-end"}),
+        (lambda data: data + MAGIC, {"after-end"}),
+        (bits, {"magic"}),
     ],
 )
-def test_what_is_no_log_is_said_to_be_none(tmp_path, data, rules):
+def test_a_wrong_beginning_or_end_is_found(recorded, tmp_path, edit, rules):
     path = tmp_path / NAME
-    path.write_bytes(data)
+    path.write_bytes(edit(recorded.read_bytes()))
     assert errors(path) == rules
 
 
@@ -991,20 +952,6 @@ def test_a_log_that_cannot_be_opened_is_said_to_be_unreadable(tmp_path):
     (tmp_path / NAME).mkdir()
     (tmp_path / "gone.mcap").symlink_to(tmp_path / "nowhere")
     assert {rule for level, rule in found(tmp_path) if level == "error"} == {"unreadable"}
-
-
-def test_bytes_behind_the_end_are_found(recorded, tmp_path):
-    path = tmp_path / NAME
-    path.write_bytes(recorded.read_bytes() + b"more")
-    assert errors(path) == {"after-end"}
-    path.write_bytes(recorded.read_bytes() + MAGIC)
-    assert errors(path) == {"after-end"}
-
-
-def test_an_end_that_is_no_magic_is_found(recorded, tmp_path):
-    path = tmp_path / NAME
-    path.write_bytes(bits(recorded.read_bytes()))
-    assert errors(path) == {"magic"}
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.9, 0.999])
@@ -1072,10 +1019,9 @@ def test_every_finding_stays_on_its_line_whatever_a_file_says(log, tmp_path):
 # Logs of other writers.
 
 
-@pytest.mark.parametrize("storage", [StoragePlugin.MCAP])
-def test_a_bag_of_rosbags_is_sound(tmp_path, storage):
+def test_a_bag_of_rosbags_is_sound(tmp_path):
     store = get_typestore(Stores.ROS2_JAZZY)
-    with BagWriter(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
+    with BagWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/text", "std_msgs/msg/String", typestore=store)
         for i in range(100):
             message = store.types["std_msgs/msg/String"](data="x" * i)
@@ -1200,20 +1146,18 @@ def clock_set(folder, *steps):
     return folder
 
 
-def test_a_clock_that_is_set_back_begins_another_log_that_may_overlap(tmp_path):
-    assert len(find_logs(clock_set(tmp_path, -9))) == 2
-    assert found(tmp_path) == {("warning", GAP)}
+AHEAD = 60 * 86_400
+EVENING = (3600, AHEAD, -AHEAD, 3600)  # the clock was wrong by days
 
 
-def test_logs_of_an_evening_for_which_the_clock_was_wrong_by_days_follow_each_other(tmp_path):
-    ahead = 60 * 86_400
-    assert len(find_logs(clock_set(tmp_path, 3600, ahead, -ahead, 3600))) == 5
+@pytest.mark.parametrize(("steps", "logs"), [((-9,), 2), (EVENING, 5)])
+def test_each_step_of_the_clock_begins_another_log_that_may_overlap(tmp_path, steps, logs):
+    assert len(find_logs(clock_set(tmp_path, *steps))) == logs
     assert found(tmp_path) == {("warning", GAP)}
 
 
 def test_a_log_before_the_clock_was_set_may_have_been_deleted(tmp_path):
-    ahead = 60 * 86_400
-    _, second, *_ = find_logs(clock_set(tmp_path, 3600, ahead, -ahead, 3600))
+    _, second, *_ = find_logs(clock_set(tmp_path, *EVENING))
     second.unlink()
     assert found(tmp_path) == {("warning", GAP), ("warning", "missing-log")}
 
