@@ -299,14 +299,9 @@ class FrameSequence:
         """Compare the stamps of labels with the features of the same frames."""
         heard = np.concatenate([self._heard, features])
         self._heard = heard[max(len(heard) - delay, 0) :]
-        order = np.argsort(heard[:, 1], kind="stable")
-        known = np.flatnonzero(np.isin(labels[:, 1], heard[:, 1]))
-        at = order[np.searchsorted(heard[order, 1], labels[known, 1])]
-        wrong = np.zeros(len(labels), bool)
-        wrong[known] = heard[at, 2] != labels[known, 2]
         self._report(
             "frame-stamp",
-            wrong,
+            _has_other_stamp(labels, heard),
             labels[:, 0],
             lambda i: f"the label of frame {labels[i, 1]} has another stamp than its features",
         )
@@ -315,7 +310,7 @@ class FrameSequence:
         self, features: Int64, rows: Int64, kind: str, expects: NDArray[np.bool_] | None
     ) -> None:
         """Compare messages of another kind with the features of the same frames."""
-        times, frames, stamps = rows.T
+        times, frames, _ = rows.T
         expected = features if expects is None else features[expects]
         extra = ~np.isin(frames, expected[:, 1])
         report = self._report
@@ -338,14 +333,9 @@ class FrameSequence:
                 expected[:, 0],
                 lambda i: f"there is no {kind} of frame {expected[i, 1]}",
             )
-        order = np.argsort(expected[:, 1], kind="stable")
-        same = np.flatnonzero(~extra)
-        at = order[np.searchsorted(expected[order, 1], frames[same])]
-        wrong = np.zeros(len(rows), bool)
-        wrong[same] = expected[at, 2] != stamps[same]
         report(
             "frame-stamp",
-            wrong,
+            _has_other_stamp(rows, expected),
             times,
             lambda i: f"{kind} of frame {frames[i]} have another stamp than its features",
         )
@@ -390,3 +380,13 @@ class FrameSequence:
 def _at_ends(rows: Int64, delay: int) -> Int64:
     """Move rows to the last frames of their windows, whose stamps are the log times."""
     return np.stack([rows[:, 0], rows[:, 1] + delay, rows[:, 0]], axis=1)
+
+
+def _has_other_stamp(rows: Int64, features: Int64) -> NDArray[np.bool_]:
+    """Whether each row has another stamp than the features of its frame, if there are some."""
+    order = np.argsort(features[:, 1], kind="stable")
+    known = np.flatnonzero(np.isin(rows[:, 1], features[:, 1]))
+    at = order[np.searchsorted(features[order, 1], rows[known, 1])]
+    wrong = np.zeros(len(rows), bool)
+    wrong[known] = features[at, 2] != rows[known, 2]
+    return wrong
