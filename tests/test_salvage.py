@@ -167,6 +167,23 @@ def recover(tmp_path):
     return run
 
 
+def chunks_of(records):
+    return [record for record in records if record.opcode == CHUNK]
+
+
+def unfinished(data, records):
+    """The bytes before the end of the data."""
+    return data[: next(r.start for r in records if r.opcode == DATA_END)]
+
+
+def flipped(data, *places, mask=1):
+    """The bytes with some bits of each of these places changed."""
+    damaged = bytearray(data)
+    for place in places:
+        damaged[place] ^= mask
+    return bytes(damaged)
+
+
 def messages_of(records, without=-1):
     """Messages of the chunks that do not contain a certain byte."""
     kept = [r for r in records if not r.start <= without < r.end]
@@ -193,11 +210,9 @@ def test_of_a_log_cut_anywhere_every_chunk_is_saved(log, recover, seed):
 
 def outcome(data, records, place, mask, recover):
     """Change one byte; assert that what is not lost is saved, and what is lost is counted."""
-    damaged = bytearray(data)
-    damaged[place] ^= mask
-    result = recover(bytes(damaged))
+    result = recover(flipped(data, place, mask=mask))
     everything, others = messages_of(records), messages_of(records, without=place)
-    chunks = [r for r in records if r.opcode == CHUNK]
+    chunks = chunks_of(records)
     first, last = chunks[0], chunks[-1]
     finished = len(data) >= records[-1].end
     if first.start <= place < first.end and not finished:
@@ -217,7 +232,7 @@ def test_with_any_byte_changed_every_other_chunk_is_saved_and_the_lost_messages_
 ):
     data, records = log
     if not finished:
-        data = data[: next(r.start for r in records if r.opcode == DATA_END)]
+        data = unfinished(data, records)
     rng = random.Random(seed)
     for _ in range(8):
         outcome(data, records, rng.randrange(len(data)), rng.randrange(1, 256), recover)
@@ -229,18 +244,16 @@ def test_no_byte_of_a_log_is_so_dear_that_its_change_takes_other_chunks_along(
 ):
     data, records = small
     if not finished:
-        data = data[: next(r.start for r in records if r.opcode == DATA_END)]
+        data = unfinished(data, records)
     for place in range(0, len(data), step):
         outcome(data, records, place, 1 << place % 8, recover)
 
 
 def test_a_wrong_head_of_a_chunk_loses_nothing(log, recover):
     data, records = log
-    chunk = [r for r in records if r.opcode == CHUNK][4]
+    chunk = chunks_of(records)[4]
     for place in [0, *range(1, 9), *range(9, 25)]:  # opcode, length, times
-        damaged = bytearray(data)
-        damaged[chunk.start + place] ^= 0x21
-        result = recover(bytes(damaged))
+        result = recover(flipped(data, chunk.start + place, mask=0x21))
         assert result.messages == messages_of(records), place
         assert [d.start for d in result.recovery.damages] == [chunk.start]
         assert result.recovery.lossless
@@ -270,13 +283,12 @@ def test_pages_that_are_lost_take_no_other_chunk_with_them(log, recover, seed, k
 
 def test_what_was_lost_is_said_with_its_place_its_times_and_its_topics(log, recover):
     data, records = log
-    chunk = [r for r in records if r.opcode == CHUNK][3]
-    damaged = bytearray(data)
-    damaged[chunk.end - 100] ^= 1
+    chunk = chunks_of(records)[3]
+    damaged = flipped(data, chunk.end - 100)
     times = [m[1] for m in chunk.messages]
     topics = [m[0] for m in chunk.messages]
-    for end in (len(data), next(r.start for r in records if r.opcode == DATA_END)):
-        (damage,) = recover(bytes(damaged[:end])).recovery.damages
+    for left in (damaged, unfinished(damaged, records)):
+        (damage,) = recover(left).recovery.damages
         assert (damage.start, damage.end) == (chunk.start, chunk.end)
         assert damage.times == (min(times), max(times))
         assert damage.messages == {topic: topics.count(topic) for topic in topics}
@@ -289,7 +301,7 @@ def test_what_was_lost_is_said_with_its_place_its_times_and_its_topics(log, reco
 
 def cut_out(data, records, number, *, indexes):
     """Leave out a chunk, with or without its message indexes; return also what was in it."""
-    chunk = [r for r in records if r.opcode == CHUNK][number]
+    chunk = chunks_of(records)[number]
     end = chunk.end
     for record in records:
         if indexes and record.start == end and record.opcode == INDEX:
@@ -314,19 +326,18 @@ def test_a_chunk_that_is_cut_out_is_missed_by_the_index(log, recover, number, in
 
 def test_chunks_that_are_cut_out_are_missed_by_what_is_left_of_an_index(log, recover):
     data, records = log
-    unfinished = data[: next(r.start for r in records if r.opcode == DATA_END)]
     uncounted = data[: [r for r in records if r.opcode == METADATA][-1].start]
     left, chunk = cut_out(uncounted, records, 3, indexes=False)
     (damage,) = recover(left).recovery.damages  # the message indexes list its messages
     assert sum(damage.messages.values()) == len(chunk.messages)
-    left, chunk = cut_out(unfinished, records, 3, indexes=True)
+    left, chunk = cut_out(unfinished(data, records), records, 3, indexes=True)
     (damage,) = recover(left).recovery.damages  # the record for rosbag2 counts them
     assert sum(damage.messages.values()) == len(chunk.messages)
 
 
 def test_chunks_that_stand_elsewhere_or_twice_are_no_loss(log, recover):
     data, records = log
-    first, second, third = [r for r in records if r.opcode == CHUNK][1:4]
+    first, second, third = chunks_of(records)[1:4]
     swapped = data[: first.start] + data[second.start : third.start]
     swapped += data[first.start : second.start] + data[third.start :]
     result = recover(swapped)
@@ -340,7 +351,7 @@ def test_chunks_that_stand_elsewhere_or_twice_are_no_loss(log, recover):
 
 def test_frames_behind_the_end_are_saved_and_said_to_be_out_of_place(log, recover):
     data, records = log
-    moved = [r for r in records if r.opcode == CHUNK][4]
+    moved = chunks_of(records)[4]
     result = recover(data[: moved.start] + data[moved.end :] + data[moved.start : moved.end])
     assert sorted(result.messages) == sorted(messages_of(records))
     assert all(damage.lossless for damage in result.recovery.damages)
@@ -375,23 +386,18 @@ def test_messages_without_an_index_behind_their_chunk_are_lost_in_unknown_number
         (a, b) for a, b in pairwise(records) if a.opcode == CHUNK and a.start > 50_000
     )
     assert behind.opcode == INDEX
-    damaged = bytearray(data[: next(r.start for r in records if r.opcode == DATA_END)])
-    damaged[chunk.end - 100] ^= 1
-    damaged[behind.start] ^= 0x80
-    result = recover(bytes(damaged))
+    damaged = flipped(flipped(data, chunk.end - 100), behind.start, mask=0x80)
+    result = recover(unfinished(damaged, records))
     assert not result.exact
-    assert "perhaps more" in str(result.recovery.damages[0]) or "unknown number" in str(
-        result.recovery.damages[0]
-    )
+    text = str(result.recovery.damages[0])
+    assert "perhaps more" in text or "unknown number" in text
 
 
 @pytest.mark.parametrize("left", range(1, 10))
 def test_a_damaged_chunk_of_a_file_cut_in_the_head_of_the_next_record(log, recover, left):
     data, records = log
-    chunk, behind = [record for record in records if record.opcode == CHUNK][1:3]
-    damaged = bytearray(data[: behind.start + left])
-    damaged[chunk.end - 100] ^= 1
-    result = recover(bytes(damaged))
+    chunk, behind = chunks_of(records)[1:3]
+    result = recover(flipped(data[: behind.start + left], chunk.end - 100))
     assert result.messages == messages_of(records[: records.index(chunk)])
     assert result.some_lost
 
@@ -399,21 +405,18 @@ def test_a_damaged_chunk_of_a_file_cut_in_the_head_of_the_next_record(log, recov
 @pytest.mark.parametrize("left", [9, 26, 30])
 def test_a_chunk_of_which_only_a_few_bytes_are_left_is_missed(log, recover, left):
     data, records = log
-    chunks = [record for record in records if record.opcode == CHUNK]
+    chunks = chunks_of(records)
     gone = chunks[len(chunks) // 2]
     behind = next(record.start for record in chunks if record.start > gone.start)
-    end = next(record.start for record in records if record.opcode == DATA_END)
-    recovery, _ = recover(data[: gone.start + left] + data[behind:end])
+    recovery, _ = recover(data[: gone.start + left] + unfinished(data, records)[behind:])
     # What is left may claim to end within the chunk behind, whose bytes are damaged then, too.
     assert {damage.exact for damage in recovery.damages if not damage.cut} == {False}
 
 
 def test_messages_whose_channel_nothing_defines_are_counted(log, recover):
     data, records = log
-    chunks = [r for r in records if r.opcode == CHUNK]
-    damaged = bytearray(data[: next(r.start for r in records if r.opcode == DATA_END)])
-    damaged[chunks[0].end - 50] ^= 1
-    result = recover(bytes(damaged))
+    damaged = flipped(data, chunks_of(records)[0].end - 50)
+    result = recover(unfinished(damaged, records))
     assert result.messages == []
     assert result.lost == len(messages_of(records))
     assert any("nothing that is left says what channel" in str(d) for d in result.recovery.damages)
@@ -431,28 +434,25 @@ def test_definitions_that_come_too_late_are_used_all_the_same(recover):
     for number in range(3, 6):
         writer.add_message(second, number, bytes(40), number)
     writer.finish()
-    data = bytearray(stream.getvalue())
-    records = structure(bytes(data))
-    defining = next(r for r in records if r.opcode == CHUNK)
-    data[defining.end - 1] ^= 1
-    data[-20] ^= 1  # the checksum of the index is wrong now
-    result = recover(bytes(data))
+    data = stream.getvalue()
+    records = structure(data)
+    defining = chunks_of(records)[0]
+    result = recover(flipped(data, defining.end - 1, -20))  # -20: of the checksum of the index
     assert result.messages == messages_of(records, without=defining.start)
 
 
 def test_a_file_whose_header_is_lost_is_still_of_ros_2(small, recover, tmp_path):
     data, records = small
-    damaged = bytearray(data)
-    damaged[10] ^= 0xFF
-    for end in (len(data), next(r.start for r in records if r.opcode == DATA_END)):
-        assert recover(bytes(damaged[:end])).messages == messages_of(records)
+    damaged = flipped(data, 10, mask=0xFF)
+    for left in (damaged, unfinished(damaged, records)):
+        assert recover(left).messages == messages_of(records)
         with (tmp_path / "copy.mcap").open("rb") as stream:
             assert make_reader(stream).get_header().profile == "ros2"
 
 
 def test_a_log_of_which_the_beginning_is_missing(log, recover):
     data, records = log
-    chunk = [r for r in records if r.opcode == CHUNK][3]
+    chunk = chunks_of(records)[3]
     result = recover(data[chunk.start + 11 :])
     assert result.messages == messages_of([r for r in records if r.start > chunk.start])
 
@@ -476,10 +476,8 @@ def test_an_attachment_is_saved_only_if_it_has_its_checksum(small, recover, tmp_
     writer.add_attachment(1, 1, "inner", "application/mcap", small[0])
     writer.add_attachment(1, 1, "third", "text/plain", b"three" * 99)
     writer.finish()
-    data = bytearray(stream.getvalue())
-    data[data.index(b"one") + 7] ^= 1
-    data[data.index(small[0]) + 40] ^= 1
-    result = recover(bytes(data))
+    data = stream.getvalue()
+    result = recover(flipped(data, data.index(b"one") + 7, data.index(small[0]) + 40))
     assert result.messages == []  # those of the file that was attached are not ours
     assert [damage.others for damage in result.recovery.damages] == [
         ("the attachment 'first'",),
@@ -534,9 +532,7 @@ def test_files_of_other_writers_are_recovered_in_the_same_way(recover, form):
         result = recover(data[:place])
         expected = messages_of([r for r in records if r.end <= place])
         assert (result.messages if result else []) == expected, place
-        damaged = bytearray(data)
-        damaged[place] ^= 1 << rng.randrange(8)
-        result = recover(bytes(damaged))
+        result = recover(flipped(data, place, mask=1 << rng.randrange(8)))
         kept = messages_of(records, without=place)
         assert result.messages in (kept, everything), place
         assert len(result.messages) == len(everything) or result.some_lost, place
@@ -561,9 +557,8 @@ def test_messages_outside_of_chunks_are_saved_up_to_a_wrong_length_and_from_ther
     rng = random.Random(0)
     for _ in range(60):
         number = rng.randrange(len(records))
-        damaged = bytearray(data)
-        damaged[records[number].start + rng.randrange(9)] ^= 1 << rng.randrange(8)
-        result = recover(bytes(damaged))
+        place = records[number].start + rng.randrange(9)
+        result = recover(flipped(data, place, mask=1 << rng.randrange(8)))
         others = everything[: max(number - 1, 0)] + everything[number + 1 :]
         assert [m for m in result.messages if m in others] == others, number
         assert set(result.messages) <= set(everything), number
@@ -745,9 +740,8 @@ def test_the_command_writes_a_log_beside_the_damaged_one_and_says_what_is_lost(
     log, hearthlog, tmp_path
 ):
     data, records = log
-    lost = [r for r in records if r.opcode == CHUNK][2]
-    damaged = bytearray(data)
-    damaged[lost.end - 9] ^= 1
+    lost = chunks_of(records)[2]
+    damaged = flipped(data, lost.end - 9)
     path = tmp_path / "a.mcap"
     path.write_bytes(damaged)
     result = hearthlog("recover", path)
@@ -768,7 +762,7 @@ def test_the_command_writes_a_log_beside_the_damaged_one_and_says_what_is_lost(
 
 def test_the_command_prints_json(log, hearthlog, tmp_path):
     data, records = log
-    cut = [r for r in records if r.opcode == CHUNK][5].start + 1000
+    cut = chunks_of(records)[5].start + 1000
     path = tmp_path / "a.mcap.active"
     path.write_bytes(data[:cut])
     result = hearthlog("recover", path, "--json", "-o", tmp_path / "b.mcap")
@@ -787,7 +781,7 @@ def test_the_command_prints_json(log, hearthlog, tmp_path):
 def test_a_log_that_only_lacks_its_end_loses_nothing(log, hearthlog, tmp_path):
     data, records = log
     path = tmp_path / "a.mcap"
-    path.write_bytes(data[: next(r.start for r in records if r.opcode == DATA_END) + 40])
+    path.write_bytes(data[: len(unfinished(data, records)) + 40])
     result = hearthlog("recover", path, "--in-place")
     assert (result.returncode, result.stdout) == (0, f"{path}\n")
     assert "the log had no end" in result.stderr

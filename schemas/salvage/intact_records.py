@@ -4,6 +4,7 @@ import struct
 import zlib
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -97,8 +98,8 @@ class LargeChunk(NamedTuple):
     unopened: str = ""  # reason why the content was not read
 
 
-class LargeAttachment(NamedTuple):
-    """Attachment that is too large to read."""
+class IntactAttachment(NamedTuple):
+    """Attachment of any size, with its index entry."""
 
     index_record: records.AttachmentIndex
     data: tuple[int, int]  # start and end offset of the content in the file
@@ -113,13 +114,6 @@ class UnknownRecord(NamedTuple):
     data: tuple[int, int]  # start and end offset of the record in the file
 
 
-class IntactAttachment(NamedTuple):
-    """Attachment of a file, with its index entry."""
-
-    record: bytes
-    index_record: records.AttachmentIndex
-
-
 class IntactRecord(NamedTuple):
     """Complete record."""
 
@@ -131,7 +125,7 @@ class IntactRecord(NamedTuple):
     proved: bool = True  # False: there is no checksum, so its content may be wrong
 
 
-Whole = IntactChunk | LargeChunk | IntactAttachment | LargeAttachment | UnknownRecord
+Whole = IntactChunk | LargeChunk | IntactAttachment | UnknownRecord
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:
@@ -176,12 +170,7 @@ def without_late(chunk: IntactChunk, content: bytes, messages: Int64) -> IntactC
     times = gather_heads(content, messages)["log_time"].astype(np.uint64)
     starts = messages[times > LAST_TIME]
     late = index_messages(content, starts)
-    parts, place = [], 0
-    for start in starts.tolist():
-        parts.append(content[place:start])
-        place = start + HEAD.size + HEAD.unpack_from(content, start)[1]
-    content = b"".join([*parts, content[place:]])
-    stored = _stored(content)
+    stored, _ = _with_records(content, starts, repeat(b""))
     counts = {channel: len(rows) // INDEX_ENTRIES.itemsize for channel, rows in late.items()}
     return chunk._replace(stored=stored, late=counts)
 
@@ -196,18 +185,22 @@ def with_definitions(
     starts : np.ndarray [shape=(d,)], int64
         Offsets of the definitions in the content, at their opcodes.
     """
+    stored, content = _with_records(content, starts, map(encode, chunk.definitions))
+    return chunk._replace(stored=stored), content
+
+
+def _with_records(
+    content: bytes, starts: Int64, replaced: Iterable[bytes]
+) -> tuple[StoredChunk, bytes]:
+    """Replace the records at offsets of a chunk, and compress the content."""
     parts, place = [], 0
-    for start, record in zip(starts.tolist(), chunk.definitions, strict=True):
-        parts += [content[place:start], encode(record)]
+    for start, record in zip(starts.tolist(), replaced, strict=False):
+        parts += [content[place:start], record]
         place = start + HEAD.size + HEAD.unpack_from(content, start)[1]
     content = b"".join([*parts, content[place:]])
-    return chunk._replace(stored=_stored(content)), content
-
-
-def _stored(content: bytes) -> StoredChunk:
-    """Compress rewritten records to a chunk."""
     entries = index_messages(content, split_content(content)[0])
-    return compress_chunk(memoryview(content), span_of(entries), entries)._replace(raw=None)
+    chunk = compress_chunk(memoryview(content), span_of(entries), entries)
+    return chunk._replace(raw=None), content
 
 
 def read_definitions(content: bytes, starts: Int64) -> tuple[list[Definition], list[str]]:
@@ -292,22 +285,7 @@ class AttachmentHead(NamedTuple):
         return self.first + self.index_record.data_size
 
 
-def read_attachment(raw: bytes) -> tuple[IntactAttachment, bool]:
-    """Parse an attachment record; also return whether a text in it is not UTF-8.
-
-    Raise `McapError` if its checksum is wrong.
-    """
-    record = memoryview(raw)
-    (crc,) = UINT32.unpack(record[-UINT32.size :])
-    if crc not in {0, zlib.crc32(record[HEAD.size : -UINT32.size])}:
-        raise McapError("an attachment has another checksum than it claims")
-    head = attachment_head(raw)
-    if head.escaped:
-        raw = b"".join(encode_attachment(head.index_record, [record[head.first : head.end]]))
-    return IntactAttachment(raw, head.index_record), head.escaped
-
-
-def attachment_head(raw: bytes) -> AttachmentHead:
+def attachment_head(raw: bytes | memoryview) -> AttachmentHead:
     """Read the fields of an attachment before its data.
 
     Raise `McapError` if the record ends within them.

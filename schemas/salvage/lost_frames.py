@@ -16,7 +16,7 @@ from hearthlog.schemas.logs.writer import ENCODING, SCHEMA_ENCODING
 from hearthlog.schemas.mcap.raw_messages import RawMessages, gather_heads
 from hearthlog.schemas.mcap.records import INDEX_ENTRIES, MESSAGE, MESSAGE_FIXED, Definitions
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.fields import lacking
+from hearthlog.schemas.messages.fields import missing_fields
 from hearthlog.schemas.messages.message_types import GAP, definition, type_hash
 from hearthlog.schemas.messages.topics import LIVE, Quality, parse_topic, topic
 from hearthlog.schemas.messages.type_definitions import message_type
@@ -64,7 +64,9 @@ def read_marks(
         if schema is None or topic is None or topic.labelling != LIVE:
             continue
         fields = _FIELDS.get((topic.kind, schema.name))
-        if fields is None or not _defines(schema, fields):
+        if fields is None:
+            continue
+        if missing_fields(schema.name, schema.encoding, schema.data, frozenset(fields)):
             continue
         content = content or _content(piece)  # contents without such channels are not read
         rows = places[:_MOST] if topic.kind in {_GAP, _INFO} else places[[0, -1]]
@@ -72,13 +74,6 @@ def read_marks(
         raw = RawMessages(channel, schema, buffer, rows + MESSAGE.size, heads)
         marks.setdefault(topic.microphone, []).extend(_decode(raw, topic.kind, fields, rows))
     return {microphone: sorted(same) for microphone, same in marks.items()}
-
-
-def _defines(schema: Schema, fields: Sequence[str]) -> bool:
-    try:
-        return not lacking(message_type(schema.name, schema.encoding, schema.data), fields)
-    except LogError:
-        return False
 
 
 def _places(piece: IntactChunk | Message) -> Iterator[tuple[int, Int64]]:

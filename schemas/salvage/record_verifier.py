@@ -6,11 +6,8 @@ add up to their length or to less: the format allows trailing fields.
 
 import struct
 import zlib
-from array import array
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from contextlib import suppress
-from typing import NamedTuple
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -21,7 +18,6 @@ from numpy.typing import NDArray
 from hearthlog.schemas.files import LocalFile
 from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.compressed_chunk import (
-    LATEST,
     ContentStream,
     StoredChunk,
     TooLargeError,
@@ -55,7 +51,6 @@ from hearthlog.schemas.salvage.intact_records import (
     IntactAttachment,
     IntactChunk,
     IntactRecord,
-    LargeAttachment,
     LargeChunk,
 )
 
@@ -207,13 +202,10 @@ class RecordVerifier:
         outer, inner = self.ends(offset)
         end = outer if self._is_padded(inner, outer) else inner
         wrong = "" if end == outer else "the length of a record"
-        if opcode == Opcode.ATTACHMENT and inner == outer and inner - offset > LIMIT:
-            if outer > self.end or not self.plausible(outer):
-                raise McapError("a record claims to be longer than the file")
-            large = self._large_attachment(offset, outer)
-            escaped = (large.index_record.name,) * large.escaped
-            return IntactRecord(offset, outer, large, escaped=escaped)
-        if inner - offset > LARGEST[opcode]:
+        is_large = opcode == Opcode.ATTACHMENT and inner == outer and inner - offset > LIMIT
+        if is_large and (outer > self.end or not self.plausible(outer)):
+            raise McapError("a record claims to be longer than the file")
+        if inner - offset > LARGEST[opcode] and not is_large:
             raise McapError("a record claims to be too large")
         if inner > self.end:
             raise McapError("a record claims to be longer than the file")
@@ -221,17 +213,15 @@ class RecordVerifier:
             raise McapError("a record has another length than it claims")
         if opcode == Opcode.MESSAGE_INDEX:  # the writer builds a new one
             return IntactRecord(offset, end, None, wrong)
-        raw = self.read(offset, inner - offset)
-        if inner != outer:
-            raw = HEAD.pack(opcode, inner - offset - HEAD.size) + raw[HEAD.size :]
         record: McapRecord | IntactAttachment | None
         if opcode == Opcode.ATTACHMENT:
-            record, is_escaped = intact_records.read_attachment(raw)
-            name = record.index_record.name
+            record = self._attachment(offset, inner)
+            name, is_escaped = record.index_record.name, record.escaped
         else:
-            record, is_escaped = parse_escaped(opcode, raw[HEAD.size :])
+            content = self.read(offset, inner - offset)[HEAD.size :]
+            record, is_escaped = parse_escaped(opcode, content)
             name = intact_records.name_of(record)
-        if is_escaped and strict:
+        if is_escaped and strict and not is_large:
             raise McapError("a text is not UTF-8")
         return IntactRecord(offset, end, record, wrong, escaped=(name,) * is_escaped)
 
@@ -360,14 +350,21 @@ class RecordVerifier:
         stored = StoredChunk(b"", b"", end - offset, self._crc(offset, end), time, time, entries)
         return LargeChunk(stored, (offset, end), [], 0, Counter({channel: 1}))
 
-    def _large_attachment(self, offset: int, end: int) -> LargeAttachment:
-        """Check an attachment that is too large to read."""
-        head = intact_records.attachment_head(self.read(offset, _ATTACHMENT_HEAD))
-        (crc,) = UINT32.unpack(self.read(end - UINT32.size, UINT32.size))
-        if crc not in {0, self._crc(offset + HEAD.size, end - UINT32.size)}:
+    def _attachment(self, offset: int, end: int) -> IntactAttachment:
+        """Check an attachment, of any size."""
+        size = end - offset
+        raw = memoryview(self.read(offset, size if size <= LIMIT else _ATTACHMENT_HEAD))
+        last = end - UINT32.size
+        if len(raw) == size:
+            crc, checksum = raw[-UINT32.size :], zlib.crc32(raw[HEAD.size : -UINT32.size])
+        else:
+            checksum = self._crc(offset + HEAD.size, last)
+            crc = memoryview(self.read(last, UINT32.size))
+        if UINT32.unpack(crc)[0] not in {0, checksum}:
             raise McapError("an attachment has another checksum than it claims")
+        head = intact_records.attachment_head(raw)
         inner = offset + head.first, offset + head.end
-        return LargeAttachment(head.index_record, (offset, end), inner, head.escaped)
+        return IntactAttachment(head.index_record, (offset, end), inner, head.escaped)
 
     def _crc(self, start: int, end: int) -> int:
         """Return the checksum of a byte range of the file."""
@@ -469,90 +466,3 @@ class RecordVerifier:
             raise McapError("a message index is damaged")
         rows = np.frombuffer(entries, INDEX_ENTRIES)
         return channel, rows[rows["time"].astype(np.uint64) <= LAST_TIME], outer
-
-
-_NO_TIMES = (LATEST, 0)
-_KEPT = 1000  # claims
-_INDEXES = 1 << 16  # per chunk: the maximum number of channels
-
-
-class Claim(NamedTuple):
-    """Messages that message indexes list but no chunk holds."""
-
-    start: int  # offset behind which they are missing
-    messages: Counter[int]  # by channel
-    times: tuple[int, int]  # first and last log time
-
-
-class IndexClaims:
-    """Comparison of the message indexes of each chunk with its messages."""
-
-    def __init__(self) -> None:
-        self._claims: list[Claim] = []
-        self._spans = array("q")  # first and last log times of all chunks
-        self._own: dict[int, NDArray[np.void]] | None = {}  # expected entries of the chunk
-        self._listed: Counter[int] = Counter()  # entries by channel
-        self._others: set[tuple[int, int]] = set()  # indexes that do not belong to the chunk
-        self._times = _NO_TIMES
-        self._start = 0
-
-    def add_chunk(self, end: int, chunk: StoredChunk) -> None:
-        """Start with a chunk.
-
-        Parameters
-        ----------
-        end : int
-            Offset of the end of the chunk.
-        """
-        self._spans.extend([chunk.start, chunk.end])
-        self._begin(end)
-        rows = chunk.entries.items()
-        self._own = {channel: np.frombuffer(same, INDEX_ENTRIES) for channel, same in rows}
-
-    def add_index(self, channel: int, entries: NDArray[np.void]) -> None:
-        """Add the next message index.
-
-        Parameters
-        ----------
-        entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
-        """
-        if self._own is None or not len(entries):
-            return
-        own = self._own.get(channel)
-        if own is not None and len(own) == len(entries) and (own == entries).all():
-            self._listed[channel] = max(self._listed[channel], len(entries))
-            return
-        key = channel, zlib.crc32(entries.tobytes())
-        if key not in self._others and len(self._others) < _INDEXES:
-            self._others.add(key)
-            self._listed[channel] += len(entries)
-            first, last = int(entries["time"].min()), int(entries["time"].max())
-            self._times = min(self._times[0], first), max(self._times[1], last)
-
-    def close(self, end: int) -> None:
-        """Finish the indexes of a chunk at the offset of the next record."""
-        if self._own is not None and self._others and len(self._claims) < _KEPT:
-            own = Counter({channel: len(same) for channel, same in self._own.items()})
-            if self._listed.total() > own.total():
-                self._claims.append(Claim(self._start, self._listed - own, self._times))
-        self._begin(end)
-
-    def give_up(self) -> None:
-        """Ignore the following indexes: the damage of the chunk before them is reported already."""
-        self._begin(0)
-        self._own = None
-
-    def _begin(self, start: int) -> None:
-        self._start, self._own, self._listed = start, {}, Counter()
-        self._others, self._times = set(), _NO_TIMES
-
-    def unmet(self) -> Iterator[Claim]:
-        """List the claims with times that no chunk of the file covers."""
-        spans = np.frombuffer(self._spans, np.int64).reshape(-1, 2)
-        spans = spans[np.argsort(spans[:, 0], kind="stable")]
-        ends = np.maximum.accumulate(spans[:, 1])
-        for claim in self._claims:
-            middle = sum(claim.times) // 2
-            before = int(np.searchsorted(spans[:, 0], middle, side="right"))
-            if not before or ends[before - 1] < middle:
-                yield claim

@@ -7,9 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.records import Channel, Header, Message
 
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -32,7 +33,7 @@ from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.chunks import in_parts, read_in_batches
 from hearthlog.schemas.mcap.compressed_chunk import most_content
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import LIMIT, MAGIC, Definition, not_mcap
+from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, Definition, not_mcap
 from hearthlog.schemas.messages.message_types import EMBEDDING, LOG_DAMAGED, encode_gap
 from hearthlog.schemas.messages.topics import LIVE, is_scenario, parse_topic
 from hearthlog.schemas.new_files import (
@@ -47,7 +48,6 @@ from hearthlog.schemas.salvage.damage import Damage
 from hearthlog.schemas.salvage.intact_records import (
     IntactAttachment,
     IntactChunk,
-    LargeAttachment,
     LargeChunk,
     UnknownRecord,
     chunk_messages,
@@ -97,15 +97,27 @@ class Recovery:
         return losses
 
 
-class TopicFilter(Protocol):
-    """Selection of the topics that a copy omits."""
+_REST = "all but labels, segments and gaps"
+STEPS = ("", "statistics", "statistics and features", _REST)  # dropped message kinds of each step
+_SOUND = {"statistics", "features", "embedding"}
+_DROPPED = (set[str](), {"statistics"}, _SOUND, _SOUND)
+_KEPT = {"info", "label", "segment", "gap"}
 
-    @property
-    def note(self) -> Mapping[str, str]:
-        """Additional entries of the `hearthlog` record of the copy."""
+
+class Thinning(NamedTuple):
+    """Step of thinning."""
+
+    step: int
+    note: Mapping[str, str]
 
     def drops(self, topic: str) -> bool:
-        """Return whether the messages of a topic are omitted."""
+        """Return whether the messages of a topic are dropped."""
+        parts = parse_topic(topic)
+        if STEPS[self.step] == _REST:
+            if parts is None or parts.kind not in _KEPT:
+                return True
+            return parts.labelling != LIVE and not is_scenario(parts.labelling)
+        return parts is not None and parts.kind in _DROPPED[self.step]
 
 
 class SalvagedCopy:
@@ -124,7 +136,7 @@ class SalvagedCopy:
         salvage: Salvage,
         profile: str,
         chunk_span: int = 0,
-        selection: TopicFilter | None = None,
+        selection: Thinning | None = None,
     ) -> None:
         self.pieces = 0
         self._salvage = salvage
@@ -220,7 +232,7 @@ class SalvagedCopy:
             self._add_large(piece)
         elif isinstance(piece, UnknownRecord):
             self._writer.copy_record(self._salvage.stored(*piece.data))
-        elif isinstance(piece, IntactAttachment | LargeAttachment):
+        elif isinstance(piece, IntactAttachment):
             self._writer.copy_attachment(self._record_of(piece), piece.index_record)
         elif piece.name == HEARTHLOG_METADATA and self._selection is not None:
             self._writer.add_metadata(piece.name, {**piece.metadata, **self._selection.note})
@@ -251,12 +263,14 @@ class SalvagedCopy:
             times = chunk.times(number)
             self._count(number, len(times), int(times.min()), int(times.max()))
 
-    def _record_of(self, piece: IntactAttachment | LargeAttachment) -> Iterable[bytes | memoryview]:
-        if isinstance(piece, IntactAttachment):
-            return [piece.record]
+    def _record_of(self, piece: IntactAttachment) -> Iterator[bytes | memoryview]:
+        stored = self._salvage.stored
         if piece.escaped:
-            return encode_attachment(piece.index_record, self._salvage.stored(*piece.inner))
-        return self._salvage.stored(*piece.data)
+            yield from encode_attachment(piece.index_record, stored(*piece.inner))
+            return
+        start, end = piece.data
+        yield HEAD.pack(Opcode.ATTACHMENT, end - start - HEAD.size)  # the one there may be wrong
+        yield from stored(start + HEAD.size, end)
 
     def _add_large(self, piece: LargeChunk) -> None:
         """Copy an unopened chunk."""
@@ -414,15 +428,13 @@ def recover_log(
         profile = attempt.profile()
     recovery = attempt.recovery()
     if not attempt.pieces and (recovery.damages or not recovery.complete):
+        what = "holds nothing that could be saved"
         if not salvage.is_mcap:
             with source.open("rb") as stream:
                 what = not_mcap(stream.read(2 * len(MAGIC)))
-            if what != not_mcap(b""):
-                raise NothingIntactError(f"{source}: {what}")
-            raise NothingIntactError(
-                f"{source}: is not an MCAP file, and holds no whole piece of one"
-            )
-        raise NothingIntactError(f"{source}: holds nothing that could be saved")
+            if what == not_mcap(b""):
+                what += ", and holds no whole piece of one"
+        raise NothingIntactError(f"{source}: {what}")
     check_copy(copy, recovery.topics)
     return recovery
 
@@ -527,27 +539,6 @@ def _is_at(stream: BinaryIO, path: Path) -> bool:
 
 
 _CHUNK_SPAN = 10 * NANOSECONDS
-_REST = "all but labels, segments and gaps"
-STEPS = ("", "statistics", "statistics and features", _REST)  # dropped message kinds of each step
-_SOUND = {"statistics", "features", "embedding"}
-_DROPPED = (set[str](), {"statistics"}, _SOUND, _SOUND)
-_KEPT = {"info", "label", "segment", "gap"}
-
-
-class Thinning(NamedTuple):
-    """Step of thinning."""
-
-    step: int
-    note: Mapping[str, str]
-
-    def drops(self, topic: str) -> bool:
-        """Return whether the messages of a topic are dropped."""
-        parts = parse_topic(topic)
-        if STEPS[self.step] == _REST:
-            if parts is None or parts.kind not in _KEPT:
-                return True
-            return parts.labelling != LIVE and not is_scenario(parts.labelling)
-        return parts is not None and parts.kind in _DROPPED[self.step]
 
 
 def dropped_kinds(text: str | None) -> set[str]:

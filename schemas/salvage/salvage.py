@@ -24,27 +24,20 @@ from hearthlog.schemas.files import LocalFile
 from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.raw_messages import CHUNK_HEAD_LIMIT, find_chunk_heads
 from hearthlog.schemas.mcap.records import LIMIT, MAGIC, MESSAGE, Definition, Definitions
-from hearthlog.schemas.salvage.damage import (
-    Damage,
-    DamagedRange,
-    DamageList,
-    MetRecords,
-    loss_in,
-    read_index,
-)
+from hearthlog.schemas.salvage.damage import Damage, DamageList, loss_in
+from hearthlog.schemas.salvage.index import MessageIndexes, read_index
 from hearthlog.schemas.salvage.intact_records import (
     SHORTEST,
     IntactAttachment,
     IntactChunk,
     IntactRecord,
-    LargeAttachment,
     LargeChunk,
     UnknownRecord,
     Whole,
     chunk_messages,
     find_record_heads,
 )
-from hearthlog.schemas.salvage.record_verifier import IndexClaims, RecordVerifier
+from hearthlog.schemas.salvage.record_verifier import RecordVerifier
 
 _VAIN = 8
 _KEPT_LIMIT = 128 << 20  # maximum bytes of definitions, names and indexes kept in memory
@@ -100,16 +93,14 @@ class Salvage:
         start = self._reader.read(0, len(MAGIC))
         self.is_mcap = bool(start) and MAGIC.startswith(start)
         self._index = read_index(RecordVerifier(self._file, self.size), _KEPT_LIMIT)
-        self._met: MetRecords | None = None
         self.complete = self._index is not None and not self._index.moved
         self.expected = None if self._index is None else self._index.messages
         if self._index is not None:
-            self._met = MetRecords(self._index)
             self._reader.end = self._index.start
             definitions = [*self._index.definitions, *definitions]
         for record in definitions:
             self.definitions.add(record)
-        self._claims = IndexClaims()
+        self._message_indexes = MessageIndexes(self._reader)
         self._next: IntactRecord | None = None  # found by the last search
         self._places = _Places(-1, [], [])  # of the last searched window
         self._vain = self._kept = 0
@@ -145,11 +136,10 @@ class Salvage:
             one.
         """
         yield from self._walk()
-        if self._met is not None:
-            self._damages.add_unmet(self._met.unmet(), self._met.unmet_names())
+        if self._index is not None:
+            self._damages.add_unmet(self._index.unmet(), self._index.unmet_names())
         else:
-            self._claims.close(self.offset)
-            self._damages.add_claims(self._claims.unmet())
+            self._damages.add_listed(self._message_indexes.unmet(self.offset))
 
     def _walk(self) -> Iterator[Piece]:
         self.offset = len(MAGIC) if self.is_mcap else 0
@@ -168,22 +158,9 @@ class Salvage:
             self.escaped.update(dict.fromkeys(whole.escaped))
             self.offset = whole.end
             self._last_index = offset if whole.record is None else None
-            self._compare_index(whole)
+            (self._index or self._message_indexes).meet(whole)
             yield from self._take(whole)
             del whole  # frees memory before the next record, which may be as large
-
-    def _compare_index(self, whole: IntactRecord) -> None:
-        """Compare message indexes with the chunk before them, if there is no other index."""
-        if self._index is not None:
-            return
-        if whole.record is None:
-            with suppress(McapError):
-                channel, entries, _ = self._reader.message_index(whole.offset)
-                self._claims.add_index(channel, entries)
-            return
-        self._claims.close(whole.offset)
-        if isinstance(whole.record, IntactChunk | LargeChunk):
-            self._claims.add_chunk(whole.end, whole.record.stored)
 
     def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> IntactRecord:
         """Read the record at an offset; raise McapError if there is no complete one."""
@@ -214,7 +191,7 @@ class Salvage:
             size += sum(_size(definition) for definition in record.definitions)
         elif isinstance(record, Definition):
             size += _size(record)
-        elif isinstance(record, IntactAttachment | LargeAttachment):
+        elif isinstance(record, IntactAttachment):
             size += len(record.index_record.name) + len(record.index_record.media_type)
         elif isinstance(record, records.Metadata):
             size += len(record.name)
@@ -253,8 +230,7 @@ class Salvage:
     def _pass(self, offset: int, why: str) -> int:
         """Record a damage at an offset; return the offset of the next complete record."""
         reader, cost = self._reader, self._cost
-        self._claims.close(offset)
-        self._claims.give_up()
+        self._message_indexes.give_up(offset)
         if (chunk := self._chunk_in_last_index(offset)) is not None:
             return chunk
         opcode = reader.read(offset, 1)[0]
@@ -285,7 +261,7 @@ class Salvage:
         if self._ended:  # part of the index
             self._damages.add(Damage(offset, end, why, cut=cut))
         else:
-            lost = loss_in(reader, DamagedRange(offset, end, opcode, ends), self._index)
+            lost = loss_in(reader, offset, end, ends, self._index)
             self._damages.add(Damage(offset, end, why, {}, *lost[1:], cut), lost.messages)
         return end
 
@@ -339,8 +315,6 @@ class Salvage:
     def _take(self, whole: IntactRecord) -> Iterator[Piece]:
         """Register the contents of a record; yield it if it belongs into the new log."""
         record = whole.record
-        if self._met is not None:
-            self._met.meet(whole)
         if isinstance(record, records.Header):
             self.header = self.header or record
             self._ended = False
@@ -359,7 +333,7 @@ class Salvage:
         elif isinstance(record, records.Message):
             self._ended = False
             yield from self._take_message(record, whole)
-        elif isinstance(record, records.Metadata | IntactAttachment | LargeAttachment) or (
+        elif isinstance(record, records.Metadata | IntactAttachment) or (
             isinstance(record, UnknownRecord) and not self._ended
         ):
             yield record

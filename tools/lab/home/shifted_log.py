@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata
+from mcap.records import Channel, Metadata
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
@@ -17,7 +16,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.writer import ENCODING, PROFILE, CountedWriter
 from hearthlog.schemas.mcap.compressed_chunk import StoredChunk, compress_chunk
 from hearthlog.schemas.mcap.raw_messages import gather_heads
-from hearthlog.schemas.mcap.records import HEAD, INDEX_ENTRIES, MESSAGE_FIXED, MESSAGE_HEAD, parse
+from hearthlog.schemas.mcap.records import HEAD, INDEX_ENTRIES, MESSAGE_FIXED, MESSAGE_HEAD
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import rows_by_layout
 from hearthlog.schemas.messages.topics import is_review, parse_topic
@@ -123,6 +122,8 @@ class ShiftedLog:
     def __init__(self, path: Path) -> None:
         with Salvage(path) as salvage:
             self._pieces = list(salvage.pieces())
+            attachments = [each for each in self._pieces if isinstance(each, IntactAttachment)]
+            self._attached = [b"".join(salvage.stored(*each.inner)) for each in attachments]
             self._complete = salvage.complete
             self._definitions = salvage.definitions
             header = salvage.header
@@ -179,6 +180,7 @@ class ShiftedLog:
             writer = CountedWriter(stream, self._definitions)
             writer.start(self._profile, self._library)
             defined: set[tuple[type, int]] = set()
+            attached = iter(self._attached)
             for piece in self._pieces:
                 if isinstance(piece, IntactChunk):
                     self._define(writer, piece, defined)
@@ -186,7 +188,7 @@ class ShiftedLog:
                 elif isinstance(piece, Metadata):
                     writer.add_metadata(piece.name, edit(piece, fewer))
                 elif isinstance(piece, IntactAttachment):
-                    _copy_attachment(writer, piece, time)
+                    _copy_attachment(writer, piece, next(attached), time)
             if self._complete:
                 definitions = self._definitions
                 writer.define(
@@ -345,8 +347,9 @@ def _spans(nanoseconds: Int64) -> NDArray[Any]:
     return spans
 
 
-def _copy_attachment(writer: CountedWriter, piece: IntactAttachment, time: int) -> None:
-    record = parse(Opcode.ATTACHMENT, piece.record[HEAD.size :])
-    assert isinstance(record, Attachment)
-    created, logged = (each + time if each else 0 for each in (record.create_time, record.log_time))
-    writer.add_attachment(created, logged, record.name, record.media_type, record.data)
+def _copy_attachment(
+    writer: CountedWriter, piece: IntactAttachment, data: bytes, time: int
+) -> None:
+    index = piece.index_record
+    created, logged = (each + time if each else 0 for each in (index.create_time, index.log_time))
+    writer.add_attachment(created, logged, index.name, index.media_type, data)
