@@ -102,7 +102,7 @@ class IntactAttachment(NamedTuple):
     """Attachment of any size, with its index entry."""
 
     index_record: records.AttachmentIndex
-    data: tuple[int, int]  # start and end offset of the content in the file
+    data: tuple[int, int]  # start and end offset of the record in the file
     inner: tuple[int, int]  # start and end offset of the attached data in the file
     escaped: bool  # whether a text before the data is not UTF-8
 

@@ -352,15 +352,14 @@ class RecordVerifier:
 
     def _attachment(self, offset: int, end: int) -> IntactAttachment:
         """Check an attachment, of any size."""
-        size = end - offset
-        raw = memoryview(self.read(offset, size if size <= LIMIT else _ATTACHMENT_HEAD))
-        last = end - UINT32.size
-        if len(raw) == size:
-            crc, checksum = raw[-UINT32.size :], zlib.crc32(raw[HEAD.size : -UINT32.size])
-        else:
-            checksum = self._crc(offset + HEAD.size, last)
-            crc = memoryview(self.read(last, UINT32.size))
-        if UINT32.unpack(crc)[0] not in {0, checksum}:
+        is_large = end - offset > LIMIT
+        raw = memoryview(self.read(offset, _ATTACHMENT_HEAD if is_large else end - offset))
+        first, last = offset + HEAD.size, end - UINT32.size
+        (crc,) = UINT32.unpack(self.read(last, UINT32.size))
+        checksum = (
+            self._crc(first, last) if is_large else zlib.crc32(raw[HEAD.size : last - offset])
+        )
+        if crc not in {0, checksum}:
             raise McapError("an attachment has another checksum than it claims")
         head = intact_records.attachment_head(raw)
         inner = offset + head.first, offset + head.end
