@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import tzinfo
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, Protocol
@@ -155,13 +156,33 @@ class ReviewSession:
     @property
     def keys(self) -> list[tuple[str, str]]:
         """Each key and its action."""
-        queued = bool(self.items)
-        keys = [("a", "accept the label") if queued else ("c", "correct as labelled")]
-        keys += [(_RIGHT, "or Enter: all else in the span is right")]
-        keys += [(key, _words(label)) for key, label in self._labels.items()]
-        keys += [("d", "delete marks"), ("z", "undo"), ("p", "play"), ("[", "from"), ("]", "to")]
-        keys += [("n", "skip"), ("b", "back")] if queued else [("f", "frames near the cursor")]
-        return [*keys, ("q", "quit")]
+        return [*((key, text) for key, (text, _) in self._actions().items()), ("q", "quit")]
+
+    def _actions(self) -> dict[str, tuple[str, Callable[[], None]]]:
+        """Text and function of each key."""
+        actions: dict[str, tuple[str, Callable[[], None]]] = {}
+        if self.items:
+            actions["a"] = "accept the label", self._accept
+        else:
+            actions["c"] = "correct as labelled", lambda: self._mark(self.marking.confirm)
+        actions[_RIGHT] = "or Enter: all else in the span is right", self._rest_is_right
+        classes = [name for name in self.classes if name != UNKNOWN]
+        labels = dict(zip(_CLASS_KEYS, classes, strict=False)) | {"u": UNKNOWN}
+        for key, label in labels.items():
+            actions[key] = _words(label), partial(self._mark_as, label)
+        actions |= {
+            "d": ("delete marks", lambda: self._mark(self.marking.delete)),
+            "z": ("undo", self._undo),
+            "p": ("play", self._play),
+            "[": ("from", self._begin_here),
+            "]": ("to", self._end_here),
+        }
+        if self.items:
+            return actions | {
+                "n": ("skip", lambda: self._go(1)),
+                "b": ("back", lambda: self._go(-1)),
+            }
+        return actions | {"f": ("frames near the cursor", self._look_around)}
 
     def run(self, keys: "SimpleQueue[str]") -> int:
         """Process keys until the reviewer quits or closes the viewer, or the last item is done.
@@ -201,36 +222,12 @@ class ReviewSession:
             self.say("the viewer did not answer, and nothing was done; press the key again")
 
     def _press(self, key: str) -> None:
-        actions: dict[str, Callable[[], None]] = {
-            "d": lambda: self._mark(self.marking.delete),
-            "z": self._undo,
-            "p": self._play,
-            _RIGHT: self._rest_is_right,
-            "\n": self._rest_is_right,
-            "[": self._begin_here,
-            "]": self._end_here,
-        }
-        if self.items:
-            actions |= {
-                "a": self._accept,
-                "n": lambda: self._go(1),
-                " ": lambda: self._go(1),
-                "b": lambda: self._go(-1),
-            }
-        else:
-            actions |= {"c": lambda: self._mark(self.marking.confirm), "f": self._look_around}
-        if key in self._labels:
-            self._mark_as(self._labels[key])
-        elif key in actions:
-            actions[key]()
+        actions = self._actions()
+        same = {"\n": _RIGHT, " ": "n"}.get(key, key)
+        if same in actions:
+            actions[same][1]()
         elif key.strip():
             self.say(f"{key!r} is no key; {', '.join(f'{k} {text}' for k, text in self.keys)}")
-
-    @property
-    def _labels(self) -> dict[str, str]:
-        """Label of each class key."""
-        classes = [name for name in self.classes if name != UNKNOWN]
-        return dict(zip(_CLASS_KEYS, classes, strict=False)) | {"u": UNKNOWN}
 
     def _mark_as(self, label: str) -> None:
         chosen = "" if self._in_minute or not self.items else self.items[self._at].chosen
