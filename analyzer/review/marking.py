@@ -28,7 +28,7 @@ class _Change:
     log: Path
     span: MarkedSpan
     before: list[Mark]
-    reviewed: list[ReviewedSpan]  # added by the change
+    reviewed: list[ReviewedSpan] = field(default_factory=list)  # added by the change
     not_reviewed: list[ReviewedSpan] = field(default_factory=list)  # removed by the change
 
 
@@ -83,8 +83,7 @@ class Marking:
         now = time.time_ns()
         changes = [self._change(*piece, now, chosen) for piece in self._pieces(start, end)]
         for change in changes:
-            write_marks(change.log, [], reviewed=change.reviewed, scenario=self.scenario)
-            self._read_layer(change.log)
+            self._change_layer(change.log, [], [], change.reviewed)
         self._done.append(changes)
 
     def confirm(self, start: int, end: int) -> list[Mark]:
@@ -155,7 +154,8 @@ class Marking:
             return None
         changes = self._done[-1]
         for change in changes:
-            self._change_layer(change, change.before, change.not_reviewed, change.reviewed)
+            kept, added = change.not_reviewed, change.reviewed
+            self._change_layer(change.log, change.before, [change.span], kept, added)
         self._done.pop()
         return changes[0].span.start, changes[-1].span.end
 
@@ -218,29 +218,24 @@ class Marking:
         changes = [self._change(*piece, now, chosen, deleted=deleted) for piece in pieces]
         for (_, first, last), change in zip(pieces, changes, strict=True):
             own = [mark for mark in made if first <= mark.start < last]
-            instead_of = MarkedSpan(self.microphone, first, last)
-            self._change_layer(change, own, change.reviewed, change.not_reviewed, instead_of)
+            span = MarkedSpan(self.microphone, first, last)
+            self._change_layer(change.log, own, [span], change.reviewed, change.not_reviewed)
         self._done.append(changes)
         return made
 
     def _change_layer(
         self,
-        change: _Change,
+        log: Path,
         marks: Sequence[Mark],
+        instead_of: Sequence[MarkedSpan],
         reviewed: Sequence[ReviewedSpan],
-        not_reviewed: Sequence[ReviewedSpan],
-        instead_of: MarkedSpan | None = None,
+        not_reviewed: Sequence[ReviewedSpan] = (),
     ) -> None:
-        span = instead_of or change.span
+        scenario = self.scenario
         write_marks(
-            change.log,
-            marks,
-            [span],
-            reviewed=reviewed,
-            not_reviewed=not_reviewed,
-            scenario=self.scenario,
+            log, marks, instead_of, reviewed=reviewed, not_reviewed=not_reviewed, scenario=scenario
         )
-        self._read_layer(change.log)
+        self._read_layer(log)
 
     def _change(  # noqa: PLR0913
         self, log: Path, start: int, end: int, now: int, chosen: str, *, deleted: bool = False
@@ -254,17 +249,16 @@ class Marking:
         first = min([start, *(mark.start for mark in touched)])
         last = max([end, *(mark.end for mark in touched)])
         span = MarkedSpan(self.microphone, first, last)
-        change = _Change(log, span, touched, self._looked_at(start, end, now, chosen))
+        change = _Change(log, span, touched)
+        if chosen:
+            origin = self.reviewer, now, self.corrects, chosen
+            change.reviewed.append(ReviewedSpan(self.microphone, start, end, *origin))
         if deleted:
             for one in read_reviewed(log, self.scenario):
                 if one.microphone == self.microphone and one.start < end and one.end > start:
                     change.not_reviewed.append(one)
                     change.reviewed += _outside(one, start, end)
         return change
-
-    def _looked_at(self, start: int, end: int, now: int, chosen: str) -> list[ReviewedSpan]:
-        origin = self.reviewer, now, self.corrects, chosen
-        return [ReviewedSpan(self.microphone, start, end, *origin)] if chosen else []
 
 
 def _spans(rows: Sequence[tuple[int, int, str]]) -> LabelledSpans:
