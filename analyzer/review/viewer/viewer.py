@@ -1,8 +1,10 @@
 """Timeline viewer, in a window or under another control, with mouse selections."""
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, Self
+from functools import cached_property
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import rerun as rr
@@ -49,63 +51,7 @@ class ViewerState(NamedTuple):
     cursor: int | None
 
 
-class ViewerControl(Protocol):
-    """Control of one kind of viewer; all methods may raise ConnectionError or TimeoutError."""
-
-    process: ViewerProcess
-
-    def state(self) -> ViewerState:
-        """Return the state of the viewer."""
-
-    def blueprint(self) -> Blueprint:
-        """Return the blueprint of the viewer, which holds the user's selection."""
-
-    def set_blueprint(self, blueprint: Blueprint) -> None:
-        """Replace the blueprint of the viewer.
-
-        Parameters
-        ----------
-        blueprint : dict of str to object
-            JSON-serializable, as returned by `blueprint`.
-        """
-
-    def set_time(self, axis: str, nanoseconds: int, *, play: bool) -> None:
-        """Set the time cursor of the viewer.
-
-        Parameters
-        ----------
-        axis : str
-            Name of the clock of the home.
-        nanoseconds : int
-            Time on that clock.
-        play : bool
-            Whether the cursor runs from there on.
-        """
-
-    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Show buttons, if there is a page.
-
-        Parameters
-        ----------
-        keys : sequence of (str, str)
-            Key and text of each button.
-        press : callable
-            Called with the key of the pressed button.
-        """
-
-    def say(self, text: str) -> None:
-        """Show a line, if there is a page.
-
-        Parameters
-        ----------
-        text : str
-        """
-
-    def close(self) -> None:
-        """Stop the viewer."""
-
-
-class Viewer:
+class Viewer(ABC):
     """A viewer in a window or in a browser.
 
     Parameters
@@ -114,9 +60,9 @@ class Viewer:
         URL of its page; empty if it opens itself.
     """
 
-    def __init__(self, control: ViewerControl, address: str = "") -> None:
+    def __init__(self, process: ViewerProcess, address: str = "") -> None:
         self.address = address
-        self._control = control
+        self._process = process
         self._recording = rr.RecordingStream(APPLICATION)
         self._canvas = Canvas(self._recording, HomeClock("", 0))
         self._reviewed: dict[tuple[str, str], DrawnLane] = {}
@@ -124,21 +70,52 @@ class Viewer:
         self._close = NONE  # spans of the close-ups
         self._sent = False
 
+    @abstractmethod
+    def state(self) -> ViewerState:
+        """Return the state of the viewer.
+
+        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
+        """
+
+    @abstractmethod
+    def _blueprint(self) -> Blueprint:
+        """Return the blueprint of the viewer, which holds the user's selection."""
+
+    @abstractmethod
+    def _set_blueprint(self, blueprint: Blueprint) -> None:
+        """Replace the blueprint of the viewer."""
+
+    @abstractmethod
+    def _set_time(self, nanoseconds: int, *, play: bool) -> None:
+        """Set the time cursor, in nanoseconds of the clock of the home, and let it run."""
+
+    def offer(  # noqa: B027 - in a window, the keys are typed in the terminal
+        self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]
+    ) -> None:
+        """Show buttons in the page of the viewer, if it has one."""
+
+    def say(self, text: str) -> None:  # noqa: B027 - lines are printed in the terminal, too
+        """Show a line in the page of the viewer, if it has one."""
+
+    def close(self) -> None:
+        """Stop the viewer."""
+        self._process.close()
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._sent and self.is_open():
             self._recording.disconnect()
-        self._control.close()
+        self.close()
 
     def is_open(self) -> bool:
         """Return whether the viewer runs; its user may have closed it."""
-        return self._control.process.is_running()
+        return self._process.is_running()
 
     def check(self) -> None:
         """Raise DataError if the viewer ended with an error."""
-        self._control.process.check()
+        self._process.check()
 
     def draw(self, timeline: Timeline, *, close_up: bool) -> None:
         """Show a timeline.
@@ -146,12 +123,11 @@ class Viewer:
         Raise `DataError` if the viewer has ended, does not take data within a minute, or the
         timeline's time zone is unknown.
         """
-        process = self._control.process
-        process.wait_until_it_listens()
+        self._process.wait_until_it_listens()
         rr.set_strict_mode(True)
         self._sent = True
         layout = review_layout(timeline, marking=True, close_up=close_up)
-        self._recording.connect_grpc(process.url, default_blueprint=layout)
+        self._recording.connect_grpc(self._process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
         self._canvas = Canvas(self._recording, timeline.clock)
         self._reviewed = draw(timeline, self._canvas)
@@ -228,7 +204,7 @@ class Viewer:
                 state = self.state()
             except (ConnectionError, TimeoutError):
                 if not self.is_open():
-                    raise self._control.process.failed() from None
+                    raise self._process.failed() from None
                 time.sleep(0.05)
                 continue
             check_version(state.version)
@@ -236,13 +212,6 @@ class Viewer:
                 return state
             time.sleep(0.05)
         raise DataError("Rerun's viewer does not show anything; use --save FILE.rrd")
-
-    def state(self) -> ViewerState:
-        """Return the state of the viewer.
-
-        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
-        """
-        return self._control.state()
 
     def selection(self) -> tuple[int, int] | None:
         """Return the span selected on the time ruler.
@@ -257,7 +226,7 @@ class Viewer:
         ConnectionError, TimeoutError
             If the viewer does not answer.
         """
-        panel = self._control.blueprint().get(_PANEL, {}).get("TimePanelBlueprint", {})
+        panel = self._blueprint().get(_PANEL, {}).get("TimePanelBlueprint", {})
         span = _span(panel.get("time_selection"))
         return span and (self._clock.utc(span[0]), self._clock.utc(span[1]))
 
@@ -283,29 +252,21 @@ class Viewer:
             If the viewer does not answer.
         """
         start, end = self._clock.shown(start), self._clock.shown(end)
-        blueprint = self._control.blueprint()
+        blueprint = self._blueprint()
         panel = blueprint.setdefault(_PANEL, {}).setdefault("TimePanelBlueprint", {})
         panel["time_selection"] = {"min": start, "max": end}
         panel["play_state"] = "Paused"
         bounds = {"start": {"Absolute": start - margin}, "end": {"Absolute": end + margin}}
         blueprint[f"/{SHARED_AXIS}"] = {"TimeAxis": {"view_range": bounds}}
-        self._control.set_blueprint(blueprint)
-        self._control.set_time(self._clock.name, start, play=False)
+        self._set_blueprint(blueprint)
+        self._set_time(start, play=False)
 
     def play(self, start: int) -> None:
         """Start the cursor running from a time.
 
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
-        self._control.set_time(self._clock.name, self._clock.shown(start), play=True)
-
-    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Show buttons in the page of the viewer, if it has one."""
-        self._control.offer(keys, press)
-
-    def say(self, text: str) -> None:
-        """Show a line in the page of the viewer, if it has one."""
-        self._control.say(text)
+        self._set_time(self._clock.shown(start), play=True)
 
     @property
     def _clock(self) -> HomeClock:
@@ -348,21 +309,16 @@ def _span(selection: Any) -> tuple[int, int] | None:
 _MEMORY = "800MB"  # of a viewer with days of incoming data; then it drops the oldest
 
 
-class _WindowControl:
-    """Controls a viewer over gRPC with Rerun's own client."""
+class WindowViewer(Viewer):
+    """A viewer in its own window, controlled over gRPC with Rerun's own client."""
 
-    def __init__(self, process: ViewerProcess) -> None:
-        self.process = process
-        self._client: ViewerClient | None = None
-
-    @property
-    def client(self) -> ViewerClient:
-        if self._client is None:
-            self._client = ViewerClient.connect(self.process.url)
-        return self._client
+    @cached_property
+    def _client(self) -> ViewerClient:
+        return ViewerClient.connect(self._process.url)
 
     def state(self) -> ViewerState:
-        state = self.client.get_state()
+        """Return the state of the viewer."""
+        state = self._client.get_state()
         errors = [
             f"{view.name}: {report.summary}" for view in state.views for report in view.reports
         ]
@@ -374,42 +330,25 @@ class _WindowControl:
         cursor = cursors[0] if cursors else None
         return ViewerState(state.viewer_version or "", len(state.views), errors, cursor)
 
-    def blueprint(self) -> Blueprint:
-        return self.client.get_blueprint().blueprint
-
-    def set_blueprint(self, blueprint: Blueprint) -> None:
-        self.client.set_blueprint(blueprint, of="recording")
-
-    def set_time(self, axis: str, nanoseconds: int, *, play: bool) -> None:
-        self.client.set_time(
-            axis,
-            timestamp=np.datetime64(nanoseconds, "ns"),
-            play_state="playing" if play else "paused",
-        )
-
-    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
-        """Ignore buttons: the keys are typed in the terminal."""
-
-    def say(self, text: str) -> None:
-        """Ignore lines: they are printed in the terminal."""
-
-    def close(self) -> None:
-        self.process.close()
-
-
-class WindowViewer(Viewer):
-    """A viewer in its own window."""
-
-    def __init__(self, process: ViewerProcess) -> None:
-        self._window = _WindowControl(process)
-        super().__init__(self._window)
-
     def picture(self) -> bytes:
         """Return a picture of the window as PNG.
 
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
-        return self._window.client.take_screenshot()
+        return self._client.take_screenshot()
+
+    def _blueprint(self) -> Blueprint:
+        return self._client.get_blueprint().blueprint
+
+    def _set_blueprint(self, blueprint: Blueprint) -> None:
+        self._client.set_blueprint(blueprint, of="recording")
+
+    def _set_time(self, nanoseconds: int, *, play: bool) -> None:
+        self._client.set_time(
+            self._clock.name,
+            timestamp=np.datetime64(nanoseconds, "ns"),
+            play_state="playing" if play else "paused",
+        )
 
 
 def open_window(port: int | None = None, data: str | None = None) -> WindowViewer:

@@ -30,70 +30,6 @@ _ON_RECORDING = 3  # in `set_blueprint`
 Value = int | bytes
 
 
-def get_state() -> bytes:
-    """Encode the request for the viewer's state."""
-    return _field(_STATE, b"")
-
-
-def get_blueprint() -> bytes:
-    """Encode the request for the blueprint, which holds the user's selection."""
-    return _field(_BLUEPRINT, b"")
-
-
-def set_blueprint(blueprint: str) -> bytes:
-    """Encode the request to replace the blueprint."""
-    return _field(_SET_BLUEPRINT, _field(2, blueprint.encode()) + _field(_ON_RECORDING, b""))
-
-
-def set_time(axis: str, nanoseconds: int, *, play: bool) -> bytes:
-    """Encode the request to set the cursor."""
-    timeline = _field(2, _field(1, axis.encode()))
-    time = _field(3, _field(1, nanoseconds))
-    return _field(_SET_TIME, timeline + time + _field(5, _PLAYING if play else _PAUSED))
-
-
-def read_blueprint(answer: bytes) -> str:
-    """Extract the JSON of a blueprint.
-
-    Returns
-    -------
-    str
-        Empty if the answer has none.
-
-    Raises
-    ------
-    ValueError
-        If the answer is no protobuf message.
-    """
-    return _text(_message(answer, _BLUEPRINT), 2)
-
-
-def read_state(answer: bytes) -> tuple[str, list[list[str]], int | None]:
-    """Decode the state of a viewer.
-
-    Returns
-    -------
-    version : str
-        Of the viewer; empty if the answer has none.
-    cursor : int or None
-        In nanoseconds of the time axis; None without a cursor.
-
-    Raises
-    ------
-    ValueError
-        If the answer is no protobuf message.
-    """
-    state = _message(answer, _STATE)
-    reports = [
-        [f"{_text(view, 3)}: {_text(report, 2)}" for report in _messages(view, 6)]
-        for view in _messages(state, 5)
-    ]
-    active = _text(state, 2)
-    shown = [one for one in _messages(state, 3) if _text(one, 1) == active]
-    cursor = _last(_message(_message(shown[0], 3), 3), 1) if shown else None
-    return _text(state, 6), reports, cursor if isinstance(cursor, int) else None
-
-
 def _field(number: int, value: Value) -> bytes:
     if isinstance(value, int):
         return _varint(number << 3 | _VARINT) + _varint(value)
@@ -147,10 +83,8 @@ def _read_varint(content: bytes, place: int) -> tuple[int, int]:
     raise ValueError("a number is too long")
 
 
-def _last(content: bytes, field: int) -> Value | None:
-    """Return the last, effective value of a field; None if there is none."""
-    values = [value for number, value in _fields(content) if number == field]
-    return values[-1] if values else None
+def _numbers(content: bytes, field: int) -> list[int]:
+    return [v for number, v in _fields(content) if number == field and isinstance(v, int)]
 
 
 def _messages(content: bytes, field: int) -> list[bytes]:
@@ -158,8 +92,8 @@ def _messages(content: bytes, field: int) -> list[bytes]:
 
 
 def _message(content: bytes, field: int) -> bytes:
-    value = _last(content, field)
-    return value if isinstance(value, bytes) else b""
+    """Return the last, effective value of a field; empty if there is none."""
+    return (_messages(content, field) or [b""])[-1]
 
 
 def _text(content: bytes, field: int) -> str:
@@ -352,29 +286,23 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
 
-class _WebControl:
-    """Controls a viewer through its page."""
+class _PageViewer(Viewer):
+    """A viewer in a page, whose process serves the data and the files of the viewer."""
 
     def __init__(self, process: ViewerProcess, server: _Server) -> None:
-        self.process = process  # serves the data and the files of the viewer
+        super().__init__(process, server.url)
         self._relay = server.relay
         self._server = server
         threading.Thread(target=server.serve_forever, daemon=True).start()
 
     def state(self) -> ViewerState:
-        version, reports, cursor = read_state(self._relay.ask(get_state()))
-        return ViewerState(version, len(reports), [text for one in reports for text in one], cursor)
-
-    def blueprint(self) -> Blueprint:
-        text = read_blueprint(self._relay.ask(get_blueprint()))
-        blueprint: Any = json.loads(text)
-        return blueprint if isinstance(blueprint, dict) else {}
-
-    def set_blueprint(self, blueprint: Blueprint) -> None:
-        self._relay.ask(set_blueprint(json.dumps(blueprint)))
-
-    def set_time(self, axis: str, nanoseconds: int, *, play: bool) -> None:
-        self._relay.ask(set_time(axis, nanoseconds, play=play))
+        state = self._ask(_STATE)
+        views, active = _messages(state, 5), _text(state, 2)
+        reports = [(_text(view, 3), each) for view in views for each in _messages(view, 6)]
+        errors = [f"{view}: {_text(report, 2)}" for view, report in reports]
+        shown = [one for one in _messages(state, 3) if _text(one, 1) == active]
+        cursors = _numbers(_message(_message(shown[0], 3), 3), 1) if shown else []
+        return ViewerState(_text(state, 6), len(views), errors, cursors[-1] if cursors else None)
 
     def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
         self._relay.keys, self._relay.press = keys, press
@@ -385,7 +313,25 @@ class _WebControl:
     def close(self) -> None:
         self._server.shutdown()
         self._server.server_close()
-        self.process.close()
+        super().close()
+
+    def _blueprint(self) -> Blueprint:
+        blueprint: Any = json.loads(_text(self._ask(_BLUEPRINT), 2))
+        return blueprint if isinstance(blueprint, dict) else {}
+
+    def _set_blueprint(self, blueprint: Blueprint) -> None:
+        text = json.dumps(blueprint).encode()
+        self._ask(_SET_BLUEPRINT, _field(2, text) + _field(_ON_RECORDING, b""))
+
+    def _set_time(self, nanoseconds: int, *, play: bool) -> None:
+        timeline = _field(2, _field(1, self._clock.name.encode()))
+        time = _field(3, _field(1, nanoseconds))
+        state = _field(5, _PLAYING if play else _PAUSED)
+        self._ask(_SET_TIME, timeline + time + state)
+
+    def _ask(self, operation: int, request: bytes = b"") -> bytes:
+        """Let the viewer in the page do an operation; return its answer."""
+        return _message(self._relay.ask(_field(operation, request)), operation)
 
 
 def open_page(port: int | None = None, data: str | None = None) -> Viewer:
@@ -396,5 +342,4 @@ def open_page(port: int | None = None, data: str | None = None) -> Viewer:
     page, viewer_files = free_port(port), free_port()
     process = ViewerProcess(["--serve-web", "--web-viewer-port", str(viewer_files)])
     files_url = f"http://{process.address}:{viewer_files}"
-    server = _Server(page, Relay(), files_url, data or process.url)
-    return Viewer(_WebControl(process, server), server.url)
+    return _PageViewer(process, _Server(page, Relay(), files_url, data or process.url))
