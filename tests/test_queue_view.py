@@ -10,6 +10,7 @@ from viewers import patiently, pixels
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.review.lanes import SHARES
 from hearthlog.analyzer.review.timeline import SoundClip
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.viewer import open_hidden
@@ -71,7 +72,8 @@ def is_asked(picture, start, end):
 
 def share_of_right_columns(picture, timeline, start, end):
     """In how many columns most of the bands has the colour of the most probable class."""
-    names, values = timeline.microphones["mic"].labellings[0].probabilities
+    shares = timeline.microphones["mic"].plots[SHARES, "live"]
+    names, values = shares.names, shares.values
     first, last = start - MARGIN, end + MARGIN
     words = picture.shape[1] // 6 + 2
     left = words + int(np.argmax((pixels_of_bands(picture, names) > 40).any(axis=1)[words:][:80]))

@@ -31,15 +31,20 @@ from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review import timeline_reader as reading
 from hearthlog.analyzer.review.lanes import (
+    FEATURES,
+    FLOOR,
+    LEVEL,
+    NOVELTY,
+    SHARES,
     class_precision,
     disagreements,
     reviewed_lane,
     timeline_lanes,
     timeline_plots,
+    worded,
 )
 from hearthlog.analyzer.review.timeline import (
     GridMeans,
-    GridSeries,
     LabelledSpans,
     LabellingTimeline,
     LogLines,
@@ -48,9 +53,8 @@ from hearthlog.analyzer.review.timeline import (
     TimelineGrid,
     home_clock,
     no_spans,
-    worded,
 )
-from hearthlog.analyzer.review.timeline_reader import SHARES, read_timeline
+from hearthlog.analyzer.review.timeline_reader import MOST_SHARES, read_timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import DrawnLane
 from hearthlog.analyzer.review.viewer.recording import save_timeline
@@ -117,6 +121,21 @@ def as_list(spans):
     return list(zip(spans.starts.tolist(), spans.ends.tolist(), spans.texts, strict=True))
 
 
+def plot(timeline, kind, labelling=""):
+    return timeline.microphones["mic"].plots[kind, labelling]
+
+
+def line(timeline, kind, labelling=""):
+    """The only column of a plot."""
+    return plot(timeline, kind, labelling).values[:, 0]
+
+
+def frames_of(timeline, kind, labelling=""):
+    """Times and values of single frames."""
+    parts = timeline.microphones["mic"].frames[kind, labelling]
+    return (np.concatenate([getattr(part, name) for part in parts]) for name in ("times", "values"))
+
+
 def slow_means(grid, times, values):
     """Means share by share; NaN where there is nothing."""
     parts = [values[(times >= a) & (times < b)] for a, b in pairwise(grid.edges.tolist())]
@@ -131,7 +150,7 @@ def test_the_timeline_begins_with_the_first_frame_and_ends_with_the_last(timelin
     _, stamps, _ = features(folder)
     assert timeline.grid.start == stamps[0]
     assert 1 <= (timeline.grid.end - stamps[-1]) / FRAME_NANOSECONDS <= 2
-    assert 1000 < timeline.grid.count <= SHARES
+    assert 1000 < timeline.grid.count <= MOST_SHARES
     assert timeline.losses == []
     assert timeline.every == 1
     assert list(timeline.microphones) == ["mic"]
@@ -139,44 +158,44 @@ def test_the_timeline_begins_with_the_first_frame_and_ends_with_the_last(timelin
 
 def test_features_and_level_are_means_of_what_is_logged_and_nothing_in_gaps(timeline, folder):
     _, stamps, values = features(folder)
-    microphone = timeline.microphones["mic"]
     expected = slow_means(timeline.grid, stamps, values)
-    assert microphone.features.names == tuple(read(folder, "info")[0].feature_names)
-    np.testing.assert_allclose(microphone.features.values, expected, rtol=1e-12)
+    features_ = plot(timeline, FEATURES)
+    assert features_.names == tuple(read(folder, "info")[0].feature_names)
+    np.testing.assert_allclose(features_.values, expected, rtol=1e-12)
     level = 10 * np.log10(np.maximum(expected[:, 0], 1e-10))
-    np.testing.assert_allclose(microphone.level, level, rtol=1e-12)
+    found = line(timeline, LEVEL)
+    np.testing.assert_allclose(found, level, rtol=1e-12)
     (lost,) = [span for span in spans_of(folder, "gap", "reason") if span[1] - span[0] > SECOND]
     edges = timeline.grid.edges
     inside = (edges[:-1] > lost[0]) & (edges[1:] < lost[1])
     assert inside.sum() > 100
-    assert np.isnan(microphone.level[inside]).all()
-    assert np.isnan(microphone.level).mean() < inside.mean() + 0.05
+    assert np.isnan(found[inside]).all()
+    assert np.isnan(found).mean() < inside.mean() + 0.05
 
 
 def test_probabilities_and_novelty_are_means_of_what_is_logged(timeline, folder, model_file):
     labels = read(folder, "label")
-    live = timeline.microphones["mic"].labellings[0]
-    assert live.name == "live"
-    assert live.probabilities.names == load_model(model_file).classes
+    assert timeline.microphones["mic"].labellings[0].name == "live"
+    shares = plot(timeline, SHARES, "live")
+    assert shares.names == load_model(model_file).classes
     values = np.array([m.probabilities for m in labels])
     expected = slow_means(timeline.grid, stamps_of(labels), values)
-    np.testing.assert_allclose(live.probabilities.values, expected, rtol=1e-9)
+    np.testing.assert_allclose(shares.values, expected, rtol=1e-9)
     novelty = np.array([[m.novelty] for m in labels])
     expected = slow_means(timeline.grid, stamps_of(labels), novelty)
-    np.testing.assert_allclose(live.novelty, expected[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(line(timeline, NOVELTY, "live"), expected[:, 0], rtol=1e-6)
 
 
 def test_every_frame_is_there_for_zooming_in(timeline, folder):
     labels = read(folder, "label")
-    microphone = timeline.microphones["mic"]
-    frames = microphone.labellings[0].frames
-    assert np.concatenate([part.times for part in frames]).tolist() == stamps_of(labels).tolist()
-    values = np.concatenate([part.values for part in frames])
+    times, values = frames_of(timeline, SHARES, "live")
+    assert times.tolist() == stamps_of(labels).tolist()
     np.testing.assert_array_equal(values, np.array([m.probabilities for m in labels], np.float32))
     _, stamps, values = features(folder)
-    assert np.concatenate([p.times for p in microphone.level_frames]).tolist() == stamps.tolist()
-    levels = np.concatenate([part.values for part in microphone.level_frames])[:, 0]
-    np.testing.assert_allclose(levels, 10 * np.log10(np.maximum(values[:, 0], 1e-10)), rtol=1e-5)
+    times, levels = frames_of(timeline, LEVEL)
+    assert times.tolist() == stamps.tolist()
+    expected = 10 * np.log10(np.maximum(values[:, 0], 1e-10))
+    np.testing.assert_allclose(levels[:, 0], expected, rtol=1e-5)
 
 
 def test_segments_gaps_and_marks_are_the_spans_of_the_log(timeline, folder):
@@ -224,7 +243,7 @@ def test_what_is_open_when_a_log_is_cut_off_is_labelled_by_its_frames(tmp_path, 
     labels = [m for m in read(cut[0], "label") if nanoseconds(m.header.stamp) >= max(written)]
     assert labels
     assert live.spans.ends[-1] == nanoseconds(labels[-1].header.stamp) + FRAME_NANOSECONDS
-    classes = live.probabilities.names
+    classes = live.classes
     for m in labels:
         stamp = nanoseconds(m.header.stamp)
         (text,) = [t for a, b, t in as_list(live.spans) if a <= stamp < b]
@@ -241,9 +260,8 @@ def test_a_span_of_time_is_cut_out_to_the_nanosecond(folder, timeline):
     ]
     assert as_list(cut) == expected
     stamps = stamps_of(read(folder, "label"))
-    frames = part.microphones["mic"].labellings[0].frames
-    found = np.concatenate([each.times for each in frames])
-    assert found.tolist() == stamps[(stamps >= start) & (stamps < end)].tolist()
+    times, _ = frames_of(part, SHARES, "live")
+    assert times.tolist() == stamps[(stamps >= start) & (stamps < end)].tolist()
     lines = timeline.lines
     inside = (lines.times >= start) & (lines.times < end)
     assert part.lines.texts.tolist() == lines.texts[inside].tolist()
@@ -253,8 +271,8 @@ def test_a_span_that_ends_with_a_log_has_labels_to_its_end(tmp_path, day, model_
     settings, hour = Settings(output=tmp_path, model=model_file), -(-START // HOUR) * HOUR
     logs = record(settings, FileSource([day], START), Flag()).logs
     timeline = read_timeline(logs, end=hour)
-    frames = timeline.microphones["mic"].labellings[0].frames
-    assert hour - FRAME_NANOSECONDS <= max(part.times[-1] for part in frames) < hour
+    times, _ = frames_of(timeline, SHARES, "live")
+    assert hour - FRAME_NANOSECONDS <= times.max() < hour
     assert list(timeline.coverage["mic"].logs) == logs[:1]
 
 
@@ -266,8 +284,8 @@ def test_a_span_in_which_there_is_nothing_is_one_line(folder):
 def test_logs_are_read_in_the_order_of_time_whatever_their_order(folder, timeline):
     back = read_timeline(find_logs(folder)[::-1])
     assert (back.grid, back.coverage) == (timeline.grid, timeline.coverage)
+    np.testing.assert_array_equal(plot(back, FEATURES).values, plot(timeline, FEATURES).values)
     one, other = back.microphones["mic"], timeline.microphones["mic"]
-    np.testing.assert_array_equal(one.features.values, other.features.values)
     for a, b in zip(one.labellings, other.labellings, strict=True):
         assert (a.name, as_list(a.spans)) == (b.name, as_list(b.spans))
 
@@ -283,15 +301,15 @@ def test_a_log_named_by_itself_comes_with_its_layers_and_no_others(folder):
 
 def test_a_log_without_a_model_shows_its_features(tmp_path, day):
     logs = record(Settings(output=tmp_path), FileSource([day], START), Flag()).logs
-    microphone = read_timeline(logs).microphones["mic"]
-    assert microphone.labellings == []
-    assert np.isfinite(microphone.level).all()
+    timeline = read_timeline(logs)
+    assert timeline.microphones["mic"].labellings == []
+    assert np.isfinite(line(timeline, LEVEL)).all()
 
 
 def test_a_log_without_features_shows_its_labels(tmp_path):
-    path = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 1000)
+    path = labels_log(tmp_path / "a.mcap", 1000)
     found = read_timeline([path]).microphones["mic"]
-    assert (found.features, found.level) == (None, None)
+    assert [kind for kind, _ in found.plots] == [SHARES]
     assert as_list(found.labellings[0].spans) == [
         (START, START + 1000 * FRAME_NANOSECONDS, "speech")
     ]
@@ -304,17 +322,17 @@ def test_logs_of_models_with_other_classes_share_a_lane_and_keep_their_columns(
     save_model(train_model(data, scenario, ignore_progress), tmp_path / "other.safetensors")
     settings = Settings(output=tmp_path / "logs", model=tmp_path / "other.safetensors")
     later = record(settings, FileSource([day], START + HOUR), Flag()).logs
-    both = read_timeline([*later, folder]).microphones["mic"].labellings[0]
+    joint = read_timeline([*later, folder])
     classes = (*load_model(model_file).classes, *scenario.classes)
-    assert both.probabilities.names == classes
-    values = both.probabilities.values
+    assert plot(joint, SHARES, "live").names == classes
+    values = plot(joint, SHARES, "live").values
     early = np.flatnonzero(~np.isnan(values[:, 0]))
     late = np.flatnonzero(~np.isnan(values[:, -1]))
     assert early.max() < late.min()
     assert np.isnan(values[early][:, -3:]).all()
     assert np.isnan(values[late][:, :-3]).all()
     expected = [span for log in (folder, *later) for span in spans_of(log, "segment", "label")]
-    found = as_list(both.spans)
+    found = as_list(joint.microphones["mic"].labellings[0].spans)
     own = as_list(timeline.microphones["mic"].labellings[0].spans)
     assert found[: len(own)] == own
     assert Counter(found) >= Counter(span for span in expected if span[2] in scenario.classes)
@@ -335,7 +353,10 @@ def test_layers_are_labellings_of_their_own(tmp_path, folder, hearthlog, model_f
         assert words in loss
 
 
-def labels_log(path, names, count, width=2, **about):
+TWO = {"probabilities": ["speech", "crying"]}
+
+
+def labels_log(path, count, names=TWO, width=2, **about):
     """A log of labels, 50 ms apart, whose first class is the most probable."""
     times = START + np.arange(count) * FRAME_NANOSECONDS
     probabilities = np.tile(np.linspace(0.9, 0.1, width, dtype=np.float32), (count, 1))
@@ -355,8 +376,8 @@ def labels_log(path, names, count, width=2, **about):
 
 
 def test_a_model_without_novelty_has_none(tmp_path):
-    path = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 10)
-    assert read_timeline([path]).microphones["mic"].labellings[0].novelty is None
+    path = labels_log(tmp_path / "a.mcap", 10)
+    assert (NOVELTY, "live") not in read_timeline([path]).microphones["mic"].plots
 
 
 @pytest.mark.parametrize(
@@ -369,7 +390,7 @@ def test_a_model_without_novelty_has_none(tmp_path):
     ],
 )
 def test_labels_that_contradict_their_names_are_a_loss_of_one_line(tmp_path, names, width, text):
-    path = labels_log(tmp_path / "a.mcap", names, 20, width)
+    path = labels_log(tmp_path / "a.mcap", 20, names, width)
     with pytest.raises(DataError, match=text) as caught:
         read_timeline([path])
     assert f"{path}: /mic/label: " in str(caught.value)
@@ -377,7 +398,7 @@ def test_labels_that_contradict_their_names_are_a_loss_of_one_line(tmp_path, nam
 
 def test_names_of_classes_that_are_markup_or_paths_are_only_names(tmp_path):
     hostile = ["../../etc/passwd", "<script>alert(1)</script>\n\x1b[31m", "$origin/**"]
-    path = labels_log(tmp_path / "a.mcap", {"probabilities": hostile}, 2000, 3)
+    path = labels_log(tmp_path / "a.mcap", 2000, {"probabilities": hostile}, 3)
     timeline = read_timeline([path])
     save_timeline(timeline, tmp_path / "a.rrd")
     strip = "/mic/lanes/live/00/1/000000"
@@ -397,7 +418,7 @@ def test_a_damaged_log_is_a_loss_and_the_others_are_shown(tmp_path, folder):
     assert any(str(own[1]) in loss for loss in timeline.losses)
     assert any("empty.mcap: is not an MCAP file" in loss for loss in timeline.losses)
     _, stamps, _ = features(own[2])
-    heard = ~np.isnan(timeline.microphones["mic"].level)
+    heard = ~np.isnan(line(timeline, LEVEL))
     assert heard[timeline.grid.find(stamps)].all()
 
 
@@ -408,7 +429,7 @@ def test_a_damaged_review_layer_is_a_loss_and_its_log_is_shown(tmp_path, folder,
     found = read_timeline([logs])
     assert len(found.losses) == 1
     assert str(layer) in found.losses[0]
-    np.testing.assert_array_equal(found.microphones["mic"].level, timeline.microphones["mic"].level)
+    np.testing.assert_array_equal(line(found, LEVEL), line(timeline, LEVEL))
 
 
 def test_of_logs_that_are_too_large_a_sample_is_read_and_said(folder, timeline, monkeypatch):
@@ -416,12 +437,11 @@ def test_of_logs_that_are_too_large_a_sample_is_read_and_said(folder, timeline, 
     monkeypatch.setattr(reading, "_WHOLE_BYTES", size // 3)
     sample = read_timeline([folder])
     assert sample.every > 1
-    one, other = sample.microphones["mic"], timeline.microphones["mic"]
-    assert one.level_frames == []
-    assert not one.labellings[0].frames
-    read_ = ~np.isnan(one.level)
+    assert not sample.microphones["mic"].frames
+    one, other = line(sample, LEVEL), line(timeline, LEVEL)
+    read_ = ~np.isnan(one)
     assert 0.1 < read_.mean() < 0.9
-    far = np.abs(one.level[read_] - other.level[read_])
+    far = np.abs(one[read_] - other[read_])
     assert np.median(far) < 1e-9
 
 
@@ -433,10 +453,10 @@ def test_the_floor_is_drawn_beside_the_level_as_the_diagnostics_tell_it(timeline
                 expected[timeline.grid.middles >= nanoseconds(one.header.stamp)] = float(pair.value)
                 told += 1
     assert told > 5
-    microphone = timeline.microphones["mic"]
-    expected[np.isnan(microphone.level)] = np.nan
-    np.testing.assert_array_equal(microphone.floor, expected)
-    assert np.nanmax(microphone.floor) < np.nanmax(microphone.level)
+    level, floor = line(timeline, LEVEL), line(timeline, FLOOR)
+    expected[np.isnan(level)] = np.nan
+    np.testing.assert_array_equal(floor, expected)
+    assert np.nanmax(floor) < np.nanmax(level)
     kinds = {plot.kind.name: plot.kind.title for plot in timeline_plots(timeline)}
     assert kinds["floor"] == kinds["level"]  # one view
 
@@ -457,7 +477,7 @@ def health(stamp, *levels):
 
 
 def test_a_trouble_lasts_until_it_is_over_or_another_one_begins(tmp_path):
-    labels = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 2000)
+    labels = labels_log(tmp_path / "a.mcap", 2000)
     said = [(0, ()), (1, (1,)), (11, (1,)), (21, (2, 0, 1)), (31, (0,)), (41, (1,))]
     rows = [health(START + second * SECOND, *levels) for second, levels in said]
     write_log(tmp_path / "b.mcap", {"/diagnostics": rows})
@@ -482,7 +502,7 @@ def sound(start, samples, rate=16_000):
 
 
 def test_kept_sound_is_chained_to_clips_that_are_heard_where_they_were(tmp_path):
-    labels = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 400)
+    labels = labels_log(tmp_path / "a.mcap", 400)
     rng = np.random.default_rng(1)
     samples = rng.integers(-9000, 9000, 32_000) / 32768
     times = [START + k * SECOND for k in (2, 3, 9)]
@@ -499,7 +519,7 @@ def test_kept_sound_is_chained_to_clips_that_are_heard_where_they_were(tmp_path)
 def test_of_more_sound_than_can_be_shown_the_first_is_shown_and_the_rest_a_loss(
     tmp_path, monkeypatch
 ):
-    labels = labels_log(tmp_path / "a.mcap", {"probabilities": ["speech", "crying"]}, 2000)
+    labels = labels_log(tmp_path / "a.mcap", 2000)
     write_log(
         audio_path(labels),
         {"/mic/audio": [sound(START + k * 10 * SECOND, np.zeros(16_000)) for k in range(5)]},
@@ -511,9 +531,7 @@ def test_of_more_sound_than_can_be_shown_the_first_is_shown_and_the_rest_a_loss(
 
 
 def test_the_time_zone_is_that_of_the_logs_unless_another_one_is_said(tmp_path):
-    path = labels_log(
-        tmp_path / "a.mcap", {"probabilities": ["speech", "no"]}, 10, timezone="Asia/Kolkata"
-    )
+    path = labels_log(tmp_path / "a.mcap", 10, timezone="Asia/Kolkata")
     assert read_timeline([path]).zone == "Asia/Kolkata"
     assert read_timeline([path], zone="Europe/Vienna").zone == "Europe/Vienna"
     with pytest.raises(DataError, match="'Nowhere' is no time zone"):
@@ -611,22 +629,18 @@ def spans_at(*rows):
 def lanes_of(*labellings, **more):
     """The lanes of a microphone, as (labelling, name, spans)."""
     nothing = dict.fromkeys(("reviewed", "gaps", "troubles"), no_spans())
-    empty = dict.fromkeys(("features", "level", "floor")) | {"level_frames": [], "clips": []}
+    empty = {"plots": {}, "frames": {}, "clips": []}
     microphone = MicrophoneTimeline("mic", list(labellings), **(nothing | empty | more))
     lines = LogLines(*(np.empty(0, kind) for kind in (np.int64, np.int64, object)))
     timeline = Timeline(TimelineGrid(0, 100 * SECOND, 10), {"mic": microphone}, lines, "UTC", {})
     return [(lane.labelling, lane.name, as_list(lane.spans)) for lane in timeline_lanes(timeline)]
 
 
-def knowing(*classes):
-    return GridSeries(classes, np.zeros((10, len(classes))))
-
-
 def test_rare_classes_are_on_top_and_what_was_not_heard_is_below():
     spans = spans_at(
         (0, 30, "speech"), (30, 31, "coughing"), (31, 90, "silence"), (90, 95, "music")
     )
-    classes = knowing("silence", "speech", "shower", "music", "coughing")
+    classes = ("silence", "speech", "shower", "music", "coughing")
     found = lanes_of(LabellingTimeline("live", spans, classes))
     assert [name for _, name, _ in found] == ["Coughing", "Music", "Talking", "Shower", "Reviewed"]
     assert found[0][2] == [(30 * SECOND, 31 * SECOND, "Coughing")]
@@ -812,7 +826,7 @@ def test_what_is_not_in_a_lane_any_more_is_hidden_and_what_is_new_is_drawn(tmp_p
 
 
 def test_bands_are_filled_from_one_probability_to_the_next(recording, timeline):
-    names, values = timeline.microphones["mic"].labellings[0].probabilities
+    names, values = (getattr(plot(timeline, SHARES, "live"), name) for name in ("names", "values"))
     times, cells = column(recording, "/mic/live/shares", "Scalars:scalars")
     lower, upper = np.array(cells).reshape(-1, 2, len(names)).swapaxes(0, 1)
     drawn = np.nan_to_num(values) >= 0.004  # half a stroke would be a line of its own
@@ -850,21 +864,21 @@ def test_the_frames_of_a_long_time_are_read_when_they_are_needed(folder, timelin
     monkeypatch.setattr(reading, "_PART", 50 * SECOND)
     long = read_timeline([folder])
     one, before = (each.microphones["mic"] for each in (long, timeline))
-    assert not one.level_frames
+    assert not one.frames
     for found, expected in zip(one.labellings, before.labellings, strict=True):
-        assert not found.frames
         assert as_list(found.spans) == as_list(expected.spans)
     parts = [part.microphones["mic"] for part in reading.read_frames(long)]
     assert len(parts) > 3
-    frames = [each for part in parts for each in part.labellings[0].frames]
-    for column in (1, 2):  # times, values
-        found = np.concatenate([each[column] for each in frames])
-        expected = np.concatenate([each[column] for each in before.labellings[0].frames])
+    frames = [each for part in parts for each in part.frames[SHARES, "live"]]
+    for name in ("times", "values"):
+        found = np.concatenate([getattr(each, name) for each in frames])
+        expected = [getattr(each, name) for each in before.frames[SHARES, "live"]]
+        expected = np.concatenate(expected)
         np.testing.assert_array_equal(found, expected)
 
 
 def test_the_heat_map_is_brighter_where_a_feature_is_higher(recording, timeline):
-    names, values = timeline.microphones["mic"].features
+    names, values = (getattr(plot(timeline, FEATURES), name) for name in ("names", "values"))
     times, cells = column(recording, "/mic/features", "SeriesPoints:colors")
     heard = ~np.isnan(values[:, 0])
     size = -(-heard.sum() // len(times))  # shares that are one column

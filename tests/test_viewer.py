@@ -31,6 +31,7 @@ from viewers import (
 from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.review.lanes import SHARES
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import save_timeline
@@ -108,7 +109,8 @@ class Picture:
 
 def blocks_of(timeline):
     """Where a class was the most probable one for long: times, and the class."""
-    names, values = timeline.microphones["mic"].labellings[0].probabilities
+    shares = timeline.microphones["mic"].plots[SHARES, "live"]
+    names, values = shares.names, shares.values
     best = np.nan_to_num(values).argmax(axis=1)
     edges = np.flatnonzero(np.diff(best, prepend=-1, append=-1))
     for first, last in pairwise(edges.tolist()):
@@ -138,7 +140,8 @@ def lanes_are_right(png, timeline):
 
 def check_bands(png, timeline):
     """Check that bands are as high as classes were probable where one of them was for long."""
-    names, values = timeline.microphones["mic"].labellings[0].probabilities
+    shares = timeline.microphones["mic"].plots[SHARES, "live"]
+    names, values = shares.names, shares.values
     found = []
     for time, text in blocks_of(timeline):
         place = int(timeline.grid.find(np.array([time]))[0])

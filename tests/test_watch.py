@@ -32,12 +32,10 @@ from hearthlog.analyzer.review.lanes import (
     NOVELTY,
     RECORDER,
     SHARES,
-    Plot,
-    StateChanges,
     StateLane,
 )
 from hearthlog.analyzer.review.live_timeline import LiveTimeline, last_time
-from hearthlog.analyzer.review.timeline import LogLines
+from hearthlog.analyzer.review.timeline import LogLines, Plot
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import LiveServer
 from hearthlog.models.modelfile.modelfile import load_model, save_model
@@ -160,7 +158,7 @@ def lane_states(found, kind):
     states = {}
     for each in found:
         if isinstance(each, StateLane) and each.kind is kind:
-            states.update(zip(each.changes.times.tolist(), each.changes.states, strict=True))
+            states.update(zip(each.times.tolist(), each.states, strict=True))
     times = np.array(sorted(states))
     return times, [states[time] for time in times.tolist()]
 
@@ -217,9 +215,7 @@ def test_a_viewer_that_comes_when_the_first_was_dropped_still_knows_names_and_co
         for number in range(600):  # three days
             times = seconds + number * 500 * SECOND
             shares = Plot(SHARES, "mic", "live", names, times, values)
-            server.show(
-                [shares, StateLane(RECORDER, "mic", StateChanges(times, ["phone_ring"] * 500))]
-            )
+            server.show([shares, StateLane(RECORDER, "mic", times, ["phone_ring"] * 500)])
             taken.append(psutil.Process().memory_info().rss)
         assert taken[-1] - taken[100] < 60_000_000
         with looking(server.url) as eye:
@@ -239,8 +235,8 @@ def test_lanes_are_sent_at_once_and_plots_every_few_seconds():
         wait_for(lambda: eye.newest() == begin)
         for second in (1, 2, 3):
             server.show([level(second)])
-        lane = StateChanges(np.array([begin + 2 * SECOND]), ["speech"])
-        server.show([StateLane(RECORDER, "mic", lane)])
+        lane = StateLane(RECORDER, "mic", np.array([begin + 2 * SECOND]), ["speech"])
+        server.show([lane])
         wait_for(lambda: eye.newest() == begin + 2 * SECOND)
         server.show([level(5)])
         wait_for(lambda: eye.newest() == begin + 5 * SECOND)
@@ -277,7 +273,7 @@ def test_a_lane_ends_as_the_segments_say_and_is_filled_until_they_do(logs):
             assert state == segments["label"][at]
     assert np.isin(starts, times).all()
     first = next(each for each in found if isinstance(each, StateLane) and each.kind is RECORDER)
-    assert None not in first.changes.states
+    assert None not in first.states
     assert np.diff(times).max() <= SECOND
 
 

@@ -4,10 +4,11 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import Enum, auto
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hearthlog.analyzer.accuracy.checked_minutes import (
     ClassCheck,
@@ -16,23 +17,34 @@ from hearthlog.analyzer.accuracy.checked_minutes import (
 )
 from hearthlog.analyzer.colours import GAP, Colour, colour
 from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, microphone_states
+from hearthlog.analyzer.logs.selection import checked_array_names
+from hearthlog.analyzer.logs.sound_vectors import as_vectors, degrees_of
 from hearthlog.analyzer.logs.spans import overlay
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.timeline import (
     LabelledSpans,
     LabellingTimeline,
+    LogLines,
     MicrophoneTimeline,
+    Plot,
+    PlotKind,
+    Style,
     Timeline,
     no_spans,
 )
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name, in_words, translation
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     LIVE,
     RELABEL,
+    TopicName,
     is_review,
     is_scenario,
+    parse_topic,
     review_labelling,
     scenario_name,
 )
@@ -43,7 +55,7 @@ TROUBLES = tuple(_TROUBLES)  # texts of a live lane, by the level of a diagnosti
 GAP_STATE = "not heard"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LaneKind:
     """Appearance of lanes of one kind; the viewer shows kinds in name order."""
 
@@ -70,8 +82,8 @@ def scenario_kind(labelling: str) -> LaneKind:
     return LaneKind(labelling.replace("/", "_").capitalize(), _class_colours)
 
 
-class StateChanges(NamedTuple):
-    """Times at which a lane changes, and its new states.
+class StateLane(NamedTuple):
+    """Additions to a lane: times at which it changes, and its new states.
 
     Attributes
     ----------
@@ -81,24 +93,18 @@ class StateChanges(NamedTuple):
         None is no state.
     """
 
+    kind: LaneKind
+    microphone: str
     times: Int64
     states: list[str | None]
 
 
-class StateLane(NamedTuple):
-    """Additions to a lane."""
-
-    kind: LaneKind
-    microphone: str
-    changes: StateChanges
-
-
-def state_changes(spans: LabelledSpans) -> StateChanges:
+def state_lane(kind: LaneKind, microphone: str, spans: LabelledSpans) -> StateLane:
     """Convert spans into changes of a lane.
 
     Returns
     -------
-    StateChanges
+    StateLane
         Each span begins with its text, and ends with None unless the next one follows at once.
     """
     followed = np.append(spans.starts[1:], np.iinfo(np.int64).max)
@@ -106,7 +112,7 @@ def state_changes(spans: LabelledSpans) -> StateChanges:
     times = np.concatenate([spans.ends[last], spans.starts])
     states = [*[None] * len(last), *spans.texts]
     order = np.argsort(times, kind="stable")
-    return StateChanges(times[order], [states[i] for i in order])
+    return StateLane(kind, microphone, times[order], [states[i] for i in order])
 
 
 def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
@@ -210,22 +216,20 @@ def reviewed_lane(
     scenario : str
         Its name; empty for the sounds of the home.
     """
-    names = {text: in_words(text) for text in dict.fromkeys(marks.texts)}
-    shades = {name: colour(text) for text, name in names.items()}
-    texts = np.array([*[REVIEWED] * len(reviewed), *(names[t] for t in marks.texts)], object)
+    name = f"{in_words(scenario)} reviewed" if scenario else REVIEWED
+    marked = _lane_in_words(microphone, name, marks)
+    texts = np.concatenate([np.full(len(reviewed), REVIEWED, object), marked.spans.texts])
     starts = np.concatenate([reviewed.starts, marks.starts])
     ends = np.concatenate([reviewed.ends, marks.ends])
-    spans = LabelledSpans(starts, ends, texts)
-    name = f"{in_words(scenario)} reviewed" if scenario else REVIEWED
-    return Lane(microphone, "", name, spans, {REVIEWED: _LOOKED_AT, **shades})
+    spans, colours = LabelledSpans(starts, ends, texts), {REVIEWED: _LOOKED_AT, **marked.colours}
+    return marked._replace(spans=spans, colours=colours)
 
 
 def _classes(
     microphone: MicrophoneTimeline, labellings: list[LabellingTimeline]
 ) -> dict[str, Colour]:
     """Return the displayed names of classes, the one heard for the shortest time first."""
-    models = {name for one in labellings if one.probabilities for name in one.probabilities.names}
-    known = {name for one in labellings for name in one.spans.texts} | models
+    known = {name for one in labellings for name in (*one.classes, *one.spans.texts)}
     names = [name for name in microphone.classes if name in known and class_name(name) != SILENCE]
     seconds: Counter[str] = Counter()
     for one in labellings:
@@ -246,17 +250,17 @@ def _of_class(spans: LabelledSpans, name: str) -> LabelledSpans:
 
 
 def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline]) -> Iterator[Lane]:
-    for one in (each for each in microphone.labellings if is_scenario(each.name)):
-        yield _scenario_lane(microphone.name, one)
+    for one in microphone.labellings:
+        if is_scenario(one.name):
+            name = in_words(scenario_name(one.name))
+            yield _lane_in_words(microphone.name, name, scenario_sounds(one.spans))
     for other in labellings[1:]:
         spans = disagreements(labellings[0].spans, other.spans)
-        shades = {in_words(text): colour(text) for text in dict.fromkeys(spans.texts)}
-        texts = np.array([in_words(text) for text in spans.texts], object)
         name = f"{labelling_in_words(other.name)} differs"
-        yield Lane(microphone.name, "", name, LabelledSpans(*spans[:2], texts), shades)
-    for name, named in ((_RECURRING, microphone.recurring), (_VOICES, microphone.spoken)):
-        if len(named):
-            yield _named_lane(microphone.name, name, named)
+        yield _lane_in_words(microphone.name, name, spans)
+    for name, spans in ((_RECURRING, microphone.recurring), (_VOICES, microphone.spoken)):
+        if len(spans):
+            yield _lane_in_words(microphone.name, name, spans)
     marks = {one.name: one.spans for one in microphone.labellings if is_review(one.name)}
     for scenario, looked_at in {"": microphone.reviewed, **microphone.reviewed_scenarios}.items():
         own = marks.get(review_labelling(scenario), no_spans())
@@ -269,21 +273,12 @@ def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline])
             yield Lane(microphone.name, "", name, named, {name: shade})
 
 
-def _scenario_lane(microphone: str, labelling: LabellingTimeline) -> Lane:
-    """Make one lane of all classes of a scenario, without spans that name none."""
-    spans = scenario_sounds(labelling.spans)
-    shades = {in_words(text): colour(text) for text in dict.fromkeys(spans.texts)}
-    words = np.array([in_words(text) for text in spans.texts], object)
-    own = LabelledSpans(*spans[:2], words)
-    name = in_words(scenario_name(labelling.name))
-    return Lane(microphone, "", name, own, shades)
-
-
-def _named_lane(microphone: str, lane: str, named: LabelledSpans) -> Lane:
-    names = {text: in_words(text) for text in dict.fromkeys(named.texts)}
+def _lane_in_words(microphone: str, lane: str, spans: LabelledSpans) -> Lane:
+    """Make a lane of all classes of some spans, by their displayed names."""
+    names = {text: in_words(text) for text in dict.fromkeys(spans.texts)}
     shades = {name: colour(text) for text, name in names.items()}
-    texts = np.array([names[text] for text in named.texts], object)
-    return Lane(microphone, "", lane, LabelledSpans(*named[:2], texts), shades)
+    texts = np.array([names[text] for text in spans.texts], object)
+    return Lane(microphone, "", lane, LabelledSpans(*spans[:2], texts), shades)
 
 
 Checked = Mapping[tuple[str, str], ClassCheck]  # by microphone and displayed class name
@@ -314,47 +309,42 @@ def class_precision(timeline: Timeline, logs: HomeLogs) -> Checked:
     return checked
 
 
-_BRIGHT: Colour = (235, 215, 140)
 _GROUND: Colour = (200, 120, 90)
 _NEW: Colour = (160, 200, 255)
 _TOWARDS: Colour = (150, 215, 150)
 _HEAT_COLUMNS = 600  # maximum: each value is a square, which costs the viewer about ten kilobytes
 _HEAT_PERCENTILES = (2, 98)
 _TINY = np.finfo(np.float64).tiny
+_QUIETEST = 1e-10  # mean square: -100 dB
 
 
-class Style(Enum):
-    """Drawing of values: stacked bands (shares of one), dark to bright (0 to 1), line, points."""
+def decibel(energy: Any) -> Any:
+    """Return the level of a mean square, in dB relative to full scale: 10 log10(energy).
 
-    BANDS = auto()
-    HEAT_MAP = auto()
-    LINE = auto()
-    POINTS = auto()
+    Parameters
+    ----------
+    energy : float or np.ndarray
+        Mean square of samples from -1 to 1.
 
-
-@dataclass(frozen=True)
-class PlotKind:
-    """Appearance of plots of one kind; they are shown in the order of `PLOTS`."""
-
-    name: str  # of the entity
-    # Title of the view, shared by all kinds with the same title. Placeholders: {first} and {last}
-    # are names of columns, {end} is the last number.
-    title: str
-    height: int  # relative to other views
-    style: Style
-    colour: Colour = _BRIGHT  # of a line, or of points
-    scale: tuple[float, float] | None = None  # None fits the values
-    live_scale: tuple[float, float] | None = None  # replaces `scale` where values are added live
-
-    @property
-    def view(self) -> str:
-        """Short name of the view."""
-        return re.split("[:,]", self.title)[0]
+    Returns
+    -------
+    float or np.ndarray
+        At least -100; 0 for a square wave of full scale.
+    """
+    return 10 * np.log10(np.maximum(energy, _QUIETEST))
 
 
-SHARES = PlotKind("shares", "How probable each class is", 280, Style.BANDS, scale=(0.0, 1.0))
+def _degrees(vectors: NDArray[np.floating]) -> Float64:
+    return degrees_of(vectors.astype(np.float64))[:, np.newaxis]
+
+
+SHARES = PlotKind(
+    "shares", "How probable each class is", 280, Style.BANDS, scale=(0.0, 1.0), frame_step=0.01
+)
 _LEVELS = "Level, and floor of the room, in dBFS"
-LEVEL = PlotKind("level", _LEVELS, 100, Style.LINE, live_scale=(-100.0, 0.0))
+LEVEL = PlotKind(
+    "level", _LEVELS, 100, Style.LINE, live_scale=(-100.0, 0.0), frame_step=0.1, of_means=decibel
+)
 FLOOR = PlotKind("floor", _LEVELS, 100, Style.LINE, _GROUND, live_scale=(-100.0, 0.0))
 NOVELTY = PlotKind(
     "novelty", "Novelty: how doubtful labels are", 90, Style.LINE, _NEW, live_scale=(0.0, 1.0)
@@ -369,86 +359,138 @@ DIRECTION = PlotKind(
     Style.POINTS,
     _TOWARDS,
     scale=(-180.0, 180.0),
+    of_means=_degrees,
 )
-PLOTS = (SHARES, LEVEL, FLOOR, DIRECTION, NOVELTY, FEATURES)
+PLOTS = (SHARES, LEVEL, FLOOR, DIRECTION, NOVELTY, FEATURES)  # in the order of the views
 
 
-class Plot(NamedTuple):
-    """A plot, or an addition to it: means over spans of time.
+_ENERGY = "energy"
+_SEGMENT_LINE = re.compile(r"^(\w+) for(?= [\d.]+ s \(\d+ %\)$)")
+FIELDS = {
+    message_types.FEATURES: ("header.stamp", "values"),
+    message_types.LABEL: ("header.stamp", "novelty", "probabilities"),
+    message_types.SEGMENT: ("header.stamp", "duration", "label"),
+    message_types.GAP: ("header.stamp", "duration", "reason"),
+    message_types.DIRECTION: ("header.stamp", "azimuth", "confidence"),
+    message_types.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
+    message_types.LOG: ("stamp", "level", "msg"),
+}
+_KINDS = {"features", "label", "segment", "gap", "direction"}
 
-    Attributes
-    ----------
-    labelling : str
-        Empty if the plot belongs to none.
-    times : np.ndarray [shape=(n,)], int64
-        Middles of the spans, in nanoseconds of UTC.
-    values : np.ndarray [shape=(n, k)], float64
-        NaN where nothing was recorded.
-    length : int
-        Of a span, in nanoseconds.
-    """
 
-    kind: PlotKind
+class LaneRows(NamedTuple):
+    """Logged spans of a lane: segments of a labelling (`RECORDER`), or gaps with their reasons."""
+
+    kind: LaneKind
     microphone: str
     labelling: str
-    names: tuple[str, ...]
-    times: Int64
-    values: Float64
-    length: int = NANOSECONDS
+    spans: LabelledSpans
 
-    @property
-    def title(self) -> str:
-        """Title of the plot's view."""
-        last = len(self.names) - 1
-        return self.kind.title.format(first=self.names[0], last=self.names[-1], end=last)
 
-    @property
-    def text(self) -> str:
-        """Text next to the plot: its title, or the names of bands from the bottom."""
-        if self.kind.style is not Style.BANDS:
-            return self.title
-        return f"From below: {', '.join(map(in_words, self.names))}"
+class StateRows(NamedTuple):
+    """Health of a microphone, from the diagnostics."""
+
+    microphone: str
+    states: list[MicrophoneHealth]
+
+
+Rows = Plot | LaneRows | StateRows | LogLines
+
+
+def read_rows(path: Path, columns: Columns) -> Iterator[Rows]:
+    """Extract the rows of lanes and plots from the messages of one topic.
+
+    Parameters
+    ----------
+    columns : Columns
+        With the `FIELDS` of its type.
+
+    Raises
+    ------
+    LogError
+        If a channel does not name its values, or names another number of them.
+    """
+    if not len(columns):
+        return
+    if columns.type == message_types.LOG:
+        texts = np.array([worded(text) for text in columns["msg"]], object)
+        yield LogLines(columns["stamp"], columns["level"], texts)
+    elif columns.type == message_types.DIAGNOSTICS:
+        by_microphone: dict[str, list[MicrophoneHealth]] = {}
+        for state in microphone_states(columns):
+            by_microphone.setdefault(state.microphone, []).append(state)
+        for name, states in sorted(by_microphone.items()):
+            yield StateRows(name, states)
+    elif (topic := shown_topic(columns.topic)) is not None:
+        yield from _microphone_rows(path, columns, topic.microphone, topic.labelling)
+
+
+def worded(line: str) -> str:
+    """Return a line about a segment, with the class name replaced by its lane's name."""
+    return _SEGMENT_LINE.sub(lambda found: f"{in_words(found[1])} for", line)
+
+
+def _microphone_rows(
+    path: Path, columns: Columns, microphone: str, labelling: str
+) -> Iterator[Plot | LaneRows]:
+    times = columns["header.stamp"]
+    match columns.type:
+        case message_types.FEATURES:
+            names, values = checked_array_names(path, columns, "values"), columns["values"]
+            if _ENERGY in names:
+                energy = values[:, [names.index(_ENERGY)]]
+                yield Plot(LEVEL, microphone, "", ("level",), times, energy)
+            yield Plot(FEATURES, microphone, "", names, times, values)
+        case message_types.LABEL:
+            names = checked_array_names(path, columns, "probabilities")
+            yield Plot(SHARES, microphone, labelling, names, times, columns["probabilities"])
+            novelty = columns["novelty"][:, np.newaxis]
+            new = np.isfinite(novelty[:, 0])
+            if new.any():
+                yield Plot(NOVELTY, microphone, labelling, ("novelty",), times[new], novelty[new])
+        case message_types.DIRECTION:
+            towards = as_vectors(columns["azimuth"], columns["confidence"])
+            yield Plot(DIRECTION, microphone, "", ("direction",), times, towards)
+        case message_types.SEGMENT:
+            spans = LabelledSpans(times, times + columns["duration"], columns["label"])
+            yield LaneRows(RECORDER, microphone, labelling, spans)
+        case message_types.GAP:
+            spans = LabelledSpans(times, times + columns["duration"], columns["reason"])
+            yield LaneRows(GAPS, microphone, "", spans)
+
+
+def shown_topic(name: str) -> TopicName | None:
+    """Parse a topic shown in a timeline.
+
+    Returns
+    -------
+    TopicName or None
+        None for any other topic. Marks are read from their layers, not shown by topic.
+    """
+    topic = parse_topic(name)
+    if topic is None or topic.kind not in _KINDS or is_review(topic.labelling):
+        return None
+    return topic
 
 
 def timeline_plots(timeline: Timeline) -> Iterator[Plot]:
     """Make the plots of a timeline, microphone by microphone in the order of `PLOTS`."""
-    grid = timeline.grid
-    times, length = grid.middles, grid.step
     for microphone in timeline.microphones.values():
-        for kind, labelling, names, values in _values(microphone):
-            rows = _shades(times, values) if kind is FEATURES else (times, values)
-            yield Plot(kind, microphone.name, labelling, names, *rows, length)
+        for plot in microphone.plots.values():
+            yield _shaded(plot) if plot.kind.style is Style.HEAT_MAP else plot
 
 
-def _values(
-    microphone: MicrophoneTimeline,
-) -> Iterator[tuple[PlotKind, str, tuple[str, ...], Float64]]:
-    for one in microphone.labellings:
-        if one.probabilities is not None:
-            yield SHARES, one.name, *one.probabilities
-    if microphone.level is not None:
-        yield LEVEL, "", ("level",), microphone.level[:, np.newaxis]
-    if microphone.floor is not None:
-        yield FLOOR, "", ("floor",), microphone.floor[:, np.newaxis]
-    if microphone.direction is not None:
-        yield DIRECTION, "", ("direction",), microphone.direction[:, np.newaxis]
-    for one in microphone.labellings:
-        if one.novelty is not None:
-            yield NOVELTY, one.name, (f"novelty, {one.name}",), one.novelty[:, np.newaxis]
-    if microphone.features is not None:
-        yield FEATURES, "", *microphone.features
-
-
-def _shades(times: Int64, values: Float64) -> tuple[Int64, Float64]:
+def _shaded(plot: Plot) -> Plot:
     """Scale each column from its low values (0) to its high values (1), and limit the rows."""
-    present = ~np.isnan(values[:, 0])
-    if not present.any():
-        return times[:0], values[:0]
-    times, values = times[present], values[present]
+    present = ~np.isnan(plot.values[:, 0])
+    times, values = plot.times[present], plot.values[present]
+    if not len(times):
+        return plot._replace(times=times, values=values)
     absent = np.isnan(values)  # where the logs have another feature set
     times, values = _thin(times, np.where(absent, np.nanmin(values, axis=0), values))
     low, high = np.percentile(values, _HEAT_PERCENTILES, axis=0)
-    return times, np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
+    shades = np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
+    return plot._replace(times=times, values=shades)
 
 
 def _thin(times: Int64, values: Float64) -> tuple[Int64, Float64]:

@@ -5,52 +5,36 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth
 from hearthlog.analyzer.logs.selection import decode_types
-from hearthlog.analyzer.logs.sound_vectors import degrees_of
 from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.analyzer.review.lanes import (
     DIRECTION,
     FEATURES,
+    FIELDS,
     FLOOR,
     GAP_STATE,
     GAPS,
-    LEVEL,
-    NOVELTY,
     RECORDER,
     SHARES,
     TROUBLE,
     TROUBLES,
-    Plot,
-    StateChanges,
+    LaneRows,
+    Rows,
     StateLane,
+    StateRows,
+    read_rows,
     scenario_kind,
     scenario_sounds,
-    state_changes,
+    state_lane,
 )
-from hearthlog.analyzer.review.timeline import (
-    ENERGY,
-    FIELDS,
-    DirectionRows,
-    FeatureRows,
-    GapRows,
-    LabelledSpans,
-    LabelRows,
-    LogLines,
-    Rows,
-    SegmentRows,
-    StateRows,
-    decibel,
-    read_rows,
-)
+from hearthlog.analyzer.review.timeline import LabelledSpans, LogLines, Plot, PlotKind
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, is_layer, time_span
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.messages.topics import LIVE, is_scenario
+from hearthlog.schemas.messages.topics import is_scenario
 
 _MEMORY = 600  # seconds covered by the scale of a feature
 _SPREAD = 2.0  # standard deviations from the middle of a scale to its ends
@@ -96,7 +80,7 @@ class LiveTimeline:
     """Converts messages into updates of lanes and plots."""
 
     def __init__(self) -> None:
-        self._ends: dict[tuple[str, ...], int] = {}  # of the last frame, by topic and names
+        self._ends: dict[tuple[PlotKind, str, tuple[str, ...]], int] = {}  # of the last frame
         self._scales: dict[tuple[str, ...], _Scale] = {}
         self._open: dict[str, Int64] = {}  # seconds without a segment yet, by microphone
 
@@ -107,8 +91,7 @@ class LiveTimeline:
         does not name its values.
         """
         for columns in decode_types(path, batch, FIELDS):
-            rows = read_rows(path, columns) if len(columns) else None
-            if rows is not None:
+            for rows in read_rows(path, columns):
                 yield from self._update(rows)
 
     def _update(self, rows: Rows) -> Iterator[Update]:
@@ -116,47 +99,33 @@ class LiveTimeline:
             case LogLines():
                 yield rows
             case StateRows():
-                yield from _states(rows)
-            case FeatureRows():
-                yield from self._features(rows)
-            case LabelRows(labelling="live"):
-                yield from self._labels(rows)
-            case SegmentRows(labelling="live"):
-                yield from self._segments(rows.microphone, rows.spans)
-            case SegmentRows() if is_scenario(rows.labelling):
-                kind = scenario_kind(rows.labelling)
-                yield StateLane(kind, rows.microphone, state_changes(scenario_sounds(rows.spans)))
-            case GapRows():
+                yield from _health(rows)
+            case Plot() if rows.kind is DIRECTION:
+                yield rows._replace(values=rows.kind.of_means(rows.values))
+            case Plot(labelling="" | "live"):
+                yield from self._add_seconds(rows)
+            case LaneRows() if rows.kind is GAPS:
                 yield _gaps(rows)
-            case DirectionRows():
-                degrees = degrees_of(rows.directions)[:, np.newaxis]
-                yield Plot(DIRECTION, rows.microphone, "", ("direction",), rows.times, degrees)
+            case LaneRows(labelling="live"):
+                yield from self._segments(rows.microphone, rows.spans)
+            case LaneRows() if is_scenario(rows.labelling):
+                kind = scenario_kind(rows.labelling)
+                yield state_lane(kind, rows.microphone, scenario_sounds(rows.spans))
 
-    def _features(self, rows: FeatureRows) -> Iterator[Plot]:
-        microphone, names = rows.microphone, rows.names
-        key = (microphone, "features", *names)
-        _, times, values = self._by_second(key, rows.times, rows.values)
-        if ENERGY in names:
-            level = decibel(values[:, [names.index(ENERGY)]])
-            yield Plot(LEVEL, microphone, "", ("level",), times, level)
-        present = ~np.isnan(values[:, 0])
-        scale = self._scales.setdefault((microphone, *names), _Scale())
-        yield Plot(FEATURES, microphone, "", names, times[present], scale(values[present]))
-
-    def _labels(self, rows: LabelRows) -> Iterator[Update]:
-        microphone, names = rows.microphone, rows.names
-        values = np.column_stack([rows.probabilities, rows.novelty])
-        starts, times, means = self._by_second((microphone, "label", *names), rows.times, values)
-        shares, novelty = means[:, :-1], means[:, -1:]
-        yield Plot(SHARES, microphone, LIVE, names, times, shares)
-        if np.isfinite(rows.novelty).any():
-            yield Plot(NOVELTY, microphone, LIVE, ("novelty",), times, novelty)
-        present = ~np.isnan(shares[:, 0])
-        best = np.where(present, np.nan_to_num(shares).argmax(axis=1), len(names))
-        states = np.array([*names, None], object)[best]
-        yield StateLane(RECORDER, microphone, StateChanges(starts, states.tolist()))
-        seconds = np.append(self._open_seconds(microphone), starts[present])
-        self._open[microphone] = seconds[-_MOST_OPEN:]
+    def _add_seconds(self, rows: Plot) -> Iterator[Plot | StateLane]:
+        starts, times, means = self._by_second(rows)
+        present = ~np.isnan(means[:, 0])
+        if rows.kind is FEATURES:
+            scale = self._scales.setdefault((rows.microphone, *rows.names), _Scale())
+            yield rows._replace(times=times[present], values=scale(means[present]))
+            return
+        yield rows._replace(times=times, values=rows.kind.of_means(means))
+        if rows.kind is SHARES:
+            best = np.where(present, np.nan_to_num(means).argmax(axis=1), len(rows.names))
+            states = np.array([*rows.names, None], object)[best]
+            yield StateLane(RECORDER, rows.microphone, starts, states.tolist())
+            seconds = np.append(self._open_seconds(rows.microphone), starts[present])
+            self._open[rows.microphone] = seconds[-_MOST_OPEN:]
 
     def _segments(self, microphone: str, spans: LabelledSpans) -> Iterator[StateLane]:
         """Replace the labels of the seconds in closed segments with the segments' labels."""
@@ -165,15 +134,13 @@ class LiveTimeline:
         rows = rows_at(spans, times)
         closed = rows >= 0
         states = spans.texts[rows[closed]].tolist()
-        yield StateLane(RECORDER, microphone, StateChanges(times[closed], states))
+        yield StateLane(RECORDER, microphone, times[closed], states)
         self._open[microphone] = seconds[seconds >= spans.ends[-1]]
 
     def _open_seconds(self, microphone: str) -> Int64:
         return self._open.get(microphone, np.empty(0, np.int64))
 
-    def _by_second(
-        self, key: tuple[str, ...], times: Int64, values: NDArray[np.floating]
-    ) -> tuple[Int64, Int64, Float64]:
+    def _by_second(self, rows: Plot) -> tuple[Int64, Int64, Float64]:
         """Average frames over each second, and insert a row of NaN where frames are missing.
 
         Returns
@@ -181,12 +148,13 @@ class LiveTimeline:
         starts, middles : np.ndarray [shape=(m,)], int64
         means : np.ndarray [shape=(m, k)], float64
         """
+        key, times = (rows.kind, rows.microphone, rows.names), rows.times
         before = np.append(self._ends.get(key, times[0]), times[:-1] + FRAME_NANOSECONDS)
         self._ends[key] = int(times[-1]) + FRAME_NANOSECONDS
         missing = np.abs(times - before) > FRAME_NANOSECONDS // 2
         first = np.flatnonzero(missing | (np.diff(times // NANOSECONDS, prepend=-1) != 0))
         last = np.append(first[1:], len(times)) - 1
-        finite = np.nan_to_num(values, posinf=0.0, neginf=0.0)
+        finite = np.nan_to_num(rows.values, posinf=0.0, neginf=0.0)
         sums = np.add.reduceat(finite, first, axis=0, dtype=np.float64)
         means = sums / (last - first + 1)[:, np.newaxis]
         starts = times[first]
@@ -219,23 +187,19 @@ class _Scale:
         return np.clip(scaled + 0.5, 0.0, 1.0)
 
 
-def _gaps(rows: GapRows) -> StateLane:
+def _gaps(rows: LaneRows) -> StateLane:
     spans = rows.spans
     later = spans.ends > spans.starts  # where the clock was set back nothing is missing
     texts = np.full(later.sum(), GAP_STATE, object)
     spans = LabelledSpans(spans.starts[later], spans.ends[later], texts)
-    return StateLane(GAPS, rows.microphone, state_changes(spans))
+    return state_lane(GAPS, rows.microphone, spans)
 
 
-def _states(rows: StateRows) -> Iterator[StateLane | Plot]:
-    by_microphone: dict[str, list[MicrophoneHealth]] = {}
-    for state in rows.states:
-        by_microphone.setdefault(state.microphone, []).append(state)
-    for name, states in sorted(by_microphone.items()):
-        times = np.array([state.time for state in states])
-        levels = (min(state.level, len(TROUBLES)) for state in states)
-        texts = [TROUBLES[level - 1] if level else None for level in levels]
-        yield StateLane(TROUBLE, name, StateChanges(times, texts))
-        floors = np.array([[state.floor_dbfs] for state in states])
-        if not np.isnan(floors).all():
-            yield Plot(FLOOR, name, "", ("floor",), times, floors)
+def _health(rows: StateRows) -> Iterator[StateLane | Plot]:
+    times = np.array([state.time for state in rows.states])
+    levels = (min(state.level, len(TROUBLES)) for state in rows.states)
+    texts = [TROUBLES[level - 1] if level else None for level in levels]
+    yield StateLane(TROUBLE, rows.microphone, times, texts)
+    floors = np.array([[state.floor_dbfs] for state in rows.states])
+    if not np.isnan(floors).all():
+        yield Plot(FLOOR, rows.microphone, "", ("floor",), times, floors)

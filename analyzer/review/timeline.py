@@ -1,26 +1,22 @@
-"""Timeline: rows of messages, their arrays on a time grid, and the clock of the home."""
+"""Timeline: lanes and plots of some logs on a time grid, and the clock of the home."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
-from pathlib import Path
+from enum import Enum, auto
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.local_time import home_zone, local_time
-from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, microphone_states
-from hearthlog.analyzer.logs.selection import checked_array_names
-from hearthlog.analyzer.logs.sound_vectors import as_vectors
 from hearthlog.models.classes import in_words
-from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
+from hearthlog.schemas.arrays import Float64, Int16, Int64
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import TopicName, is_review, parse_topic, scenario_name
+from hearthlog.schemas.messages.topics import scenario_name
 
 
 @dataclass(frozen=True)
@@ -164,32 +160,81 @@ def no_spans() -> LabelledSpans:
     return LabelledSpans(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
 
 
-class GridSeries(NamedTuple):
-    """Means on the grid of a timeline.
+class Style(Enum):
+    """Drawing of values: stacked bands (shares of one), dark to bright (0 to 1), line, points."""
+
+    BANDS = auto()
+    HEAT_MAP = auto()
+    LINE = auto()
+    POINTS = auto()
+
+
+def _unchanged(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class PlotKind:
+    """Values and appearance of plots of one kind."""
+
+    name: str  # of the entity
+    # Title of the view, shared by all kinds with the same title. Placeholders: {first} and {last}
+    # are names of columns, {end} is the last number.
+    title: str
+    height: int  # relative to other views
+    style: Style
+    colour: Colour = (235, 215, 140)  # of a line, or of points
+    scale: tuple[float, float] | None = None  # None fits the values
+    live_scale: tuple[float, float] | None = None  # replaces `scale` where values are added live
+    frame_step: float = 0.0  # of single frames, smaller ones are invisible; 0 draws no frames
+    of_means: Callable[[NDArray[np.floating]], NDArray[np.floating]] = _unchanged
+
+    @property
+    def view(self) -> str:
+        """Short name of the view."""
+        return re.split("[:,]", self.title)[0]
+
+
+class Plot(NamedTuple):
+    """Values of a plot, or an addition to it: logged rows, or what is drawn of their means.
 
     Attributes
     ----------
-    values : np.ndarray [shape=(count, k)], float64
-        NaN where nothing was recorded.
-    """
-
-    names: tuple[str, ...]
-    values: Float64
-
-
-class FrameValues(NamedTuple):
-    """Values of successive frames of a log, 20 a second.
-
-    Attributes
-    ----------
+    labelling : str
+        Empty if the plot belongs to none.
+    names : tuple of str
+        Of the drawn columns.
     times : np.ndarray [shape=(n,)], int64
-        Starts of the frames, in nanoseconds of UTC.
-    values : np.ndarray [shape=(n, k)], float32
+        Starts of frames, or middles of spans, in nanoseconds of UTC.
+    values : np.ndarray [shape=(n, k)], float
+        NaN where nothing was recorded.
+    length : int
+        Of a span, in nanoseconds.
     """
 
+    kind: PlotKind
+    microphone: str
+    labelling: str
     names: tuple[str, ...]
     times: Int64
-    values: Float32
+    values: NDArray[np.floating]
+    length: int = NANOSECONDS
+
+    @property
+    def title(self) -> str:
+        """Title of the plot's view."""
+        last = len(self.names) - 1
+        return self.kind.title.format(first=self.names[0], last=self.names[-1], end=last)
+
+    @property
+    def text(self) -> str:
+        """Text next to the plot: its title, or the names of bands from the bottom."""
+        if self.kind.style is not Style.BANDS:
+            return self.title
+        return f"From below: {', '.join(map(in_words, self.names))}"
+
+
+PlotKey = tuple[PlotKind, str]  # with the labelling
 
 
 class LogLines(NamedTuple):
@@ -231,20 +276,11 @@ class SoundClip(NamedTuple):
 
 @dataclass
 class LabellingTimeline:
-    """Labels of one source: the recorder (`live`), a relabelling, a reviewer (`review`).
-
-    Attributes
-    ----------
-    novelty : np.ndarray [shape=(count,)], float64, or None
-    frames : list of FrameValues
-        Probabilities of each frame; empty above three hours, see `read_frames`.
-    """
+    """Labels of one source: the recorder (`live`), a relabelling, a reviewer (`review`)."""
 
     name: str
     spans: LabelledSpans
-    probabilities: GridSeries | None = None
-    novelty: Float64 | None = None
-    frames: Sequence[FrameValues] = ()
+    classes: Sequence[str] = ()  # of its model
 
 
 @dataclass
@@ -253,29 +289,22 @@ class MicrophoneTimeline:
 
     Attributes
     ----------
-    level : np.ndarray [shape=(count,)], float64, or None
-        Level of the mean energy, in dB relative to full scale (0 for a square wave of full scale).
-    level_frames : list of FrameValues
-        Level of each frame; empty above three hours.
-    floor : np.ndarray [shape=(count,)], float64, or None
-        Noise floor of the room, in the same unit; NaN where unknown.
-    direction : np.ndarray [shape=(count,)], float64, or None
-        Direction of the sound at an array, in degrees; NaN where nothing was located.
+    plots : mapping of (PlotKind, str) to Plot
+        Means on the grid, in the order of the views.
+    frames : mapping of (PlotKind, str) to list of Plot
+        Single frames; empty above three hours, see `read_frames`.
     """
 
     name: str
     labellings: list[LabellingTimeline]
-    features: GridSeries | None
-    level: Float64 | None
-    level_frames: Sequence[FrameValues]
-    floor: Float64 | None
+    plots: Mapping[PlotKey, Plot]
+    frames: Mapping[PlotKey, Sequence[Plot]]
     reviewed: LabelledSpans
     gaps: LabelledSpans
     troubles: LabelledSpans
     clips: list[SoundClip]
     recurring: LabelledSpans = field(default_factory=no_spans)
     spoken: LabelledSpans = field(default_factory=no_spans)
-    direction: Float64 | None = None
     reviewed_scenarios: dict[str, LabelledSpans] = field(default_factory=dict)
 
     @property
@@ -292,8 +321,7 @@ class MicrophoneTimeline:
             Its name; empty for all labellings without a scenario.
         """
         labellings = [one for one in self.labellings if scenario_name(one.name) == scenario]
-        series = [one.probabilities for one in labellings if one.probabilities is not None]
-        names = [name for each in series for name in each.names]
+        names = [name for one in labellings for name in one.classes]
         return list(dict.fromkeys([*names, *(t for one in labellings for t in one.spans.texts)]))
 
 
@@ -322,175 +350,3 @@ class Timeline:
         Raise `DataError` if the time zone is unknown.
         """
         return home_clock(home_zone(self.zone), self.grid.start, self.grid.end)
-
-
-ENERGY = "energy"
-_SEGMENT_LINE = re.compile(r"^(\w+) for(?= [\d.]+ s \(\d+ %\)$)")
-FIELDS = {
-    message_types.FEATURES: ("header.stamp", "values"),
-    message_types.LABEL: ("header.stamp", "novelty", "probabilities"),
-    message_types.SEGMENT: ("header.stamp", "duration", "label"),
-    message_types.GAP: ("header.stamp", "duration", "reason"),
-    message_types.DIRECTION: ("header.stamp", "azimuth", "confidence"),
-    message_types.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
-    message_types.LOG: ("stamp", "level", "msg"),
-}
-_KINDS = {"features", "label", "segment", "gap", "direction"}
-_QUIETEST = 1e-10  # mean square: -100 dB
-
-
-class FeatureRows(NamedTuple):
-    """Features of n frames.
-
-    Attributes
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        Starts of the frames, in nanoseconds of UTC.
-    values : np.ndarray [shape=(n, k)], float32
-    """
-
-    microphone: str
-    names: tuple[str, ...]
-    times: Int64
-    values: Float32
-
-
-class LabelRows(NamedTuple):
-    """Probabilities of k classes, and novelty, in n frames.
-
-    Attributes
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        Starts of the frames, in nanoseconds of UTC.
-    probabilities : np.ndarray [shape=(n, k)], float32
-    novelty : np.ndarray [shape=(n,)], float32
-        NaN where the model has none.
-    """
-
-    microphone: str
-    labelling: str
-    names: tuple[str, ...]
-    times: Int64
-    probabilities: Float32
-    novelty: Float32
-
-
-class SegmentRows(NamedTuple):
-    """Segments of a labelling."""
-
-    microphone: str
-    labelling: str
-    spans: LabelledSpans
-
-
-class GapRows(NamedTuple):
-    """Gaps of a microphone, with their reasons."""
-
-    microphone: str
-    spans: LabelledSpans
-
-
-class DirectionRows(NamedTuple):
-    """Directions of the sound at an array, in n blocks.
-
-    Attributes
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        Starts of the blocks, in nanoseconds of UTC.
-    directions : np.ndarray [shape=(n, 2)], float64
-        Ahead and left; the length is the confidence.
-    """
-
-    microphone: str
-    times: Int64
-    directions: Float64
-
-
-class StateRows(NamedTuple):
-    """Health of microphones, from the diagnostics."""
-
-    states: list[MicrophoneHealth]
-
-
-Rows = FeatureRows | LabelRows | SegmentRows | GapRows | DirectionRows | StateRows | LogLines
-
-
-def read_rows(path: Path, columns: Columns) -> Rows | None:
-    """Extract the fields from the messages of one topic.
-
-    Parameters
-    ----------
-    columns : Columns
-        At least one message, with the `FIELDS` of its type.
-
-    Returns
-    -------
-    FeatureRows, LabelRows, SegmentRows, GapRows, DirectionRows, StateRows, LogLines or None
-        None if a timeline does not show the topic.
-
-    Raises
-    ------
-    LogError
-        If a channel does not name its values, or names another number of them.
-    """
-    if columns.type == message_types.LOG:
-        texts = np.array([worded(text) for text in columns["msg"]], object)
-        return LogLines(columns["stamp"], columns["level"], texts)
-    if columns.type == message_types.DIAGNOSTICS:
-        return StateRows(list(microphone_states(columns)))
-    topic = shown_topic(columns.topic)
-    return topic and _microphone_rows(path, columns, topic)
-
-
-def worded(line: str) -> str:
-    """Return a line about a segment, with the class name replaced by its lane's name."""
-    return _SEGMENT_LINE.sub(lambda found: f"{in_words(found[1])} for", line)
-
-
-def _microphone_rows(path: Path, columns: Columns, topic: TopicName) -> Rows:
-    microphone, labelling = topic.microphone, topic.labelling
-    times = columns["header.stamp"]
-    if columns.type == message_types.FEATURES:
-        names = checked_array_names(path, columns, "values")
-        return FeatureRows(microphone, names, times, columns["values"])
-    if columns.type == message_types.LABEL:
-        names = checked_array_names(path, columns, "probabilities")
-        values = columns["probabilities"], columns["novelty"]
-        return LabelRows(microphone, labelling, names, times, *values)
-    if columns.type == message_types.DIRECTION:
-        towards = as_vectors(columns["azimuth"], columns["confidence"])
-        return DirectionRows(microphone, times, towards)
-    ends = times + columns["duration"]
-    if columns.type == message_types.SEGMENT:
-        return SegmentRows(microphone, labelling, LabelledSpans(times, ends, columns["label"]))
-    return GapRows(microphone, LabelledSpans(times, ends, columns["reason"]))
-
-
-def shown_topic(name: str) -> TopicName | None:
-    """Parse a topic shown in a timeline.
-
-    Returns
-    -------
-    TopicName or None
-        None for any other topic. Marks are read from their layers, not shown by topic.
-    """
-    topic = parse_topic(name)
-    if topic is None or topic.kind not in _KINDS or is_review(topic.labelling):
-        return None
-    return topic
-
-
-def decibel(energy: Any) -> Any:
-    """Return the level of a mean square, in dB relative to full scale: 10 log10(energy).
-
-    Parameters
-    ----------
-    energy : float or np.ndarray
-        Mean square of samples from -1 to 1.
-
-    Returns
-    -------
-    float or np.ndarray
-        At least -100; 0 for a square wave of full scale.
-    """
-    return 10 * np.log10(np.maximum(energy, _QUIETEST))

@@ -9,7 +9,6 @@ from pathlib import Path
 from time import time_ns
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import read_clips
@@ -23,37 +22,38 @@ from hearthlog.analyzer.logs.layers import (
 from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, lasting
 from hearthlog.analyzer.logs.selection import decode_types
-from hearthlog.analyzer.logs.sound_vectors import degrees_of
 from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.logs.spans import one as one_span
-from hearthlog.analyzer.marks.marks import Reviewed, ReviewedSpan, read_review
-from hearthlog.analyzer.review.timeline import (
-    ENERGY,
+from hearthlog.analyzer.marks.marks import Reviewed, read_review
+from hearthlog.analyzer.review.lanes import (
+    FEATURES,
     FIELDS,
-    DirectionRows,
-    FeatureRows,
-    FrameValues,
-    GapRows,
-    GridMeans,
-    GridSeries,
-    LabelledSpans,
-    LabellingTimeline,
-    LabelRows,
-    LogLines,
-    MicrophoneTimeline,
-    Rows,
-    SegmentRows,
-    SoundClip,
+    FLOOR,
+    GAPS,
+    NOVELTY,
+    PLOTS,
+    SHARES,
+    LaneRows,
     StateRows,
-    Timeline,
-    TimelineGrid,
-    decibel,
-    no_spans,
     read_rows,
     shown_topic,
 )
+from hearthlog.analyzer.review.timeline import (
+    GridMeans,
+    LabelledSpans,
+    LabellingTimeline,
+    LogLines,
+    MicrophoneTimeline,
+    Plot,
+    PlotKey,
+    PlotKind,
+    SoundClip,
+    Timeline,
+    TimelineGrid,
+    no_spans,
+)
 from hearthlog.models.classifiers.names import MOST_AHEAD_FRAMES
-from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
+from hearthlog.schemas.arrays import Float32, Float64, Int16
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -71,13 +71,15 @@ class _NamedMeans:
     grid: TimelineGrid
     means: dict[tuple[str, ...], GridMeans] = field(default_factory=dict)
 
-    def add(self, names: tuple[str, ...], times: Int64, values: NDArray[np.floating]) -> None:
-        self.means.setdefault(names, GridMeans(self.grid, len(names))).add(times, values)
+    def add(self, plot: Plot) -> None:
+        means = self.means.setdefault(plot.names, GridMeans(self.grid, plot.values.shape[1]))
+        means.add(plot.times, plot.values)
 
-    def series(self) -> GridSeries | None:
-        """Align all rows to the same columns; None without rows."""
-        if not self.means:
-            return None
+    def series(self) -> tuple[tuple[str, ...], Float64]:
+        """Align all rows to the same columns; return their names and values."""
+        if len(self.means) == 1:
+            ((names, means),) = self.means.items()
+            return names, means.values
         names = tuple(dict.fromkeys(name for names in self.means for name in names))
         values = np.full((self.grid.count, len(names)), np.nan)
         for own, means in self.means.items():
@@ -85,241 +87,151 @@ class _NamedMeans:
             present = ~np.isnan(part[:, 0])
             columns = [names.index(name) for name in own]
             values[np.flatnonzero(present)[:, np.newaxis], columns] = part[present]
-        return GridSeries(names, values)
+        return names, values
 
 
 @dataclass
 class _Microphone:
-    """Data collected for one microphone."""
+    """Data collected for one microphone, from successive logs in time order."""
 
-    features: _NamedMeans
-    level_frames: list[FrameValues] = field(default_factory=list)
-    labels: dict[str, _NamedMeans] = field(default_factory=dict)
-    label_frames: dict[str, list[FrameValues]] = field(default_factory=dict)
-    novelty: dict[str, GridMeans] = field(default_factory=dict)
-    spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)
+    name: str
+    grid: TimelineGrid
+    sampled: bool
+    keeps_frames: bool
+    means: dict[PlotKey, _NamedMeans] = field(default_factory=dict)
+    frames: dict[PlotKey, list[Plot]] = field(default_factory=dict)
+    spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)  # by labelling
     reviewed: dict[str, list[LabelledSpans]] = field(default_factory=dict)  # by scenario
     gaps: list[LabelledSpans] = field(default_factory=list)
-    directions: GridMeans | None = None  # ahead, left
     states: list[MicrophoneHealth] = field(default_factory=list)
     clips: list[SoundClip] = field(default_factory=list)
     logs: set[Path] = field(default_factory=set)
 
     @property
     def is_empty(self) -> bool:
-        return not any((self.features.means, self.labels, self.spans, self.gaps, self.clips))
+        return not any((self.means, self.spans, self.gaps, self.clips))
 
-    @property
-    def labellings(self) -> list[str]:
-        """Names of the labellings: the recorder's first, the reviewer's last."""
-        names = {*self.labels, *self.spans}
-        return sorted(names, key=lambda name: (is_review(name), name != LIVE, name))
-
-
-class Collector:
-    """Collects the rows of successive logs in time order."""
-
-    def __init__(self, grid: TimelineGrid, *, sampled: bool, frames: bool) -> None:
-        self._grid = grid
-        self._sampled = sampled
-        self._frames = frames
-        self._microphones: dict[str, _Microphone] = {}
-        self._lines: list[LogLines] = []
-
-    def add(self, rows: Rows) -> None:
-        """Add the rows of one topic, in time order.
-
-        Parameters
-        ----------
-        rows : Rows
-            At least one, of any kind.
-        """
+    def add(self, rows: Plot | LaneRows | StateRows) -> None:
         match rows:
-            case LogLines():
-                self._lines.append(rows)
+            case Plot():
+                self._add_values(rows)
+            case LaneRows() if rows.kind is GAPS:
+                self.gaps.append(rows.spans)
+            case LaneRows():
+                self.spans.setdefault(rows.labelling, []).append(rows.spans)
+                self._forget_frames(rows.labelling)
             case StateRows():
-                for state in rows.states:
-                    self._microphone(state.microphone).states.append(state)
-            case FeatureRows():
-                self._add_features(rows)
-            case LabelRows():
-                self._add_labels(rows)
-            case SegmentRows():
-                self._spans(rows.microphone, rows.labelling).append(rows.spans)
-                self._forget_frames(rows.microphone, rows.labelling)
-            case GapRows():
-                self._microphone(rows.microphone).gaps.append(rows.spans)
-            case DirectionRows():
-                microphone = self._microphone(rows.microphone)
-                if microphone.directions is None:
-                    microphone.directions = GridMeans(self._grid, 2)
-                microphone.directions.add(rows.times, rows.directions)
+                self.states += rows.states
 
-    def add_log(self, microphone: str, log: Path) -> None:
-        """Record that a log or layer has topics of a microphone."""
-        self._microphone(microphone).logs.add(log)
+    def _add_values(self, rows: Plot) -> None:
+        key = rows.kind, rows.labelling
+        self.means.setdefault(key, _NamedMeans(self.grid)).add(rows)
+        if rows.kind.frame_step and (
+            self.keeps_frames or (rows.kind is SHARES and not self.sampled)
+        ):
+            values = rows.kind.of_means(rows.values)
+            self.frames.setdefault(key, []).append(rows._replace(values=values))
+            self._forget_frames(rows.labelling)
 
-    def add_review(self, review: Mapping[str, Reviewed]) -> None:
-        """Add the marks within the span of the grid, and the reviewed spans."""
-        for scenario, (marks, reviewed) in review.items():
-            for mark in marks:
-                if mark.start < self._grid.end and mark.end > self._grid.start:
-                    span = np.array([mark.start]), np.array([mark.end])
-                    label = np.array([mark.label], object)
-                    own = self._spans(mark.microphone, review_labelling(scenario))
-                    own.append(LabelledSpans(*span, label))
-                    self._looked_at(mark.microphone, scenario)
-            for one in reviewed:
-                self._looked_at(one.microphone, scenario).append(_one_span(one))
-
-    def _looked_at(self, microphone: str, scenario: str) -> list[LabelledSpans]:
-        return self._microphone(microphone).reviewed.setdefault(scenario, [])
-
-    def add_clip(self, microphone: str, clip: SoundClip) -> None:
-        """Add a clip of kept sound."""
-        self._microphone(microphone).clips.append(clip)
-
-    def microphones(self) -> dict[str, MicrophoneTimeline]:
-        """Return the timelines of the microphones that have data."""
-        return {
-            name: self._timeline(name, rows)
-            for name, rows in sorted(self._microphones.items())
-            if not rows.is_empty
-        }
-
-    def logs(self, microphone: str) -> set[Path]:
-        """Return the logs and layers that have topics of a microphone."""
-        return self._microphones[microphone].logs
-
-    def lines(self) -> LogLines:
-        """Return the lines of all logs, in time order."""
-        if not self._lines:
-            return LogLines(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
-        times, levels, texts = map(np.concatenate, zip(*self._lines, strict=True))
-        order = np.argsort(times, kind="stable")
-        return LogLines(times[order], levels[order], texts[order])
-
-    def _microphone(self, name: str) -> _Microphone:
-        return self._microphones.setdefault(name, _Microphone(_NamedMeans(self._grid)))
-
-    def _spans(self, microphone: str, labelling: str) -> list[LabelledSpans]:
-        return self._microphone(microphone).spans.setdefault(labelling, [])
-
-    def _add_features(self, rows: FeatureRows) -> None:
-        microphone = self._microphone(rows.microphone)
-        microphone.features.add(rows.names, rows.times, rows.values)
-        if self._frames and ENERGY in rows.names:
-            level = decibel(rows.values[:, rows.names.index(ENERGY)])
-            frames = FrameValues(("level",), rows.times, level[:, np.newaxis])
-            microphone.level_frames.append(frames)
-
-    def _add_labels(self, rows: LabelRows) -> None:
-        microphone, name = self._microphone(rows.microphone), rows.labelling
-        means = microphone.labels.setdefault(name, _NamedMeans(self._grid))
-        means.add(rows.names, rows.times, rows.probabilities)
-        if not self._sampled:
-            frames = FrameValues(rows.names, rows.times, rows.probabilities)
-            microphone.label_frames.setdefault(name, []).append(frames)
-            self._forget_frames(rows.microphone, name)
-        finite = np.isfinite(rows.novelty)
-        if finite.any():
-            novelty = microphone.novelty.setdefault(name, GridMeans(self._grid, 1))
-            novelty.add(rows.times[finite], rows.novelty[finite, np.newaxis])
-
-    def _forget_frames(self, name: str, labelling: str) -> None:
+    def _forget_frames(self, labelling: str) -> None:
         """Drop the frames covered by segments, unless single frames are kept."""
-        microphone = self._microphone(name)
-        spans, frames = microphone.spans.get(labelling), microphone.label_frames.get(labelling)
-        while not self._frames and spans and frames and frames[0].times[-1] < spans[-1].ends[-1]:
+        spans, frames = self.spans.get(labelling), self.frames.get((SHARES, labelling))
+        while (
+            not self.keeps_frames and spans and frames and frames[0].times[-1] < spans[-1].ends[-1]
+        ):
             del frames[0]
 
-    def _timeline(self, name: str, rows: _Microphone) -> MicrophoneTimeline:
-        features = rows.features.series()
-        level = None
-        if features is not None and ENERGY in features.names:
-            level = decibel(features.values[:, features.names.index(ENERGY)])
+    def timeline(self) -> MicrophoneTimeline:
+        """Return all collected data, and release the clips."""
+        labels = {labelling for kind, labelling in self.means if kind is SHARES}
+        names = sorted({*labels, *self.spans}, key=lambda one: (is_review(one), one != LIVE, one))
+        keys = [(kind, labelling) for kind in PLOTS for labelling in ("", *names)]
+        plots = {key: plot for key in keys if (plot := self._plot(*key)) is not None}
         return MicrophoneTimeline(
-            name=name,
-            labellings=[self._labelling(rows, each) for each in rows.labellings],
-            features=features,
-            level=level,
-            level_frames=rows.level_frames,
-            floor=_floor(rows.states, self._grid, features),
-            reviewed=self._join(rows.reviewed.get("", [])),
-            gaps=self._join(rows.gaps),
-            troubles=_trouble_spans(rows.states, self._grid.end),
-            clips=_join_clips(rows.clips),
-            direction=None if rows.directions is None else degrees_of(rows.directions.values),
+            name=self.name,
+            labellings=[self._labelling(name, plots.get((SHARES, name))) for name in names],
+            plots=plots,
+            frames={k: self.frames[k] for k in keys if self.keeps_frames and k in self.frames},
+            reviewed=self._join(self.reviewed.get("", [])),
+            gaps=self._join(self.gaps),
+            troubles=_trouble_spans(self.states, self.grid.end),
+            clips=_join_clips(self.clips),
             reviewed_scenarios={
-                name: self._join(parts) for name, parts in sorted(rows.reviewed.items()) if name
+                name: self._join(parts) for name, parts in sorted(self.reviewed.items()) if name
             },
         )
 
-    def _labelling(self, rows: _Microphone, name: str) -> LabellingTimeline:
-        means, frames = rows.labels.get(name), rows.label_frames.get(name, [])
-        parts = rows.spans.get(name, [])
+    def _plot(self, kind: PlotKind, labelling: str) -> Plot | None:
+        if kind is FLOOR and not labelling:
+            return self._floor()
+        means = self.means.get((kind, labelling))
+        if means is None:
+            return None
+        names, values = means.series()
+        if kind is NOVELTY:
+            names = (f"novelty, {labelling}",)
+        place = self.name, labelling, names, self.grid.middles
+        return Plot(kind, *place, kind.of_means(values), self.grid.step)
+
+    def _floor(self) -> Plot | None:
+        """Hold each floor value until the next message, where features were recorded."""
+        states = [state for state in self.states if not math.isnan(state.floor_dbfs)]
+        features = self._plot(FEATURES, "")
+        if not states or features is None:
+            return None
+        floors = np.array([math.nan, *(state.floor_dbfs for state in states)])
+        floor = floors[np.searchsorted([state.time for state in states], features.times, "right")]
+        floor = np.where(np.isnan(features.values).all(axis=1), math.nan, floor)
+        return features._replace(kind=FLOOR, names=("floor",), values=floor[:, np.newaxis])
+
+    def _labelling(self, name: str, shares: Plot | None) -> LabellingTimeline:
+        parts = self.spans.get(name, [])
         end = max((int(spans.ends.max()) for spans in parts), default=0)
-        parts = [*parts, *_runs(frames, end, FRAME_NANOSECONDS)]  # open segments are not logged yet
-        if not parts and means is not None:
-            parts = list(_runs(_shares(means, self._grid), 0, self._grid.step))
-        return LabellingTimeline(
-            name,
-            self._join(parts),
-            None if means is None else means.series(),
-            rows.novelty[name].values[:, 0] if name in rows.novelty else None,
-            frames if self._frames else (),
-        )
+        frames = self.frames.get((SHARES, name), [])  # open segments are not logged yet
+        parts = [*parts, *_runs(frames, end, FRAME_NANOSECONDS)]
+        if not parts and shares is not None:
+            means = self.means[SHARES, name].means
+            parts = list(_runs(_shares(means, self.grid), 0, self.grid.step))
+        return LabellingTimeline(name, self._join(parts), () if shares is None else shares.names)
 
     def _join(self, parts: Sequence[LabelledSpans]) -> LabelledSpans:
         """Concatenate spans in time order, clipped to the grid."""
         if not parts:
             return no_spans()
         spans = LabelledSpans(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-        starts = np.maximum(spans.starts, self._grid.start)
-        ends = np.minimum(spans.ends, self._grid.end)
+        starts = np.maximum(spans.starts, self.grid.start)
+        ends = np.minimum(spans.ends, self.grid.end)
         inside = np.flatnonzero(starts < ends)
         order = inside[np.argsort(starts[inside], kind="stable")]
         return LabelledSpans(starts[order], ends[order], spans.texts[order])
 
 
-def _one_span(span: ReviewedSpan) -> LabelledSpans:
-    text = np.array([span.chosen], object)
-    return LabelledSpans(np.array([span.start]), np.array([span.end]), text)
+def _one_span(start: int, end: int, text: str) -> LabelledSpans:
+    return LabelledSpans(np.array([start]), np.array([end]), np.array([text], object))
 
 
-def _shares(means: _NamedMeans, grid: TimelineGrid) -> Iterator[FrameValues]:
+def _shares(means: Mapping[tuple[str, ...], GridMeans], grid: TimelineGrid) -> Iterator[Plot]:
     """Yield the grid shares as frames, without empty shares."""
-    for names, part in means.means.items():
+    for names, part in means.items():
         values = part.values
         present = ~np.isnan(values[:, 0])
-        yield FrameValues(names, grid.edges[:-1][present], values[present].astype(np.float32))
+        times = grid.edges[:-1][present]
+        yield Plot(SHARES, "", "", names, times, values[present].astype(np.float32))
 
 
-def _runs(parts: Iterable[FrameValues], after: int, step: int) -> Iterator[LabelledSpans]:
+def _runs(parts: Iterable[Plot], after: int, step: int) -> Iterator[LabelledSpans]:
     """Merge successive frames (`step` apart) with the same likeliest class, from a time on."""
-    for names, all_times, all_values in parts:
-        later = all_times >= after
-        times, values = all_times[later], all_values[later]
+    for part in parts:
+        later = part.times >= after
+        times, values = part.times[later], part.values[later]
         if not len(times):
             continue
         best = values.argmax(axis=1)
         broken = np.diff(times, prepend=times[0]) > 1.5 * step
         first = np.flatnonzero(broken | (np.diff(best, prepend=-1) != 0))
         last = np.append(first[1:], len(times)) - 1
-        texts = np.array(names, object)[best[first]]
+        texts = np.array(part.names, object)[best[first]]
         yield LabelledSpans(times[first], times[last] + step, texts)
-
-
-def _floor(
-    states: Sequence[MicrophoneHealth], grid: TimelineGrid, features: GridSeries | None
-) -> Float64 | None:
-    """Hold each floor value until the next message, where features were recorded."""
-    states = [state for state in states if not math.isnan(state.floor_dbfs)]
-    if not states or features is None:
-        return None
-    floors = np.array([math.nan, *(state.floor_dbfs for state in states)])
-    floor = floors[np.searchsorted([state.time for state in states], grid.middles, "right")]
-    return np.where(np.isnan(features.values).all(axis=1), math.nan, floor)
 
 
 def _trouble_spans(states: Sequence[MicrophoneHealth], end: int) -> LabelledSpans:
@@ -350,7 +262,7 @@ def _join_clips(parts: list[SoundClip]) -> list[SoundClip]:
     return clips
 
 
-SHARES = 1_200  # maximum per timeline: more than a screen has pixels
+MOST_SHARES = 1_200  # of a timeline: more than a screen has pixels
 MOST_CLIP_SECONDS = 3_600  # maximum kept sound shown: 115 MB
 MOST_FRAMES = 3 * 3600 * NANOSECONDS  # maximum span with all frames kept; a day's are 90 MB
 _PART = 3600 * NANOSECONDS
@@ -398,7 +310,7 @@ def read_timeline(
     first = min(file.first for file in files) if start is None else start
     last = max(file.last for file in files) + FRAME_NANOSECONDS if end is None else end
     last = max(last, first + _SHORTEST)
-    grid = TimelineGrid(first, last, min(SHARES, (last - first) // _SHORTEST))
+    grid = TimelineGrid(first, last, min(MOST_SHARES, (last - first) // _SHORTEST))
     every = -(-sum(file.size for file in files if not file.layer) // _WHOLE_BYTES)
     reader = _Reader(grid, max(every, 1))
     for number, file in enumerate(files):
@@ -407,24 +319,24 @@ def read_timeline(
         except (LogError, DataError) as error:
             losses.append(str(error))
         progress((number + 1) / len(files))
-    collector = reader.collector
-    microphones = collector.microphones()
-    if not microphones:
+    collected = {name: one for name, one in sorted(reader.microphones.items()) if not one.is_empty}
+    if not collected:
         raise _nothing(losses, limited=limited)
+    microphones = {name: one.timeline() for name, one in collected.items()}
     coverage = {
         name: coverage_of(
             [
                 (file.first, file.last + FRAME_NANOSECONDS, file.path)
                 for file in inside
-                if not file.layer and file.path in collector.logs(name)
+                if not file.layer and file.path in one.logs
             ]
         )
-        for name in microphones
+        for name, one in collected.items()
     }
     for name, microphone in microphones.items():
         microphone.gaps = _unheard(microphone, coverage[name], grid)
     home = str(home_zone(zone, latest_records(file.path for file in files)))
-    return Timeline(grid, microphones, collector.lines(), home, coverage, reader.every, losses)
+    return Timeline(grid, microphones, reader.lines(), home, coverage, reader.every, losses)
 
 
 def read_frames(
@@ -497,11 +409,24 @@ class _Reader:
 
     def __init__(self, grid: TimelineGrid, every: int) -> None:
         self.every = every
-        frames = every == 1 and grid.end - grid.start <= MOST_FRAMES
-        self.collector = Collector(grid, sampled=every > 1, frames=frames)
+        self.microphones: dict[str, _Microphone] = {}
         self._grid = grid
+        self._keeps_frames = every == 1 and grid.end - grid.start <= MOST_FRAMES
         self._clip_seconds = 0.0
         self._layers: dict[tuple[Path, str], Path] = {}
+        self._lines: list[LogLines] = []
+
+    def lines(self) -> LogLines:
+        """Return the lines of all logs, in time order."""
+        if not self._lines:
+            return LogLines(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
+        times, levels, texts = map(np.concatenate, zip(*self._lines, strict=True))
+        order = np.argsort(times, kind="stable")
+        return LogLines(times[order], levels[order], texts[order])
+
+    def _microphone(self, name: str) -> _Microphone:
+        new = _Microphone(name, self._grid, self.every > 1, self._keeps_frames)
+        return self.microphones.setdefault(name, new)
 
     def read(self, file: TimedFile) -> None:
         """Collect the messages of a log or layer."""
@@ -515,7 +440,20 @@ class _Reader:
             types = {name: FIELDS[name] for name in _OF_LAYERS}
         self._read_messages(file, types)
         if not file.layer:  # last, since a damaged layer must not hide its log
-            self.collector.add_review(read_review(file.path))
+            self._add_review(read_review(file.path))
+
+    def _add_review(self, review: Mapping[str, Reviewed]) -> None:
+        """Add the marks within the span of the grid, and the reviewed spans."""
+        for scenario, (marks, reviewed) in review.items():
+            for mark in marks:
+                if mark.start < self._grid.end and mark.end > self._grid.start:
+                    microphone = self._microphone(mark.microphone)
+                    own = microphone.spans.setdefault(review_labelling(scenario), [])
+                    own.append(_one_span(mark.start, mark.end, mark.label))
+                    microphone.reviewed.setdefault(scenario, [])
+            for one in reviewed:
+                own = self._microphone(one.microphone).reviewed.setdefault(scenario, [])
+                own.append(_one_span(one.start, one.end, one.chosen))
 
     def _read_messages(self, file: TimedFile, types: Mapping[str, Sequence[str]]) -> None:
         for topics, end, every in self._parts(file):
@@ -557,16 +495,18 @@ class _Reader:
     def _collect(self, path: Path, columns: Columns) -> None:
         topic = shown_topic(columns.topic)
         if topic is not None:
-            self.collector.add_log(topic.microphone, path)
+            self._microphone(topic.microphone).logs.add(path)
         if columns.type == message_types.LABEL:  # labels are logged later than their frame
             stamps = columns["header.stamp"]
             inside = (stamps >= self._grid.start) & (stamps < self._grid.end)
             columns = columns if inside.all() else columns.take(np.flatnonzero(inside))
         elif columns.type not in _OF_SPANS:
             columns = columns.between(self._grid.start, self._grid.end)
-        rows = read_rows(path, columns) if len(columns) else None
-        if rows is not None:
-            self.collector.add(rows)
+        for rows in read_rows(path, columns):
+            if isinstance(rows, LogLines):
+                self._lines.append(rows)
+            else:
+                self._microphone(rows.microphone).add(rows)
 
     def _read_clips(self, path: Path) -> None:
         with LogFile(path) as file:
@@ -582,4 +522,5 @@ class _Reader:
                         f"{path}: more than {MOST_CLIP_SECONDS // 60} minutes of sound: what comes "
                         "later is not shown; name a shorter span with --start and --end"
                     )
-                self.collector.add_clip(name.microphone, SoundClip(start, rate, _as_kept(samples)))
+                clip = SoundClip(start, rate, _as_kept(samples))
+                self._microphone(name.microphone).clips.append(clip)

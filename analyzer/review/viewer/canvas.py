@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.logs.spans import Spans
-from hearthlog.analyzer.review.timeline import FrameValues, HomeClock, LogLines, SoundClip
+from hearthlog.analyzer.review.timeline import HomeClock, LogLines, Plot, SoundClip, Style
 from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float64, Int64
 
@@ -98,22 +98,32 @@ class Canvas:
         column = rr.StateChange.columns(state=pa.array(states, pa.string()))
         self.recording.send_columns(entity, [self._time_column(times)], column)
 
-    def configure_bands(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Set the names and colours of the bands of an entity.
-
-        Parameters
-        ----------
-        colours : sequence of Colour
-            Red, green and blue of each band, 0 to 255.
-        """
-        widths = [_STROKE_WIDTH] * len(names)
-        style = rr.SeriesLines(
-            names=names, colors=colours, widths=widths, aggregation_policy="MinMax"
-        )
-        self.recording.log(entity, style, static=True)
+    def configure(
+        self, entity: str, style: Style, names: Sequence[str], colours: Sequence[Colour] = ()
+    ) -> None:
+        """Set the names and colours (red, green and blue, 0 to 255) of the columns of an entity."""
+        count = len(names)
+        look: rr.SeriesLines | rr.SeriesPoints
+        match style:
+            case Style.BANDS:
+                widths = [_STROKE_WIDTH] * count
+                look = rr.SeriesLines(
+                    names=names, colors=colours, widths=widths, aggregation_policy="MinMax"
+                )
+            case Style.LINE:
+                look = rr.SeriesLines(names=names, colors=colours, aggregation_policy="average")
+            case Style.POINTS:
+                sizes = [_POINT] * count
+                look = rr.SeriesPoints(
+                    names=names, colors=colours, markers=["circle"] * count, marker_sizes=sizes
+                )
+            case Style.HEAT_MAP:
+                sizes = [_HEAT_SQUARE] * count
+                look = rr.SeriesPoints(names=names, markers=["square"] * count, marker_sizes=sizes)
+        self.recording.log(entity, look, static=True)
 
     def add_bands(
-        self, entity: str, times: Int64, shares: Float64, length: int, strokes: int = 1
+        self, entity: str, times: Int64, shares: NDArray[np.floating], length: int, strokes: int = 1
     ) -> None:
         """Stack shares of one as bands: each is filled by a line that goes up and down in it.
 
@@ -121,7 +131,7 @@ class Canvas:
         ----------
         times : np.ndarray [shape=(n,)], int64
             Middles of spans, in nanoseconds of UTC.
-        shares : np.ndarray [shape=(n, k)], float64
+        shares : np.ndarray [shape=(n, k)], float
             0 to 1; NaN where there is nothing.
         length : int
             Of a span, in nanoseconds.
@@ -135,30 +145,6 @@ class Canvas:
         steps = (np.arange(2 * strokes) + 0.5) / (2 * strokes) - 0.5
         places = times[:, np.newaxis] + (steps * length).astype(np.int64)
         self.draw_lines(entity, places.ravel(), ends.reshape(-1, shares.shape[1]))
-
-    def configure_lines(self, entity: str, names: Sequence[str], colours: Sequence[Colour]) -> None:
-        """Set the names and colours of the lines of an entity.
-
-        Parameters
-        ----------
-        colours : sequence of Colour
-            Red, green and blue of each line, 0 to 255.
-        """
-        style = rr.SeriesLines(names=names, colors=colours, aggregation_policy="average")
-        self.recording.log(entity, style, static=True)
-
-    def configure_points(self, entity: str, name: str, colour: Colour) -> None:
-        """Set the name and the colour of points, which `draw_lines` draws.
-
-        Parameters
-        ----------
-        colour : Colour
-            Red, green and blue, 0 to 255.
-        """
-        style = rr.SeriesPoints(
-            names=[name], colors=[colour], markers=["circle"], marker_sizes=[_POINT]
-        )
-        self.recording.log(entity, style, static=True)
 
     def draw_lines(self, entity: str, times: Int64, values: NDArray[np.floating]) -> None:
         """Draw a line for each column of values.
@@ -178,7 +164,7 @@ class Canvas:
             self.recording.send_columns(entity, [stamps], column)
 
     def draw_frames(
-        self, entity: str, names: Sequence[str], parts: Iterable[FrameValues], step: float
+        self, entity: str, names: Sequence[str], parts: Iterable[Plot], step: float
     ) -> None:
         """Draw frames as lines, interrupted where frames are missing.
 
@@ -186,7 +172,7 @@ class Canvas:
 
         Parameters
         ----------
-        parts : iterable of FrameValues
+        parts : iterable of Plot
             Each with at least one frame.
         """
         for part in parts:
@@ -196,22 +182,14 @@ class Canvas:
             kept = changes | np.append(changes[1:], True)
             self.draw_lines(entity, times[kept], rounded[kept])
 
-    def configure_heat_map(self, entity: str, names: Sequence[str]) -> None:
-        """Set the names of the rows of a heat map."""
-        count = len(names)
-        style = rr.SeriesPoints(
-            names=names, markers=["square"] * count, marker_sizes=[_HEAT_SQUARE] * count
-        )
-        self.recording.log(entity, style, static=True)
-
-    def add_shades(self, entity: str, times: Int64, shade: Float64) -> None:
+    def add_shades(self, entity: str, times: Int64, shade: NDArray[np.floating]) -> None:
         """Draw squares of a heat map.
 
         Parameters
         ----------
         times : np.ndarray [shape=(n,)], int64
             In nanoseconds of UTC.
-        shade : np.ndarray [shape=(n, k)], float64
+        shade : np.ndarray [shape=(n, k)], float
             0 (dark) to 1 (bright).
         """
         scale = np.linspace(0.0, 1.0, len(_DARK_TO_BRIGHT))
@@ -268,7 +246,7 @@ class Canvas:
         return rr.TimeColumn(self.clock.name, timestamp=shown)
 
 
-def _with_holes(part: FrameValues, names: Sequence[str]) -> tuple[Int64, Float64]:
+def _with_holes(part: Plot, names: Sequence[str]) -> tuple[Int64, Float64]:
     """Align frames to the named columns, and insert a row of NaN where frames are missing."""
     values = np.full((len(part.times), len(names)), np.nan)
     values[:, [names.index(name) for name in part.names]] = part.values

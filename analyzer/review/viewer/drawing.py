@@ -15,14 +15,12 @@ from hearthlog.analyzer.review.lanes import (
     SHARES,
     Checked,
     Lane,
-    Plot,
-    Style,
     labelling_in_words,
     labellings_of,
     timeline_lanes,
     timeline_plots,
 )
-from hearthlog.analyzer.review.timeline import FrameValues, MicrophoneTimeline, Timeline
+from hearthlog.analyzer.review.timeline import MicrophoneTimeline, Plot, Style, Timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.models.classes import in_words
 from hearthlog.schemas.frames import NANOSECONDS
@@ -32,8 +30,6 @@ LINES, CLIP, WORDS = "events", "clip", "words"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # suffix of a microphone's name
 ASKED, ASKED_WORDS = "asked", "words/asked"
-_CLOSE_KINDS = SHARES, LEVEL  # of plots
-_SHARE_STEP, _LEVEL_STEP = 0.01, 0.1  # smaller steps are invisible
 _CLOSE_STROKES, _ASKED_STROKES = 1_200, 600  # maximum strokes of a band
 _ASKED: Colour = (245, 240, 225)
 
@@ -90,19 +86,20 @@ class LanePlace(NamedTuple):
     height: float
 
 
-def lane_places(lanes: Sequence[Lane]) -> list[LanePlace]:
+def placed_lanes(timeline: Timeline) -> list[tuple[Lane, LanePlace]]:
     """Assign a place to each lane; all labellings of a microphone share the same places."""
+    lanes = list(timeline_lanes(timeline))
     names: dict[str, dict[str, None]] = {}
     for lane in lanes:
         names.setdefault(lane.microphone, {})[lane.name] = None
-    places = []
+    placed = []
     for lane in lanes:
         own = list(names[lane.microphone])
         number = own.index(lane.name)
         root = lanes_entity(lane.microphone, lane.labelling)
         name = f"{lane.microphone}/{WORDS}/names/{_word(lane.labelling) or 'all'}/{number:02}"
-        places.append(LanePlace(f"{root}/{number:02}", name, len(own) - number - 0.5))
-    return places
+        placed.append((lane, LanePlace(f"{root}/{number:02}", name, len(own) - number - 0.5)))
+    return placed
 
 
 def lanes_entity(microphone: str, labelling: str) -> str:
@@ -124,16 +121,17 @@ def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]
         If the timeline's time zone is unknown.
     """
     reviewed = {}
-    lanes = list(timeline_lanes(timeline))
     canvas.begin(NOTHING, timeline.grid.start)
-    for lane, place in zip(lanes, lane_places(lanes), strict=True):
+    for lane, place in placed_lanes(timeline):
         canvas.write(place.name, lane.name)
         drawn = DrawnLane(place.entity, place.height, timeline.grid.step)
         drawn.show(lane, canvas)
         if REVIEWED in lane.colours:
             reviewed[lane.microphone, lane.name] = drawn
-    _draw_plots(timeline, canvas)
     for plot in timeline_plots(timeline):
+        if len(plot.times):
+            configure_plot(plot, plot_entity(plot), canvas)
+            add_to_plot(plot, plot_entity(plot), canvas)
         canvas.write(text_entity(plot), plot.text)
     for microphone in timeline.microphones.values():
         if microphone.clips:
@@ -144,8 +142,7 @@ def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]
 
 def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
     """Write next to the recorder's classes how many of their sounds were right in this home."""
-    lanes = list(timeline_lanes(timeline))
-    for lane, place in zip(lanes, lane_places(lanes), strict=True):
+    for lane, place in placed_lanes(timeline):
         known = checked.get((lane.microphone, lane.name))
         if lane.labelling == LIVE and known is not None:
             canvas.write(place.name, f"{lane.name} · {known.right}/{known.labelled} right")
@@ -155,7 +152,7 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
     """Draw the close-ups of a short timeline next to the longer timeline around it."""
     strokes = -(-_CLOSE_STROKES // timeline.grid.count)
     for plot in timeline_plots(timeline):
-        if plot.kind in _CLOSE_KINDS:
+        if plot.kind.frame_step:
             entity = plot_entity(plot, CLOSE_UP)
             if not len(before.starts):
                 configure_plot(plot, entity, canvas)
@@ -175,7 +172,7 @@ def draw_requested(number: int, start: int, end: int, text: str, canvas: Canvas)
     if number:
         canvas.hide(f"{ASKED}/{number - 1}")
     entity, middle = f"{ASKED}/{number}", np.array([(start + end) // 2])
-    canvas.configure_bands(entity, [text], [_ASKED])
+    canvas.configure(entity, Style.BANDS, [text], [_ASKED])
     canvas.add_bands(entity, middle, np.ones((1, 1)), end - start, _ASKED_STROKES)
     canvas.write(ASKED_WORDS, text)
 
@@ -191,32 +188,23 @@ def draw_frames(
         In nanoseconds of UTC, for the first samples of frames; `end` is excluded. By default all.
     """
     for microphone in timeline.microphones.values():
-        for labelling in microphone.labellings:
-            if labelling.probabilities is not None and labelling.frames:
-                entity = frames_entity(microphone.name, labelling.name)
-                names = labelling.probabilities.names
-                words = [in_words(name) for name in names]
-                canvas.configure_lines(entity, words, [colour(name) for name in names])
-                parts = _between(labelling.frames, start, end)
-                canvas.draw_frames(entity, names, parts, _SHARE_STEP)
-        if microphone.level_frames:
-            entity = frames_entity(microphone.name, LEVEL.name)
-            canvas.configure_lines(entity, ["level"], [LEVEL.colour])
-            parts = map(_level_means, _between(microphone.level_frames, start, end))
-            canvas.draw_frames(entity, ["level"], parts, _LEVEL_STEP)
+        for key, frames in microphone.frames.items():
+            plot = microphone.plots[key]
+            entity = frames_entity(plot)
+            parts = _between(frames, start, end)
+            configure_plot(plot, entity, canvas, Style.LINE)
+            if plot.kind is LEVEL:
+                parts = map(_fifths, parts)
+            canvas.draw_frames(entity, plot.names, parts, plot.kind.frame_step)
 
 
-def configure_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
-    """Set the names and colours of the series of a plot."""
+def configure_plot(plot: Plot, entity: str, canvas: Canvas, style: Style | None = None) -> None:
+    """Set the names and colours of the series of a plot, drawn in its own or another style."""
+    names: Sequence[str] = plot.names
+    colours = [plot.kind.colour]
     if plot.kind.style is Style.BANDS:
-        words = [in_words(name) for name in plot.names]
-        canvas.configure_bands(entity, words, [colour(name) for name in plot.names])
-    elif plot.kind.style is Style.HEAT_MAP:
-        canvas.configure_heat_map(entity, plot.names)
-    elif plot.kind.style is Style.POINTS:
-        canvas.configure_points(entity, plot.names[0], plot.kind.colour)
-    else:
-        canvas.configure_lines(entity, plot.names, [plot.kind.colour])
+        names, colours = [in_words(name) for name in plot.names], [*map(colour, plot.names)]
+    canvas.configure(entity, style or plot.kind.style, names, colours)
 
 
 def add_to_plot(plot: Plot, entity: str, canvas: Canvas, strokes: int = 1) -> None:
@@ -241,41 +229,31 @@ def text_entity(plot: Plot) -> str:
     return f"{plot.microphone}/{WORDS}/{_word(plot.kind.view)}{labelling}"
 
 
-def frames_entity(microphone: str, name: str) -> str:
-    """Return the entity of the frames of a labelling, or of the level."""
-    return f"{microphone}/frames/{_word(name)}"
+def frames_entity(plot: Plot) -> str:
+    """Return the entity of the frames of a plot."""
+    return f"{plot.microphone}/frames/{_word(plot.labelling or plot.kind.name)}"
 
 
 def _length(strips: Iterable[_Strip]) -> int:
     return sum(end - start for start, end, _ in strips)
 
 
-def _draw_plots(timeline: Timeline, canvas: Canvas) -> None:
-    for plot in timeline_plots(timeline):
-        if len(plot.times):
-            entity = plot_entity(plot)
-            configure_plot(plot, entity, canvas)
-            add_to_plot(plot, entity, canvas)
-
-
-def _between(
-    parts: Sequence[FrameValues], start: int | None, end: int | None
-) -> Iterator[FrameValues]:
+def _between(parts: Sequence[Plot], start: int | None, end: int | None) -> Iterator[Plot]:
     """Yield the frames that begin in a span of time."""
-    for names, times, values in parts:
-        first = 0 if start is None else int(np.searchsorted(times, start))
-        last = len(times) if end is None else int(np.searchsorted(times, end))
+    for part in parts:
+        first = 0 if start is None else int(np.searchsorted(part.times, start))
+        last = len(part.times) if end is None else int(np.searchsorted(part.times, end))
         if first < last:
-            yield FrameValues(names, times[first:last], values[first:last])
+            yield part._replace(times=part.times[first:last], values=part.values[first:last])
 
 
-def _level_means(part: FrameValues) -> FrameValues:
-    """Average the level over each fifth of a second, enough to show the noise of a room."""
+def _fifths(part: Plot) -> Plot:
+    """Average over each fifth of a second, enough to show the noise of a room."""
     fifths = part.times // (NANOSECONDS // 5)
     first = np.flatnonzero(np.diff(fifths, prepend=-1))
     sizes = np.diff(first, append=len(part.times))
     means = np.add.reduceat(part.values, first, axis=0) / sizes[:, np.newaxis]
-    return FrameValues(part.names, part.times[first], means.astype(np.float32))
+    return part._replace(times=part.times[first], values=means.astype(np.float32))
 
 
 def _word(name: str) -> str:
@@ -391,8 +369,7 @@ def review_layout(
     plots: dict[str, list[Plot]] = {name: [] for name in timeline.microphones}
     for plot in timeline_plots(timeline):
         plots[plot.microphone].append(plot)
-    lanes = list(timeline_lanes(timeline))
-    places = list(zip(lanes, lane_places(lanes), strict=True))
+    places = placed_lanes(timeline)
     stacks: dict[str, list[Row]] = {}
     for name, microphone in timeline.microphones.items():
         own = [(lane.labelling, place) for lane, place in places if lane.microphone == name]
@@ -503,14 +480,9 @@ def _sounds(microphone: MicrophoneTimeline) -> list[rrb.View | rrb.Container]:
 
 def _frame_views(microphone: MicrophoneTimeline, every: int) -> list[rrb.View | rrb.Container]:
     """Show frames, unless only a sample is read."""
-    known = [one for one in microphone.labellings if one.probabilities is not None]
-    scales = {one.name: SHARES.scale for one in known}
-    if microphone.level is not None:
-        scales[LEVEL.name] = LEVEL.scale
-    if every > 1:
-        return []
-    rows = [(name, frames_entity(microphone.name, name), scales[name]) for name in scales]
+    plots = [plot for plot in microphone.plots.values() if plot.kind.frame_step and every == 1]
+    names = [labelling_in_words(plot.labelling or plot.kind.name) for plot in plots]
     return [
-        _time_series(f"{labelling_in_words(name)}, frame by frame: zoom in", [entity], scale)
-        for name, entity, scale in rows
+        _time_series(f"{name}, frame by frame: zoom in", [frames_entity(plot)], plot.kind.scale)
+        for name, plot in zip(names, plots, strict=True)
     ]

@@ -16,9 +16,9 @@ import rerun.blueprint as rrb
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.network import free_port
-from hearthlog.analyzer.review.lanes import PLOTS, Checked, Plot, StateLane
+from hearthlog.analyzer.review.lanes import PLOTS, Checked, StateLane
 from hearthlog.analyzer.review.live_timeline import Update
-from hearthlog.analyzer.review.timeline import LogLines, Timeline, home_clock
+from hearthlog.analyzer.review.timeline import LogLines, Plot, Timeline, home_clock
 from hearthlog.analyzer.review.timeline_reader import read_frames
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
@@ -172,9 +172,8 @@ class LiveServer:
         A change of the home's clock starts an axis of the new time.
         """
         for update in updates:
-            times = update.changes.times if isinstance(update, StateLane) else update.times
-            if len(times):
-                self._show(update, self._canvas_at(int(times[-1]), zone))
+            if len(update.times):
+                self._show(update, self._canvas_at(int(update.times[-1]), zone))
         if self._canvas is not None and self._plots and not self._is_laid_out:
             layout = _layout(self._plots, self._minutes, self._canvas.clock.name)
             self._recording.send_blueprint(layout, make_active=True, make_default=True)
@@ -197,14 +196,14 @@ class LiveServer:
 
     def _show_lane(self, lane: StateLane, canvas: Canvas) -> None:
         entity = f"{_STATES}/{lane.microphone}/{lane.kind.name}"
-        states = {state for state in lane.changes.states if state is not None}
+        states = {state for state in lane.states if state is not None}
         if entity not in self._lanes and not states:
             return  # a lane appears with its first state
         colours = self._lanes.get(entity) or lane.kind.colours(lane.kind.states)
         if entity not in self._lanes or (states - colours.keys() and len(colours) < _MOST_STATES):
             self._lanes[entity] = lane.kind.colours(sorted(states)) | colours
             canvas.configure_states(entity, self._lanes[entity])
-        canvas.change_states(entity, *lane.changes)
+        canvas.change_states(entity, lane.times, lane.states)
 
     def _show_plot(self, plot: Plot, canvas: Canvas) -> None:
         """Draw into the entity of these names; another model or feature set has its own."""
