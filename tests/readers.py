@@ -5,7 +5,6 @@ They read `logs`, `left` and `models` in the current folder, and get what runs t
 
 import csv
 import json
-import shutil
 from collections import Counter
 from collections.abc import Callable
 from itertools import takewhile
@@ -209,9 +208,10 @@ def by_splicing(run: Run) -> Any:
 
 
 def by_catalog(run: Run) -> Any:
-    said = json.loads(run("catalog", "logs", "--json").stdout)
-    rows = pq.read_table("logs/catalog.parquet").to_pylist()
-    shutil.rmtree("logs/catalog.parquet")
+    said = json.loads(run("catalog", "logs", "--json", "--export", "rows.parquet").stdout)
+    rows = pq.read_table("rows.parquet").to_pylist()
+    for written in ("rows.parquet", "logs/catalog.sqlite"):
+        Path(written).unlink()
     of_files = {"size", "mtime", "input_sha256"}
     return said["labels"], [
         {key: value for key, value in row.items() if key not in of_files} for row in rows

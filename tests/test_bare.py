@@ -65,7 +65,7 @@ NEEDS = {
         "report",
         "train --home logs",
         "train --data sounds.csv --scenario general --output general.safetensors",
-        "catalog logs",
+        "catalog logs --export files.parquet",
         "export logs --topics /mic/label --output label.parquet",
         "discover logs",
         "evaluate log logs --reference marks.txt",

@@ -1,9 +1,7 @@
 """The index of a catalogue saves looking at logs, and never changes what is found in them."""
 
-import hashlib
 import os
 import shutil
-import struct
 import subprocess
 import sys
 import time
@@ -11,7 +9,6 @@ import warnings
 from pathlib import Path
 
 import pytest
-from spliced import run
 from stores import put
 from test_catalog import SECOND, fleet, recording, relabelled
 
@@ -21,7 +18,7 @@ from hearthlog.analyzer.logs.catalog import FINISHED, read_catalog
 from hearthlog.analyzer.logs.catalog_writer import write_catalog
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.schemas.errors import LogError, ignore_progress
-from hearthlog.schemas.logs.files import CATALOG_INDEX, find_logs, time_span
+from hearthlog.schemas.logs.files import CATALOG, find_logs, time_span
 from hearthlog.schemas.logs.writer import LogWriter
 
 __all__ = ["fleet", "recording"]
@@ -61,11 +58,11 @@ def found(folder: Path, start: int | None = None, end: int | None = None) -> tup
 def found_without(fleet: Path, *span: int | None) -> tuple:
     """Tell what it is without a catalogue."""
     away = fleet.parent / "away"
-    (fleet / CATALOG_INDEX).rename(away)
+    (fleet / CATALOG).rename(away)
     try:
         return found(fleet, *span)
     finally:
-        away.rename(fleet / CATALOG_INDEX)
+        away.rename(fleet / CATALOG)
 
 
 @pytest.fixture
@@ -223,7 +220,7 @@ def test_a_folder_that_changed_just_before_it_was_listed_is_listed_again(fleet, 
 
 def test_where_folders_do_not_change_with_their_files_all_are_listed(catalogued, looked_into):
     later = time.time_ns() + 60 * SECOND
-    os.utime(catalogued / CATALOG_INDEX, ns=(later, later))  # as if no folder had noticed it
+    os.utime(catalogued / CATALOG, ns=(later, later))  # as if no folder had noticed it
     found(catalogued)
     assert inner_folders(catalogued) <= set(looked_into)
 
@@ -347,82 +344,3 @@ def test_logs_in_a_store_are_not_opened_where_the_index_knows_them(fleet, in_mem
     second.write_bytes(b"nonsense")
     found(store)
     assert opened == [second]
-
-
-def resealed(data: bytes) -> bytes:
-    return data[:-32] + hashlib.sha256(data[:-32]).digest()
-
-
-def with_count(data: bytes, place: int, value: int) -> bytes:
-    """Let an index say another number in its head."""
-    changed = bytearray(data)
-    struct.pack_into("<Q", changed, 24 + 8 * place, value)
-    return resealed(bytes(changed))
-
-
-def with_logs(data: bytes, *counts: int) -> bytes:
-    """Let an index say of its first folders that they have more logs than they have."""
-    changed = bytearray(data)
-    for number, count in enumerate(counts):
-        place = 24 + 4 * 8 + 16 * number + 8
-        struct.pack_into("<q", changed, place, struct.unpack_from("<q", data, place)[0] + count)
-    return resealed(bytes(changed))
-
-
-DAMAGES = {
-    "empty": lambda _: b"",
-    "cut": lambda data: data[: len(data) // 2],
-    "another file": lambda _: b"path,home\n" * 1000,
-    "a bit of a name": lambda data: data.replace(b"home_2026", b"home_2027", 1),
-    "only a head": lambda data: resealed(data[:40] + bytes(32)),
-    "another version": lambda data: resealed(data.replace(b"logs\x01", b"logs\x02")),
-    "many folders": lambda data: with_count(data, 0, 1 << 60),
-    "fewer logs": lambda data: with_count(data, 1, 1),
-    "longer names": lambda data: with_count(data, 2, (1 << 64) - 1),
-    "no folders": lambda data: with_count(with_count(data, 0, 0), 1, 0),
-    "logs of no folder": lambda data: with_logs(data, 1 << 40, 0),
-    "less than no logs": lambda data: with_logs(data, -1, 1),
-    "a folder outside": lambda data: resealed(data.replace(b"bert\0", b"../a\0")),
-    "a log outside": lambda data: resealed(data.replace(b"home_", b"../a_")),
-    "names in one": lambda data: resealed(data.replace(b"mcap\0", b"mcap_")),
-    "folders in one": lambda data: resealed(data.replace(b"bert\0", b"bert_")),
-    "a folder twice": lambda data: resealed(
-        data.replace(b"north/anna/2026\0", b"bert/2026/03/01\0")
-    ),
-}  # fmt: skip
-
-
-def test_the_damages_are_such(catalogued):
-    data = (catalogued / CATALOG_INDEX).read_bytes()
-    assert all(damage(data) != data for damage in DAMAGES.values())
-    assert resealed(data) == data
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_an_index_that_cannot_be_used_is_not_used_and_made_anew(catalogued, capfd, damage):
-    before, path = found(catalogued), catalogued / CATALOG_INDEX
-    path.write_bytes(DAMAGES[damage](path.read_bytes()))
-    (why,) = read_catalog(catalogued).unusable
-    assert why.startswith(f"{path}: cannot be used as the index of a catalogue (it")
-    assert found(catalogued) == before
-    done = run(capfd, "catalog", catalogued)
-    assert done.stderr == f"hearthlog: {why}; it is made anew\n"
-    assert not read_catalog(catalogued).unusable
-
-
-@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
-def test_what_is_no_file_is_no_index(catalogued, make):
-    before = found(catalogued)
-    (catalogued / CATALOG_INDEX).unlink()
-    make(catalogued / CATALOG_INDEX)
-    assert found(catalogued) == before
-    assert len(read_catalog(catalogued).unusable) == 1
-
-
-def test_an_older_catalogue_has_no_index_and_gets_one(catalogued):
-    before = found(catalogued)
-    (catalogued / CATALOG_INDEX).unlink()
-    assert found(catalogued) == before
-    assert not read_catalog(catalogued).unusable
-    write_catalog(catalogued, read_catalog(catalogued))
-    assert (catalogued / CATALOG_INDEX).exists()

@@ -1,308 +1,91 @@
-"""Catalogue of a log folder: one Parquet file per home with one row per log."""
+"""Catalogue of a folder of homes: one SQLite file with a row for each log."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import os
+import re
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, fields
+from heapq import merge
+from itertools import groupby, islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
-from urllib.parse import quote
+from typing import Any
 
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
-
-from hearthlog.analyzer.logs.locations import (
-    ListedLog,
-    catalogued_name,
-    size_and_time,
-    what_is_wrong,
-)
-from hearthlog.schemas.arrays import Int64
+from hearthlog.analyzer.logs.locations import UNSURE, ListedLog, Listing, list_logs, size_and_time
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.files import is_local, map_logs, store_errors
+from hearthlog.schemas.files import is_local, open_file, store_errors
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
-from hearthlog.schemas.logs.files import CATALOG, log_readers
-from hearthlog.schemas.new_files import private_folder, replaced_file
+from hearthlog.schemas.logs.files import CATALOG, find_logs, log_readers
+from hearthlog.schemas.logs.merged_reading import time_spans
+from hearthlog.schemas.new_files import new_file, replaced_file
 
-_MOMENT = pa.timestamp("ns", "UTC")
-_LABELS = {"label": pa.string(), "minutes": pa.float64(), "segments": pa.int64()}
-_SCENARIOS = {"scenario": pa.string(), "model": pa.string(), **_LABELS}
-_ALWAYS = {
-    "path": pa.string(), "home": pa.string(), "kind": pa.string(), "state": pa.string(),
-    "size": pa.int64(), "mtime": _MOMENT, "frames": pa.int64(),
-    "gaps": pa.int64(), "gap_seconds": pa.float64(),
-    "labels": pa.list_(pa.struct(_LABELS.items())),
-    "scenarios": pa.list_(pa.struct(_SCENARIOS.items())), "microphones": pa.list_(pa.string()),
-}  # fmt: skip
-_IF_KNOWN = {
-    "error": pa.string(), "log": pa.string(), "node": pa.string(),
-    "start": _MOMENT, "end": _MOMENT, "first_frame": pa.uint64(), "first_stamp": _MOMENT,
-    "last_frame": pa.uint64(), "last_stamp": _MOMENT, "feature_set": pa.string(),
-    "model": pa.string(), "model_sha256": pa.string(), "input_sha256": pa.string(),
-    "version": pa.string(),
-}  # fmt: skip
-SCHEMA = pa.schema(
-    [
-        *(pa.field(name, kind, nullable=False) for name, kind in _ALWAYS.items()),
-        *(pa.field(name, kind) for name, kind in _IF_KNOWN.items()),
-    ],
-    metadata={"hearthlog_catalog": "2"},  # version of the columns and their meaning
-)
-_TEXTS = [
-    *(field.name for field in SCHEMA if field.type == pa.string()),
-    "labels.list.element.label",
-    *(f"scenarios.list.element.{name}" for name in ("scenario", "model", "label")),
-    "microphones.list.element",
-]
-_LEAVES = {
-    *(field.name for field in SCHEMA if not pa.types.is_list(field.type)),
-    *(f"labels.list.element.{name}" for name in _LABELS),
-    *(f"scenarios.list.element.{name}" for name in _SCENARIOS),
-    "microphones.list.element",
-}
+# `PRAGMA integrity_check` verifies types and constraints of the rows of a file from elsewhere.
+_SCHEMA = """
+CREATE TABLE folders (
+    folder INTEGER PRIMARY KEY,
+    path TEXT NOT NULL UNIQUE CHECK (
+        path NOT GLOB '/*' AND '/' || path || '/' NOT GLOB '*/../*' AND instr(path, char(0)) = 0
+    ),
+    home TEXT NOT NULL,
+    changed INTEGER NOT NULL
+) STRICT;
+CREATE TABLE files (
+    file INTEGER PRIMARY KEY,
+    folder INTEGER NOT NULL,
+    name TEXT NOT NULL CHECK (name NOT GLOB '*/*' AND name <> '..' AND instr(name, char(0)) = 0),
+    node TEXT,
+    kind TEXT NOT NULL,
+    log TEXT,
+    size INTEGER NOT NULL,
+    mtime INTEGER NOT NULL,
+    state TEXT NOT NULL,
+    error TEXT,
+    microphones TEXT NOT NULL,
+    start INTEGER CHECK ((start IS NULL) = ("end" IS NULL)),
+    "end" INTEGER,
+    frames INTEGER NOT NULL,
+    first_frame INTEGER,
+    first_stamp INTEGER,
+    last_frame INTEGER,
+    last_stamp INTEGER,
+    feature_set TEXT,
+    model TEXT,
+    model_sha256 TEXT,
+    input_sha256 TEXT,
+    version TEXT,
+    gaps INTEGER NOT NULL,
+    gap_seconds REAL NOT NULL
+) STRICT;
+CREATE TABLE labels (
+    file INTEGER NOT NULL,
+    scenario TEXT NOT NULL,
+    label TEXT NOT NULL,
+    model TEXT,
+    minutes REAL NOT NULL,
+    segments INTEGER NOT NULL,
+    PRIMARY KEY (file, scenario, label)
+) STRICT, WITHOUT ROWID;
+CREATE VIEW catalog AS
+SELECT ltrim(folders.path || '/' || name, '/') AS path, home, changed, files.*,
+    state = 'finished' AND name NOT GLOB '*.mcap.active' AS finished
+FROM files JOIN folders USING (folder);
+"""
+_TABLES = "folders", "files", "labels"
+
 _DIGEST = hashlib.sha256().digest_size
-_VALUE = 16  # bytes in memory
 _LIMIT = 1 << 30  # bytes of a file: about three million logs
-_ROOM = 1 << 20  # bytes of memory
-_GROWTH = 100  # bytes of memory per byte of file; our own files take up to 15
-
-
-def table_of(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
-    """Build the catalogue table from its rows.
-
-    Parameters
-    ----------
-    rows : sequence of mapping of str to object
-        Values by column of `SCHEMA`; times are int, in nanoseconds of UTC.
-    """
-    return pa.Table.from_pylist(rows, SCHEMA)
-
-
-def without_times(table: pa.Table) -> pa.Table:
-    """Replace timestamps by int64 nanoseconds of UTC; Python times have no nanoseconds."""
-    plain = [
-        column.cast(pa.int64()) if column.type == _MOMENT else column for column in table.columns
-    ]
-    return pa.table(plain, table.column_names)
-
-
-def write_table(table: pa.Table, stream: BinaryIO) -> None:
-    """Write a catalogue table as Parquet, with a digest."""
-    buffer = pa.BufferOutputStream()
-    pq.write_table(table, buffer, compression="none")
-    stream.writelines(sealed(memoryview(buffer.getvalue())))
-
-
-def sealed(data: memoryview) -> tuple[memoryview, bytes, memoryview]:
-    """Insert a digest before the footer of a Parquet file, where readers ignore it.
-
-    Parquet has no checksum of its footer, and Arrow may abort the process on a damaged one.
-
-    Parameters
-    ----------
-    data : memoryview
-        The complete Parquet file.
-    """
-    footer = _footer(data)
-    return data[:footer], _digest(data[:footer], data[footer:]), data[footer:]
-
-
-def read_table(stream: BinaryIO) -> pa.Table:
-    """Read and check the table of one catalogue part.
-
-    Parameters
-    ----------
-    stream : binary file
-        Read from its current position, up to 1 GiB.
-
-    Raises
-    ------
-    ValueError, pa.ArrowException
-        If the file is no catalogue, has another version, is damaged or compressed, lacks a value,
-        or if the table would take too much memory.
-    """
-    data = memoryview(stream.read(_LIMIT))
-    footer = _footer(data)
-    digest = data[footer - _DIGEST : footer]
-    if _digest(data[: footer - _DIGEST], data[footer:]) != digest:
-        raise ValueError("it is damaged, or was not made by hearthlog")
-    parquet = pq.read_metadata(pa.BufferReader(data))
-    leaves = {parquet.schema.column(number).path for number in range(parquet.num_columns)}
-    version = parquet.schema.to_arrow_schema().metadata
-    if leaves != _LEAVES or version != SCHEMA.metadata:
-        raise ValueError("it is of another version of hearthlog")
-    room = _ROOM + _GROWTH * len(data)
-    _check_size(parquet, room)
-    tables = [SCHEMA.empty_table()]
-    with pq.ParquetFile(pa.BufferReader(data), metadata=parquet, read_dictionary=_TEXTS) as file:
-        for batch in file.iter_batches(_BATCH):
-            room -= _size(batch)
-            if room < 0:
-                raise ValueError("it is too large")
-            always = [batch.column(name) for name in _ALWAYS]
-            if any(part.null_count for part in [*always, *_parts(batch)]):
-                raise ValueError("a value is missing")
-            tables.append(pa.Table.from_batches([batch]).select(SCHEMA.names).cast(SCHEMA))
-    return pa.concat_tables(tables)
-
-
-def _footer(data: memoryview) -> int:
-    """Return the offset of the footer; its length is in the last 8 bytes of a Parquet file."""
-    return len(data) - 8 - int.from_bytes(data[-8:-4], "little")
-
-
-def _digest(body: memoryview, footer: memoryview) -> bytes:
-    digest = hashlib.sha256(body)
-    digest.update(footer)
-    return digest.digest()
-
-
-def _check_size(parquet: pq.FileMetaData, room: int) -> None:
-    """Raise ValueError if the table would not fit into memory."""
-    for group in map(parquet.row_group, range(parquet.num_row_groups)):
-        for column in map(group.column, range(group.num_columns)):
-            room -= column.num_values * _VALUE
-            if column.compression != "UNCOMPRESSED":
-                raise ValueError("it is compressed")
-    if room < 0:
-        raise ValueError("it holds more than a file of its size can")
-
-
-def _size(batch: pa.RecordBatch) -> int:
-    """Return the bytes of a batch with its dictionary-encoded texts expanded."""
-    columns = [*batch.columns, *_parts(batch)]
-    texts = [column for column in columns if pa.types.is_dictionary(column.type)]
-    lengths = [pc.binary_length(text.dictionary).take(text.indices) for text in texts]
-    return batch.nbytes + sum(pc.sum(length, min_count=0).as_py() for length in lengths)
-
-
-def _parts(batch: pa.RecordBatch) -> list[pa.Array]:
-    """Return the flattened values of the list columns."""
-    lists = [batch.column(name).flatten() for name in ("labels", "scenarios")]
-    parts = [part for each in lists for part in (each, *each.flatten())]
-    return [*parts, batch.column("microphones").flatten()]
-
-
-class IndexedFiles:
-    """Index of catalogued files by name, with size and modification time."""
-
-    def __init__(self, table: pa.Table) -> None:
-        plain = without_times(table.select(["path", "size", "mtime"]))
-        self._numbers = {path: number for number, path in enumerate(plain["path"].to_pylist())}
-        self._sizes: Int64 = plain["size"].to_numpy()
-        self._times: Int64 = plain["mtime"].to_numpy()
-
-    def rows_of(self, logs: Sequence[ListedLog]) -> list[int | None]:
-        """Return the row number of each file; None if the file has no row or has changed."""
-        sizes, times = self._sizes.tolist(), self._times.tolist()
-        numbers = [self._numbers.get(catalogued_name(log.name)) for log in logs]
-        return [
-            number if number is not None and (sizes[number], times[number]) == log[1:3] else None
-            for number, log in zip(numbers, logs, strict=True)
-        ]
-
-    def find(self, path: Path, folder: Path) -> int | None:
-        """Return the row number of a file on disk, as `rows_of` does."""
-        try:
-            name = path.relative_to(folder).as_posix()
-            return self.rows_of([ListedLog(name, *size_and_time(path))])[0]
-        except (ValueError, LogError):
-            return None
-
-
-_SUFFIX = ".parquet"
-_LONGEST = 150  # bytes of the home's name in the name of its part
-
-
-class Parts(NamedTuple):
-    """Tables and errors of a catalogue."""
-
-    tables: dict[str, pa.Table]  # by the name of the part
-    unusable: list[str]  # problems of the other parts
-
-
-def part_of(home: str) -> str:
-    """Return the file name of a home's part."""
-    name = quote(home, safe="")  # the prefix `home-` keeps pyarrow from hiding it
-    if len(name) > _LONGEST:
-        name = f"{name[:_LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:16]}"
-    return f"home-{name}{_SUFFIX}"
-
-
-def read_parts(folder: Path) -> Parts | None:
-    """Read the catalogue of a folder; None if there is none.
-
-    An older catalogue, which is a single file, counts as one part.
-
-    Raise `LogError` if the folder cannot be listed.
-    """
-    catalog = folder / CATALOG
-    with store_errors(catalog):
-        older = catalog.is_file()
-        paths = [catalog] if older else [catalog / name for name in _names(catalog)]
-    if not paths:
-        return None
-    parts = Parts({}, [])
-    for path, read in zip(paths, map_logs(_read, paths), strict=True):
-        if isinstance(read, str):
-            parts.unusable.append(f"{path}: cannot be used as a catalogue ({read})")
-        else:
-            parts.tables[path.name] = read
-    return parts
-
-
-def _read(path: Path) -> pa.Table | str:
-    try:
-        with path.open("rb") as stream:
-            return read_table(stream)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        return str(error).partition("\n")[0]
-
-
-def write_parts(
-    folder: Path, parts: Mapping[str, pa.Table], before: Mapping[str, pa.Table]
-) -> None:
-    """Write new and changed catalogue parts, each atomically, and delete obsolete ones.
-
-    Raise `LogError` if the catalogue cannot be written or is a link.
-    """
-    catalog = folder / CATALOG
-    if is_local(catalog) and catalog.is_symlink():
-        raise LogError(f"{catalog}: is a link, and what it leads to is not hearthlog's: delete it")
-    with store_errors(catalog):
-        if catalog.is_file():  # older, single-file catalogue
-            catalog.unlink()
-        if is_local(catalog):
-            private_folder(catalog, readers=log_readers(folder))
-        there = set(_names(catalog))
-        for gone in there - parts.keys():
-            (catalog / gone).unlink(missing_ok=True)
-    for name, table in parts.items():
-        if name not in there or table != before.get(name):
-            put = replaced_file(catalog / name, readers=log_readers(folder))
-            with put as temporary, temporary.open("wb") as stream:
-                write_table(table, stream)
-
-
-def _names(catalog: Path) -> list[str]:
-    if not catalog.is_dir():  # a store has no empty folders
-        return []
-    return sorted(part.name for part in catalog.iterdir() if part.name.endswith(_SUFFIX))
-
-
-def divided(table: pa.Table) -> Iterator[tuple[str, pa.Table]]:
-    """Yield the rows of each home with the name of its part."""
-    ordered = table.sort_by([("home", "ascending"), ("path", "ascending")])
-    first = 0
-    runs = pc.run_end_encode(ordered["home"].combine_chunks())
-    for home, end in zip(runs.values.to_pylist(), runs.run_ends.to_pylist(), strict=True):
-        yield part_of(home), ordered.slice(first, end - first)
-        first = end
-
+_EARLIER = "catalog.parquet", "catalog.index"  # of hearthlog 0.1
+_LAST = (1 << 63) - 1  # the largest integer of SQLite
+_LEAF = b"\x0d"  # kind of a page
+_BATCH = 10_000  # rows
+_MOMENTS = "mtime", "start", "end", "first_stamp", "last_stamp"
+_HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}", re.DOTALL)
 
 LOG = "log"  # kind of a file that is not a layer
 FINISHED, UNFINISHED, DAMAGED = "finished", "unfinished", "damaged"
-_BATCH = 1000  # rows
+SpanOf = Callable[[Path], tuple[int, int] | None]
+LogSpan = tuple[int, int, Path]  # log times of the first and the last message (ns of UTC), the log
 
 
 @dataclass(frozen=True)
@@ -345,67 +128,342 @@ class CatalogRow:
         return None if self.start is None or self.end is None else (self.start, self.end)
 
 
-class Catalog:
-    """The catalogue of a folder."""
+_COLUMNS = [field.name for field in fields(CatalogRow)][2:-2]  # the last columns of `files`
 
-    def __init__(self, folder: Path, table: pa.Table, unusable: Sequence[str] = ()) -> None:
+
+class Catalog:
+    """The catalogue of a folder: rows of its logs, in memory.
+
+    Parameters
+    ----------
+    data : bytes, optional
+        An SQLite file, and its digest; by default, the catalogue is empty.
+    unusable : sequence of str
+        Errors of the file.
+    tables : sequence of str
+        The tables to check; the others must not be read.
+
+    Raises
+    ------
+    sqlite3.Error, ValueError
+        If the data is no catalogue, or is damaged.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        data: bytes | None = None,
+        unusable: Sequence[str] = (),
+        tables: Sequence[str] = _TABLES,
+    ) -> None:
         self.folder = folder
-        self.table = table
         self.unusable = unusable
-        self.files = IndexedFiles(table)
-        self._plain = without_times(table)
+        self.database = sqlite3.connect(":memory:", check_same_thread=False)
+        if data is not None:
+            self._read(memoryview(data), tables)
+        else:
+            self.database.executescript(_SCHEMA)
+        self.database.text_factory = os.fsdecode  # file names are bytes
+
+    def _read(self, data: memoryview, tables: Sequence[str]) -> None:
+        """Raise ValueError unless the schema is ours, without triggers, and tables are intact."""
+        content = data[:-_DIGEST]
+        # Pages of a schema that is not on the first page may refer to each other without end.
+        if hashlib.sha256(content).digest() != data[-_DIGEST:] or content[100:101] != _LEAF:
+            raise ValueError("it is damaged, or was not made by hearthlog")
+        self.database.deserialize(content)
+        self.database.execute("PRAGMA trusted_schema = OFF")
+        schema = "SELECT type, name, sql FROM sqlite_schema"
+        ours = Catalog(self.folder).database.execute(schema).fetchall()
+        if self.database.execute(schema).fetchall() != ours:
+            raise ValueError("it is of another version of hearthlog")
+        checks = [self.database.execute(f"PRAGMA integrity_check({table})") for table in tables]
+        if any(check.fetchone() != ("ok",) for check in checks):
+            raise ValueError("it is damaged, or was not made by hearthlog")
 
     def __len__(self) -> int:
-        return len(self.table)
+        (count,) = self.database.execute("SELECT count(*) FROM files").fetchone()
+        return int(count)
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file, by its path within the folder."""
+        return self.folder.joinpath(*name.split("/"))
 
     def current(self, path: Path) -> CatalogRow | None:
         """Return the row of a file; None if the file has no row or has changed."""
-        number = self.files.find(path, self.folder)
-        return None if number is None else next(self.rows(number, 1))
-
-    def rows(self, first: int = 0, count: int | None = None) -> Iterator[CatalogRow]:
-        """Yield rows of the catalogue.
-
-        Parameters
-        ----------
-        first : int
-            Number of the first row, from 0.
-        count : int, optional
-            Maximum number of rows; by default all from `first` on.
-        """
-        for batch in self._plain.slice(first, count).to_batches(_BATCH):
-            for values in batch.to_pylist():
-                yield CatalogRow(**values)
+        try:
+            name = path.relative_to(self.folder).as_posix()
+            about = size_and_time(path)
+        except (ValueError, LogError):
+            return None
+        same = "path = CAST(? AS TEXT) AND size = ? AND mtime = ?"
+        return next(self.rows(same, os.fsencode(name), *about), None)
 
     def of_state(self, state: str) -> list[CatalogRow]:
         """Return the rows of the files in a state."""
-        chosen = self._plain.filter(pc.equal(self._plain["state"], state))
-        return [CatalogRow(**values) for values in chosen.to_pylist()]
+        return list(self.rows("state = ?", state))
+
+    def rows(self, condition: str = "TRUE", *values: object) -> Iterator[CatalogRow]:
+        """Yield the rows that meet a condition in SQL, ordered by home and path."""
+        query = f"SELECT * FROM catalog WHERE {condition} ORDER BY home, path"  # noqa: S608
+        found = self.database.execute(query, values)
+        names = [column[0] for column in found.description]
+        for each in found:
+            row = dict(zip(names, each, strict=True))
+            path = text_of(row["path"])
+            labels: list[dict[str, Any]] = []
+            scenarios: list[dict[str, Any]] = []
+            for scenario, model, *amounts in self.database.execute(
+                "SELECT scenario, model, label, minutes, segments FROM labels WHERE file = ?",
+                [row["file"]],
+            ):
+                amount = dict(zip(("label", "minutes", "segments"), amounts, strict=True))
+                if scenario:
+                    scenarios.append({"scenario": scenario, "model": model, **amount})
+                else:
+                    labels.append(amount)
+            row |= {"path": path, "labels": labels, "scenarios": scenarios}
+            row["microphones"] = list(filter(None, row["microphones"].split("/")))
+            if row["log"] is not None:
+                row["log"] = path.removesuffix(text_of(row["name"])) + row["log"]
+            yield CatalogRow(**{name: row[name] for name in CatalogRow.__match_args__})
+
+    def spans(self, since: int, until: int) -> Iterator[LogSpan]:
+        """Yield the logs that end at `since` or later and begin before `until`, latest first."""
+        for start, end, name in self.database.execute(
+            'SELECT start, "end", path FROM catalog WHERE "end" >= ? AND start < ? '
+            'ORDER BY start DESC, "end" DESC',
+            (since, until),
+        ):
+            yield start, end, self.path(name)
+
+    def remove_changed(self, since: int, until: int) -> list[Path]:
+        """Remove the rows of changed logs and of logs without a span; return these logs.
+
+        Logs that are finished, and end before `since` or begin at `until` or later, count as
+        unchanged if their folder has not changed.
+        """
+        changed = dict(self.database.execute("SELECT path, changed FROM folders"))
+        listing = list_logs(
+            self.folder, changed if is_local(self.folder) and _keeps_times(self.folder) else {}
+        )
+        self.database.executemany(
+            "UPDATE folders SET changed = ? WHERE path = CAST(? AS TEXT)",
+            [(UNSURE, os.fsencode(path)) for path in changed.keys() - listing.unchanged],
+        )
+        listed = {log.name: log for log in listing.logs}
+        opened: list[Path] = []
+        removed: list[tuple[int]] = []
+        for file, name, size, mtime, start, is_listed in self.database.execute(
+            "SELECT file, path, size, mtime, start, changed = ? FROM catalog "
+            'WHERE changed = ? OR start IS NULL OR NOT finished OR "end" >= ? AND start < ?',
+            (UNSURE, UNSURE, since, until),
+        ):
+            if is_listed:
+                known = listed.get(name) == (name, size, mtime)
+            else:
+                known = _is_current(self.path(name), size, mtime)
+            if known and start is not None:
+                listed.pop(name, None)
+                continue
+            removed.append((file,))
+            if not is_listed:
+                opened.append(self.path(name))
+        self.database.executemany("DELETE FROM files WHERE file = ?", removed)
+        opened += map(self.path, listed)
+        if not opened and not len(self):
+            find_logs(self.folder)  # raises the error with its reason
+        return opened
+
+    def keep(self, listing: Listing) -> list[ListedLog]:
+        """Keep only the rows of unchanged and undamaged files; return the files without a row."""
+        self.database.execute("DELETE FROM files WHERE state = ?", [DAMAGED])  # may be mended
+        files = self.database.execute("SELECT path, size, mtime, file FROM catalog")
+        known = {ListedLog(*row[:3]): row[3] for row in files}
+        gone = [(known[log],) for log in known.keys() - listing.logs]
+        self.database.executemany("DELETE FROM files WHERE file = ?", gone)
+        self.database.executemany("DELETE FROM labels WHERE file = ?", gone)
+        paths = {log.name.rpartition("/")[0] for log in listing.logs} | listing.folders.keys()
+        before = {path for (path,) in self.database.execute("SELECT path FROM folders")}
+        self.database.executemany(
+            "DELETE FROM folders WHERE path = CAST(? AS TEXT)",
+            [(os.fsencode(path),) for path in before - paths],
+        )
+        self.database.executemany(
+            "INSERT INTO folders (path, home, changed) VALUES (CAST(? AS TEXT), ?, ?) "
+            "ON CONFLICT (path) DO UPDATE SET changed = excluded.changed "
+            "WHERE changed <> excluded.changed",
+            [
+                (os.fsencode(path), home_of(path), listing.folders.get(path, UNSURE))
+                for path in sorted(paths)
+            ],
+        )
+        return [log for log in listing.logs if log not in known]
+
+    def add(self, rows: Iterable[CatalogRow]) -> None:
+        """Add the rows of files in known folders."""
+        insert = (
+            "INSERT INTO files VALUES (NULL, (SELECT folder FROM folders WHERE path = CAST(? AS "  # noqa: S608
+            f"TEXT)), CAST(? AS TEXT){', ?' * len(_COLUMNS)})"
+        )
+        for row in rows:
+            folder, _, name = os.fsencode(row.path).rpartition(b"/")
+            about = vars(row) | {"microphones": "/".join(row.microphones)}
+            values = [folder, name, *(about[column] for column in _COLUMNS)]
+            file = self.database.execute(insert, values).lastrowid
+            self.database.executemany(
+                "INSERT INTO labels VALUES (?, ?, ?, ?, ?, ?)",
+                [
+                    (file, one.get("scenario", ""), one["label"], one.get("model"),
+                     one["minutes"], one["segments"])
+                    for one in (*row.labels, *row.scenarios)
+                ],
+            )  # fmt: skip
+
+    def forget_times(self) -> None:
+        """Let the next query list all folders, as some of their logs have no row."""
+        self.database.execute("UPDATE folders SET changed = ?", [UNSURE])
+
+    def write(self) -> None:
+        """Write a changed catalogue into its folder, in one step.
+
+        Raise `LogError` if it cannot be written.
+        """
+        if not self.database.total_changes:
+            return
+        self.database.commit()
+        data = self.database.serialize()
+        put = replaced_file(self.folder / CATALOG, readers=log_readers(self.folder))
+        with put as temporary, temporary.open("wb") as stream:
+            stream.writelines([data, hashlib.sha256(data).digest()])
+        _remove_earlier(self.folder)
 
 
-def read_catalog(folder: Path) -> Catalog | None:
-    """Read the usable parts of a folder's catalogue, ordered by home and path.
+def text_of(name: str) -> str:
+    """Return a file name as text; undecodable bytes are replaced."""
+    return os.fsencode(name).decode(errors="replace")
 
-    Returns
-    -------
-    Catalog or None
-        None if there is no catalogue.
+
+def home_of(folder: str) -> str:
+    """Return the home of the logs in a folder: the folder that holds its `YYYY/MM/DD`."""
+    found = _HOME.fullmatch(folder)
+    return text_of(found[1] or "") if found else ""
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Delete the catalogue of an earlier version."""
+    for path in (folder / name for name in _EARLIER):
+        if is_local(path) and path.is_symlink():
+            continue  # what it leads to is not ours
+        with suppress(OSError):
+            if path.is_dir():
+                for part in path.glob("home-*.parquet"):
+                    part.unlink()
+                path.rmdir()
+            elif path.is_file():
+                path.unlink()
+
+
+def _keeps_times(folder: Path) -> bool:
+    """Whether writing the catalogue changed the time of its folder; on some mounts it does not."""
+    return (folder / CATALOG).stat().st_mtime_ns <= folder.stat().st_ctime_ns
+
+
+def _is_current(path: Path, size: int, mtime: int) -> bool:
+    try:
+        return size_and_time(path) == (size, mtime)
+    except LogError:
+        return False
+
+
+def read_catalog(folder: Path, tables: Sequence[str] = _TABLES) -> Catalog | None:
+    """Read the catalogue of a folder; None if there is none.
+
+    A catalogue that cannot be used is empty. `tables` are those to check, as of `Catalog`.
+    """
+    path = folder / CATALOG
+    try:
+        with store_errors(path):
+            if not path.exists():
+                older = [folder / name for name in _EARLIER if (folder / name).exists()]
+                lines = [f"{older[0]}: is of an earlier version of hearthlog"] if older else []
+                return Catalog(folder, unusable=lines) if older else None
+        with closing(open_file(path)) as file:
+            data = file.read(0, min(file.size, _LIMIT))
+        return Catalog(folder, data, tables=tables)
+    except (LogError, OSError, ValueError, sqlite3.Error) as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        return Catalog(folder, unusable=[f"{path}: cannot be used as a catalogue ({reason})"])
+
+
+class LogSpans:
+    """Spans of many logs: of opened logs, in order of time, and of the logs of catalogues."""
+
+    def __init__(self, opened: Sequence[LogSpan], catalogs: Sequence[Catalog]) -> None:
+        self._opened = opened
+        self._catalogs = catalogs
+
+    def within(self, start: int | None, end: int | None) -> list[LogSpan]:
+        """Return the logs with messages in a span of time, without duplicates, in order of time."""
+        return _in_time(self._latest_first(*_limits(start, end)))
+
+    def before(self, time: int) -> Iterator[Path]:
+        """Yield the logs with messages before a time, without duplicates, latest first."""
+        found = self._latest_first(*_limits(None, time))
+        for _, same in groupby(found, key=lambda span: span[:2]):
+            yield from (path for _, _, path in reversed(_in_time(same)))
+
+    def _latest_first(self, since: int, until: int) -> Iterator[LogSpan]:
+        opened = (one for one in reversed(self._opened) if one[1] >= since and one[0] < until)
+        known = [catalog.spans(since, until) for catalog in self._catalogs]
+        return merge(opened, *known, key=lambda span: span[:2], reverse=True)
+
+
+def _limits(start: int | None, end: int | None) -> tuple[int, int]:
+    """Return log times that SQLite can compare: from the first on, before the second."""
+    since = -_LAST if start is None else max(start, -_LAST)
+    return min(since, _LAST), _LAST if end is None else max(min(end, _LAST), -_LAST)
+
+
+def _in_time(spans: Iterable[LogSpan]) -> list[LogSpan]:
+    once = {str(span[2].resolve()): span for span in spans}  # a log may have several names
+    # Local paths and paths of a store do not compare; their parts do.
+    return sorted(once.values(), key=lambda span: (*span[:2], span[2].parts))
+
+
+def find_spans(
+    paths: Iterable[Path], span_of: SpanOf, start: int | None = None, end: int | None = None
+) -> LogSpans:
+    """Find the logs of some folders with their first and last log times.
+
+    Parameters
+    ----------
+    span_of : callable
+        Returns first and last log time of a log without a current catalogue row; None drops the
+        log.
+    start, end : int, optional
+        Log times in nanoseconds of UTC, from `start` on, before `end`: outside of this span,
+        catalogue rows of finished logs are trusted without a check.
 
     Raises
     ------
     LogError
-        If the folder cannot be listed.
+        If there is no such log, or none in a folder.
     """
-    parts = read_parts(folder)
-    if parts is None:
-        return None
-    table = pa.concat_tables([SCHEMA.empty_table(), *parts.tables.values()])
-    wrong = what_is_wrong(folder)
-    return Catalog(folder, table, parts.unusable if wrong is None else [*parts.unusable, wrong])
+    catalogs: list[Catalog] = []
+    unknown: dict[str, Path] = {}
+    for path in paths:
+        catalog = read_catalog(path, _TABLES[:2])
+        if catalog is None or catalog.unusable:
+            logs = find_logs(path)
+        else:
+            logs = catalog.remove_changed(*_limits(start, end))
+            catalogs.append(catalog)
+        unknown |= {str(log.resolve()): log for log in logs}
+    return LogSpans(time_spans(unknown.values(), span_of), catalogs)
 
 
 _HOUR = 3600 * NANOSECONDS // FRAME_NANOSECONDS  # frames
-_FUNCTIONS = {"start": "min", "end": "max"}
 
 
 @dataclass(frozen=True)
@@ -445,70 +503,54 @@ class LabelAmount:
 
 def homes(catalog: Catalog) -> list[HomeTotals]:
     """Return the totals of each home."""
-    table = catalog.table
-    logs = pc.equal(table["kind"], LOG)
-    counted = pa.table(
-        {
-            "home": table["home"],
-            "logs": logs.cast(pa.int64()),
-            "layers": pc.invert(logs).cast(pa.int64()),
-            "unfinished": pc.equal(table["state"], UNFINISHED).cast(pa.int64()),
-            "damaged": pc.equal(table["state"], DAMAGED).cast(pa.int64()),
-            "size": table["size"],
-            "frames": pc.if_else(logs, table["frames"], 0),
-            "gaps": table["gaps"],
-            "gap_seconds": table["gap_seconds"],
-            "start": pc.if_else(logs, table["start"], None).cast(pa.int64()),
-            "end": pc.if_else(logs, table["end"], None).cast(pa.int64()),
-        }
+    rows = catalog.database.execute(
+        "SELECT home, sum(kind = 'log'), sum(kind <> 'log'), sum(state = 'unfinished'), "
+        "sum(state = 'damaged'), sum(size), sum(frames * (kind = 'log')), "
+        "min(CASE kind WHEN 'log' THEN start END), max(CASE kind WHEN 'log' THEN \"end\" END), "
+        "sum(gaps), sum(gap_seconds) FROM catalog GROUP BY home ORDER BY home"
     )
-    functions = [(name, _FUNCTIONS.get(name, "sum")) for name in counted.column_names[1:]]
-    return [HomeTotals(**row) for row in _grouped(counted, ["home"], functions)]
+    return [HomeTotals(*row) for row in rows]
 
 
 def label_amounts(catalog: Catalog) -> list[LabelAmount]:
-    """Return the label totals of each home, by kind of labelling and by model.
+    """Return the label totals of each home, by kind of labelling, scenario and model.
 
     Returns
     -------
     list of LabelAmount
-        Sorted by home, kind, model and descending minutes.
+        The sounds of the homes, then the scenarios; each sorted by home, kind, scenario, model
+        and descending minutes.
     """
-    return _amounts(catalog.table, "labels", ["home", "kind", "model"], ["label"])
-
-
-def scenario_amounts(catalog: Catalog) -> list[LabelAmount]:
-    """Return the label totals of each home's scenarios, by kind, scenario and model.
-
-    Returns
-    -------
-    list of LabelAmount
-        Sorted by home, kind, scenario, model and descending minutes.
-    """
-    return _amounts(catalog.table, "scenarios", ["home", "kind"], ["scenario", "model", "label"])
-
-
-def _amounts(
-    table: pa.Table, column: str, keys: Sequence[str], own: Sequence[str]
-) -> list[LabelAmount]:
-    """Sum the entries of a list column, grouped by table columns `keys` and entry fields `own`."""
-    lists = table[column].combine_chunks()
-    labels = pa.Table.from_struct_array(lists.flatten())
-    for name in keys:
-        labels = labels.append_column(name, table[name].take(pc.list_parent_indices(lists)))
-    values = [("minutes", "sum"), ("segments", "sum")]
-    amounts = [LabelAmount(**row) for row in _grouped(labels, [*keys, *own], values)]
-    return sorted(
-        amounts,
-        key=lambda one: (one.home, one.kind, one.scenario, one.model or "", -one.minutes),
+    rows = catalog.database.execute(
+        "SELECT home, kind, iif(scenario = '', files.model, labels.model) AS by_model, label, "
+        "sum(minutes) AS total, sum(segments), scenario "
+        "FROM labels JOIN files USING (file) JOIN folders USING (folder) "
+        "GROUP BY home, kind, by_model, label, scenario "
+        "ORDER BY scenario <> '', home, kind, scenario, by_model, total DESC, label"
     )
+    return [LabelAmount(*row) for row in rows]
 
 
-def _grouped(
-    table: pa.Table, keys: Sequence[str], functions: Sequence[tuple[str, str]]
-) -> list[dict[str, Any]]:
-    """Aggregate rows with equal key columns; the result is sorted by these columns."""
-    grouped = table.group_by(keys, use_threads=False).aggregate(functions)
-    names = [*keys, *(name for name, _ in functions)]
-    sums = grouped.select([*keys, *map("_".join, functions)]).rename_columns(names)
-    return sums.sort_by([(key, "ascending") for key in keys]).to_pylist()
+def export_parquet(catalog: Catalog, path: Path) -> None:
+    """Write the rows of a catalogue to a new Parquet file.
+
+    Raise `LogError` if the file exists, or cannot be written.
+    """
+    import pyarrow as pa  # noqa: PLC0415  only for this
+    import pyarrow.parquet as pq  # noqa: PLC0415  only for this
+
+    amount = [("label", pa.string()), ("minutes", pa.float64()), ("segments", pa.int64())]
+    scenario = [("scenario", pa.string()), ("model", pa.string()), *amount]
+    own = {"labels": pa.list_(pa.struct(amount)), "scenarios": pa.list_(pa.struct(scenario))}
+    own |= dict.fromkeys(("first_frame", "last_frame"), pa.uint64())
+    own |= dict.fromkeys(_MOMENTS, pa.timestamp("ns", "UTC"))
+    kinds: dict[Any, pa.DataType] = {str: pa.string(), str | None: pa.string()}
+    kinds |= {int: pa.int64(), int | None: pa.int64(), float: pa.float64()}
+    kinds |= {Sequence[str]: pa.list_(pa.string())}
+    schema = pa.schema(
+        (field.name, own.get(field.name) or kinds[field.type]) for field in fields(CatalogRow)
+    )
+    rows = catalog.rows()
+    with new_file(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
+        while batch := list(islice(rows, _BATCH)):
+            writer.write_table(pa.Table.from_pylist([vars(row) for row in batch], schema))

@@ -1,6 +1,5 @@
 """Writer of a catalogue: workers take inventories of new and changed logs."""
 
-import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -10,42 +9,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.catalog import (
-    DAMAGED,
     FINISHED,
     LOG,
-    SCHEMA,
     UNFINISHED,
     Catalog,
     CatalogRow,
-    divided,
-    table_of,
-    write_parts,
+    home_of,
+    text_of,
 )
 from hearthlog.analyzer.logs.labelling import MOST_CLASSES
-from hearthlog.analyzer.logs.locations import (
-    NEVER,
-    SPAN,
-    ListedLog,
-    catalogued_name,
-    list_logs,
-    size_and_time,
-    write_index,
-)
+from hearthlog.analyzer.logs.locations import ListedLog, list_logs, size_and_time
 from hearthlog.analyzer.logs.selection import decode_types, is_compatible
 from hearthlog.analyzer.workers.workers import InlineWorkers, Workers
 from hearthlog.schemas.errors import HearthlogError, LogError, Progress, ignore_progress
 from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.logs.files import log_name, log_of_layer, time_span
+from hearthlog.schemas.logs.files import find_logs, log_name, log_of_layer, time_span
 from hearthlog.schemas.logs.metadata import read_provenance, recorded_scenarios
 from hearthlog.schemas.mcap.chunks import read_in_batches
-from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile
+from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import (
     LIVE,
@@ -66,6 +52,7 @@ _OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
     (message_types.STREAM_INFO, message_types.STATISTICS, message_types.LABEL), ()
 )
 _LONGEST = 1000  # maximum characters of a text from a log
+_LAST = (1 << 63) - 1  # the largest number of a frame in a catalogue
 
 
 @dataclass
@@ -188,7 +175,8 @@ class _Reading:
 
     def _note_features(self, columns: Columns) -> None:
         ends = columns.take(np.array([0, len(columns) - 1]))
-        pairs = zip(ends["frame"].tolist(), ends["header.stamp"].tolist(), strict=True)
+        numbers = np.minimum(ends["frame"], np.uint64(_LAST)).tolist()
+        pairs = zip(numbers, ends["header.stamp"].tolist(), strict=True)
         first, self._contents.last = pairs
         self._contents.first = self._contents.first or first
         self._contents.frames += len(columns)
@@ -212,42 +200,38 @@ class _Reading:
             )
 
 
-_HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}/[^/]*", re.DOTALL)
-
-
-def read_rows(folder: Path, names: Sequence[str]) -> pa.Table:
+def read_rows(folder: Path, names: Sequence[str]) -> list[CatalogRow]:
     """Build the catalogue rows of some files: the task of a worker."""
     paths = [folder.joinpath(*name.split("/")) for name in names]
-    rows = [row for read in map_logs(partial(_read_row, folder), paths) for row in read]
-    return table_of([vars(row) for row in rows])
+    rows = map_logs(partial(_read_row, folder), paths)
+    return [row for row in rows if row is not None]
 
 
-def _read_row(folder: Path, path: Path) -> list[CatalogRow]:
-    """Build the row of a file; empty if the file no longer exists."""
+def _read_row(folder: Path, path: Path) -> CatalogRow | None:
+    """Build the row of a file; None if the file no longer exists."""
     name = log_name(path)
     kind = name.layer.partition("-")[0]
     if kind not in {RELABEL, REVIEW}:  # audio layers are no labelling
         kind = LOG
-    home = _HOME.fullmatch(_relative(path, folder))
     try:
         size, mtime = size_and_time(path)
     except LogError:
-        return []
+        return None
     row = CatalogRow(
-        path=_relative(path, folder),
-        home="" if home is None else home[1] or "",
-        node=name.node or None,
+        path=path.relative_to(folder).as_posix(),
+        home=home_of(path.parent.relative_to(folder).as_posix()),
+        node=text_of(name.node) or None,
         kind=kind,
-        log=None if kind == LOG else _relative(log_of_layer(path), folder),
+        log=None if kind == LOG else text_of(log_of_layer(path).name),
         size=size,
         mtime=mtime,
     )
     try:
-        return [_filled(row, read_contents(path, LIVE if kind == LOG else kind))]
+        return _filled(row, read_contents(path, LIVE if kind == LOG else kind))
     except LogError as error:
         if not path.exists():  # a recorder finished and renamed the file
-            return []
-        return [replace(row, error=str(error).removeprefix(f"{path}: "))]
+            return None
+        return replace(row, error=str(error).removeprefix(f"{path}: "))
 
 
 def _filled(row: CatalogRow, contents: LogInventory) -> CatalogRow:
@@ -298,10 +282,6 @@ def _model(record: Mapping[str, str], scenario: str) -> str:
     return ", ".join(sorted(models))
 
 
-def _relative(path: Path, folder: Path) -> str:
-    return catalogued_name(path.relative_to(folder).as_posix())
-
-
 _TASK = 100  # files per task
 
 
@@ -331,65 +311,33 @@ def write_catalog(
         If interrupted; the catalogue then has the files read so far.
     """
     listing = list_logs(folder)
-    listed = listing.logs
-    kept, new = _divided(listed, before)
-    rows = pa.array(kept, pa.int64())
-    tables = [SCHEMA.empty_table() if before is None else before.table.take(rows)]
+    if not listing.logs:
+        find_logs(folder)  # raises the error with its reason
+    catalog = Catalog(folder)
+    if before is not None:
+        before.database.backup(catalog.database)
+    new = catalog.keep(listing)
+    kept = len(listing.logs) - len(new)
     stopped: BaseException | None = None
     try:
-        for read, done in _read(folder, new, workers or InlineWorkers()):
-            tables.append(read)
-            progress((len(kept) + done) / len(listed))
+        for rows, done in _read(folder, new, workers or InlineWorkers()):
+            catalog.add(rows)
+            progress((kept + done) / len(listing.logs))
     except (KeyboardInterrupt, HearthlogError) as error:
         stopped = error
-    parts = dict(divided(pa.concat_tables(tables)))
-    old = {} if before is None else dict(divided(before.table))
-    write_parts(folder, parts, old)
-    ordered = [parts[name] for name in sorted(parts)]
-    catalog = Catalog(folder, pa.concat_tables([SCHEMA.empty_table(), *ordered]))
-    write_index(folder, listing, _spans(listed, catalog))
+        catalog.forget_times()
+    catalog.write()
     if stopped is not None:
         raise stopped
     return catalog
 
 
-def _spans(listed: Sequence[ListedLog], catalog: Catalog) -> NDArray[np.void]:
-    """Return the spans of listed files; `NEVER` for files that were not read or have changed."""
-    numbers = catalog.files.rows_of(listed)
-    read = [place for place, number in enumerate(numbers) if number is not None]
-    rows = catalog.table.take(pa.array((n for n in numbers if n is not None), pa.int64()))
-    spans = np.full(len(listed), NEVER, SPAN)
-    for name in ("start", "end", "size", "mtime"):
-        spans[name][read] = pc.fill_null(rows[name].cast(pa.int64()), NEVER).to_numpy()
-    spans["finished"] = [not log.name.endswith(ACTIVE_SUFFIX) for log in listed]
-    spans["finished"][read] &= pc.equal(rows["state"], FINISHED).to_numpy()
-    return spans
-
-
-def _divided(
-    listed: Sequence[ListedLog], before: Catalog | None
-) -> tuple[list[int], list[ListedLog]]:
-    """Return the numbers of rows that are still valid, and the files to read."""
-    if before is None:
-        return [], list(listed)
-    kept: list[int] = []
-    new: list[ListedLog] = []
-    damaged = np.array(before.table["state"].to_pylist()) == DAMAGED
-    for log, number in zip(listed, before.files.rows_of(listed), strict=True):
-        # A damaged file may be readable now, even if it is unchanged.
-        if number is None or damaged[number]:
-            new.append(log)
-        else:
-            kept.append(number)
-    return kept, new
-
-
 def _read(
     folder: Path, logs: Sequence[ListedLog], workers: Workers
-) -> Iterable[tuple[pa.Table, int]]:
+) -> Iterable[tuple[list[CatalogRow], int]]:
     """Yield the rows of files in batches, with the number of files done."""
     tasks = (logs[first : first + _TASK] for first in range(0, len(logs), _TASK))
-    running: dict[Future[pa.Table], int] = {}
+    running: dict[Future[list[CatalogRow]], int] = {}
     done = 0
     while True:
         most = 2 * workers.parallel if workers.parallel > 1 else 1  # keeps all workers busy

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from mcap.records import Channel, Schema
 
-from hearthlog.analyzer.logs.locations import LogSpans, find_spans
+from hearthlog.analyzer.logs.catalog import LogSpans, find_spans
 from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, abridged, ignore_progress
 from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.logs.columns import Columns, decode, decode_readable, leave_out, unreadable

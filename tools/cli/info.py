@@ -311,29 +311,38 @@ def catalog(
         typer.Option(min=1, max=256, help="Processes; worth it where thousands of files are new."),
     ] = 1,
     scheduler: Scheduler = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(dir_okay=False, metavar="FILE", help="Also write the rows to a Parquet file."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write FOLDER/catalog.parquet, a row for each file, and show the homes in the folder.
+    """Write FOLDER/catalog.sqlite, a row for each file, and show the homes in the folder.
 
     Files that have not changed since the last catalogue are not read again. Exit status 3: a file
     is unfinished or damaged.
     """
     from hearthlog.analyzer.extras import require
-    from hearthlog.schemas.logs.files import check_allowed
-
-    require("pyarrow")
     from hearthlog.analyzer.logs.catalog import (
         DAMAGED,
         UNFINISHED,
+        export_parquet,
         homes,
         label_amounts,
-        scenario_amounts,
     )
+    from hearthlog.schemas.logs.files import check_allowed
+    from hearthlog.schemas.new_files import check_new
 
     check_allowed(folder)
     if folder.is_file():
         wrong_use(f"{folder} is a file; give the folder that holds the logs or homes")
+    if export is not None:
+        require("pyarrow")
+        check_new(export)
     files = _write(folder, workers, scheduler)
+    if export is not None:
+        export_parquet(files, export)
+    amounts = label_amounts(files)
     damaged = files.of_state(DAMAGED)
     for row in damaged:
         print_notice(f"{folder / row.path}: {row.error}")
@@ -344,12 +353,12 @@ def catalog(
             "unfinished": unfinished,
             "damaged": {row.path: row.error for row in damaged},
             "homes": [_home(home) for home in homes(files)],
-            "labels": [asdict(label) for label in label_amounts(files)],
-            "scenarios": [asdict(label) for label in scenario_amounts(files)],
+            "labels": [asdict(label) for label in amounts if not label.scenario],
+            "scenarios": [asdict(label) for label in amounts if label.scenario],
         }
         print(json.dumps(result, indent=2))
     else:
-        _print_homes(homes(files), [*label_amounts(files), *scenario_amounts(files)], unfinished)
+        _print_homes(homes(files), amounts, unfinished)
     if damaged or unfinished:
         raise typer.Exit(3)
 
