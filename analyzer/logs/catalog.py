@@ -18,60 +18,8 @@ from hearthlog.schemas.files import is_local, open_file, store_errors
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import CATALOG, find_logs, log_readers
 from hearthlog.schemas.logs.merged_reading import time_spans
+from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.schemas.new_files import new_file, replaced_file
-
-# `PRAGMA integrity_check` verifies types and constraints of the rows of a file from elsewhere.
-_SCHEMA = """
-CREATE TABLE folders (
-    folder INTEGER PRIMARY KEY,
-    path TEXT NOT NULL UNIQUE CHECK (
-        path NOT GLOB '/*' AND '/' || path || '/' NOT GLOB '*/../*' AND instr(path, char(0)) = 0
-    ),
-    home TEXT NOT NULL,
-    changed INTEGER NOT NULL
-) STRICT;
-CREATE TABLE files (
-    file INTEGER PRIMARY KEY,
-    folder INTEGER NOT NULL,
-    name TEXT NOT NULL CHECK (name NOT GLOB '*/*' AND name <> '..' AND instr(name, char(0)) = 0),
-    node TEXT,
-    kind TEXT NOT NULL,
-    log TEXT,
-    size INTEGER NOT NULL,
-    mtime INTEGER NOT NULL,
-    state TEXT NOT NULL,
-    error TEXT,
-    microphones TEXT NOT NULL,
-    start INTEGER CHECK ((start IS NULL) = ("end" IS NULL)),
-    "end" INTEGER,
-    frames INTEGER NOT NULL,
-    first_frame INTEGER,
-    first_stamp INTEGER,
-    last_frame INTEGER,
-    last_stamp INTEGER,
-    feature_set TEXT,
-    model TEXT,
-    model_sha256 TEXT,
-    input_sha256 TEXT,
-    version TEXT,
-    gaps INTEGER NOT NULL,
-    gap_seconds REAL NOT NULL
-) STRICT;
-CREATE TABLE labels (
-    file INTEGER NOT NULL,
-    scenario TEXT NOT NULL,
-    label TEXT NOT NULL,
-    model TEXT,
-    minutes REAL NOT NULL,
-    segments INTEGER NOT NULL,
-    PRIMARY KEY (file, scenario, label)
-) STRICT, WITHOUT ROWID;
-CREATE VIEW catalog AS
-SELECT ltrim(folders.path || '/' || name, '/') AS path, home, changed, files.*,
-    state = 'finished' AND name NOT GLOB '*.mcap.active' AS finished
-FROM files JOIN folders USING (folder);
-"""
-_TABLES = "folders", "files", "labels"
 
 _DIGEST = hashlib.sha256().digest_size
 _LIMIT = 1 << 30  # bytes of a file: about three million logs
@@ -128,7 +76,43 @@ class CatalogRow:
         return None if self.start is None or self.end is None else (self.start, self.end)
 
 
-_COLUMNS = [field.name for field in fields(CatalogRow)][2:-2]  # the last columns of `files`
+_FILE = fields(CatalogRow)[2:-2]  # the last columns of `files`
+_KINDS: dict[Any, str] = {
+    str: "TEXT NOT NULL", str | None: "TEXT", Sequence[str]: "TEXT NOT NULL",
+    int: "INTEGER NOT NULL", int | None: "INTEGER", float: "REAL NOT NULL",
+}  # fmt: skip
+# `PRAGMA integrity_check` verifies types and constraints of the rows of a file from elsewhere.
+_SCHEMA = f"""
+CREATE TABLE folders (
+    folder INTEGER PRIMARY KEY,
+    path TEXT NOT NULL UNIQUE CHECK (
+        path NOT GLOB '/*' AND '/' || path || '/' NOT GLOB '*/../*' AND instr(path, char(0)) = 0
+    ),
+    home TEXT NOT NULL,
+    changed INTEGER NOT NULL
+) STRICT;
+CREATE TABLE files (
+    file INTEGER PRIMARY KEY,
+    folder INTEGER NOT NULL,
+    name TEXT NOT NULL CHECK (name NOT GLOB '*/*' AND name <> '..' AND instr(name, char(0)) = 0),
+    {", ".join(f'"{column.name}" {_KINDS[column.type]}' for column in _FILE)},
+    CHECK ((start IS NULL) = ("end" IS NULL))
+) STRICT;
+CREATE TABLE labels (
+    file INTEGER NOT NULL,
+    scenario TEXT NOT NULL,
+    label TEXT NOT NULL,
+    model TEXT,
+    minutes REAL NOT NULL,
+    segments INTEGER NOT NULL,
+    PRIMARY KEY (file, scenario, label)
+) STRICT, WITHOUT ROWID;
+CREATE VIEW catalog AS
+SELECT ltrim(folders.path || '/' || name, '/') AS path, home, changed, files.*,
+    state = 'finished' AND name NOT GLOB '*{ACTIVE_SUFFIX}' AS finished
+FROM files JOIN folders USING (folder);
+"""  # noqa: S608  no values
+_TABLES = "folders", "files", "labels"
 
 
 class Catalog:
@@ -304,12 +288,12 @@ class Catalog:
         """Add the rows of files in known folders."""
         insert = (
             "INSERT INTO files VALUES (NULL, (SELECT folder FROM folders WHERE path = CAST(? AS "  # noqa: S608
-            f"TEXT)), CAST(? AS TEXT){', ?' * len(_COLUMNS)})"
+            f"TEXT)), CAST(? AS TEXT){', ?' * len(_FILE)})"
         )
         for row in rows:
             folder, _, name = os.fsencode(row.path).rpartition(b"/")
             about = vars(row) | {"microphones": "/".join(row.microphones)}
-            values = [folder, name, *(about[column] for column in _COLUMNS)]
+            values = [folder, name, *(about[column.name] for column in _FILE)]
             file = self.database.execute(insert, values).lastrowid
             self.database.executemany(
                 "INSERT INTO labels VALUES (?, ?, ?, ?, ?, ?)",

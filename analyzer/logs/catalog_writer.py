@@ -239,8 +239,11 @@ def _filled(row: CatalogRow, contents: LogInventory) -> CatalogRow:
     record = {name: value for name, value in contents.record.items() if value}
     start, end = contents.span or (None, None)
     first, last = contents.first or (None, None), contents.last or (None, None)
+    names = "feature_set", "model", "model_sha256", "input_sha256", "version"
+    own: dict[str, Any] = {name: record.get(name) for name in names}
     return replace(
         row,
+        **own,
         node=record.get("node", row.node),
         state=FINISHED if contents.complete else UNFINISHED,
         microphones=contents.microphones,
@@ -251,11 +254,6 @@ def _filled(row: CatalogRow, contents: LogInventory) -> CatalogRow:
         first_stamp=first[1],
         last_frame=last[0],
         last_stamp=last[1],
-        feature_set=record.get("feature_set"),
-        model=record.get("model"),
-        model_sha256=record.get("model_sha256"),
-        input_sha256=record.get("input_sha256"),
-        version=record.get("version"),
         gaps=contents.gaps,
         gap_seconds=contents.gap_seconds,
         labels=list(_labels(contents, "")),

@@ -83,17 +83,7 @@ def unified(labels: Labelling) -> Labelling:
 
 
 def labelling_of(segments: Columns) -> Labelling:
-    """Build a labelling from segments.
-
-    Raise `LogError` if a field is missing, or if segments overlap.
-    """
-    segments = segments_in_order(segments)
-    starts = segments["header.stamp"]
-    return Labelling(starts, starts + segments["duration"], segments["label"])
-
-
-def segments_in_order(segments: Columns) -> Columns:
-    """Sort segments by stamp, and drop segments without a duration.
+    """Build a labelling from segments, in order of stamp, without segments of no duration.
 
     Raise `LogError` if a field is missing, or if segments overlap.
     """
@@ -105,7 +95,7 @@ def segments_in_order(segments: Columns) -> Columns:
             f"{segments.topic}: segments overlap; is a log there twice, or those of two homes? "
             "name the folder of one"
         )
-    return segments
+    return Labelling(starts, ends, segments["label"])
 
 
 def all_classes(

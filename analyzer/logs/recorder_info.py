@@ -164,7 +164,7 @@ def _info_of(
         },
         attachments=attachments,
         first_frame=first,
-        has_directions=kind == "features" and _has_topic(file, topic(microphone, "direction")),
+        has_directions=kind == "features" and bool(_channels(file, topic(microphone, "direction"))),
         embedding=embedding_source(file, microphone) if kind == "features" else None,
     )
 
@@ -174,21 +174,19 @@ def _set_of_names(file: LogFile, name: str) -> str:
 
     Programs that copy topics drop metadata records, but keep the names.
     """
-    channels = (channel for channel in file.channels.values() if channel.topic == name)
-    names = next((array_names(channel.metadata, "values") for channel in channels), [])
+    names = next((array_names(one.metadata, "values") for one in _channels(file, name)), [])
     ours = {each.feature_names: each.name for each in (HOME33, AUROS21)}
     return ours.get(tuple(names), _UNNAMED) if names else ""
 
 
 def embedding_source(file: LogFile, microphone: str) -> EmbeddingSource | None:
     """Return network and projection of a log's embeddings; None without embeddings."""
-    name = topic(microphone, "embedding")
-    channels = (channel for channel in file.channels.values() if channel.topic == name)
+    channels = _channels(file, topic(microphone, "embedding"))
     return next((EmbeddingSource.from_metadata(channel.metadata) for channel in channels), None)
 
 
-def _has_topic(file: LogFile, name: str) -> bool:
-    return any(channel.topic == name for channel in file.channels.values())
+def _channels(file: LogFile, name: str) -> list[records.Channel]:
+    return [channel for channel in file.channels.values() if channel.topic == name]
 
 
 def first_embedding_source(path: Path) -> EmbeddingSource | None:

@@ -128,31 +128,20 @@ class LogSummary:
         other : LogSummary
             Summary of different files; not modified.
         """
-        self.files += other.files
-        self.unfinished += other.unfinished
-        self.layers += other.layers
+        for name in ("files", "unfinished", "layers", "gaps"):
+            getattr(self, name).extend(getattr(other, name))
+        for name in ("size", "chunks", "chunk_bytes", "raw_bytes"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name in ("profiles", "libraries", "attachments", "metadata", "schema_versions"):
+            getattr(self, name).update(getattr(other, name))
         self.damaged |= other.damaged
-        self.size += other.size
-        self.chunks += other.chunks
-        self.chunk_bytes += other.chunk_bytes
-        self.raw_bytes += other.raw_bytes
-        self.profiles |= other.profiles
-        self.libraries |= other.libraries
-        self.attachments |= other.attachments
-        self.metadata |= other.metadata
-        self.schema_versions |= other.schema_versions
         for name, topic in other.topics.items():
-            mine = self.topics.setdefault(name, TopicSummary(topic.type, topic.encoding))
-            mine.add(topic.messages, topic.bytes, topic.span)
-        for microphone, seconds in other.label_seconds.items():
-            self.label_seconds.setdefault(microphone, Counter()).update(seconds)
-        for microphone, counts in other.segments.items():
-            self.segments.setdefault(microphone, Counter()).update(counts)
-        for microphone, lengths in other.segment_seconds.items():
-            self.segment_seconds.setdefault(microphone, Counter()).update(lengths)
-        for microphone, amounts in other.unsure.items():
-            self.unsure.setdefault(microphone, Counter()).update(amounts)
-        self.gaps += other.gaps
+            own = self.topics.setdefault(name, TopicSummary(topic.type, topic.encoding))
+            own.add(topic.messages, topic.bytes, topic.span)
+        for name in ("label_seconds", "segments", "segment_seconds", "unsure"):
+            mine = getattr(self, name)
+            for microphone, amounts in getattr(other, name).items():
+                mine.setdefault(microphone, Counter()).update(amounts)
         self.streams += [stream for stream in other.streams if stream not in self.streams]
         self.health = worse(self.health, other.health)
         both = [one for one in (self.latest_health, other.latest_health) if one is not None]
