@@ -1,12 +1,16 @@
 """Sounds that recur, each of one thing, among coughs and cries."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import soundfile
 
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.lab import recurring_scene
 
+START = 1_772_352_000 * NANOSECONDS
+DAY = 86_400 * NANOSECONDS
 CLIPS = Path(__file__).parent / "data" / "household"
 RECURRING = {
     "rooster": "other_negative/other_negative_013.flac",
@@ -15,6 +19,14 @@ RECURRING = {
     "clock": "objects_activity/objects_activity_027.flac",
 }
 _LONGEST = 4 * 16_000
+
+
+@cache
+def two_recurring_days(base):
+    """Logs of some minutes on each of two days, and when what recurs was."""
+    folder = base / "recurring" / "logs"
+    folder.parent.mkdir()
+    return folder, [record_recurring(folder, START + day * DAY, seed=day) for day in range(2)]
 
 
 def record_recurring(folder, start, seed, seconds=720):

@@ -1,5 +1,6 @@
 """Two voices in conversations, recorded with the starter model."""
 
+from functools import cache
 from pathlib import Path
 
 from hearthlog.models.starter import GENERAL, starter_file
@@ -11,6 +12,16 @@ START = 1_772_352_000 * NANOSECONDS
 DAY = 86_400 * NANOSECONDS
 CLIPS = Path(home.__file__).parent / "clips"
 THEO, ALLISON = "fsdd_theo", "voice_allison_smith"
+
+
+@cache
+def two_spoken_days(base):
+    """Logs of a minute on each of two days, and when who spoke."""
+    folder = base / "spoken"
+    folder.mkdir()
+    voices = two_voices(folder)
+    days = [record_conversation(voices, folder, START + day * DAY, day) for day in range(2)]
+    return days[0][0], [turns for _, turns in days]
 
 
 def two_voices(tmp_path):

@@ -72,7 +72,7 @@ def group(number, name="", times=84, *, microphones=("mic",), **changes):
 
 def summary_of(*groups, of="5b4e0d1c"):
     return GroupsSummary(
-        id=of, sounds=1000, timezone="UTC", groups_file=GROUPS, groups=list(groups)
+        id=of, sounds=1000, timezone="UTC", groups_file=GROUPS.file, groups=list(groups)
     )
 
 
@@ -137,7 +137,7 @@ def test_without_a_summary_there_is_nothing_and_a_new_one_is_seen(tmp_path):
 
 
 def test_the_summary_lies_beside_the_groups():
-    assert summary_path(Path(GROUPS)).name == SUMMARY
+    assert summary_path(Path(GROUPS.file)).name == SUMMARY
 
 
 # Files that are none

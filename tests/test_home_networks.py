@@ -11,9 +11,11 @@ import numpy as np
 import spliced
 from recurring import record_recurring
 
-from hearthlog.analyzer.discover.groups import NO_GROUP, load_groups, save_groups
+from hearthlog.analyzer.discover.clusters import NO_CLUSTER
+from hearthlog.analyzer.discover.groups import load_groups, save_groups
 from hearthlog.analyzer.discover.sounds import (
     discover,
+    groups_of,
     read_log_sounds,
     read_sounds,
     unembedded_note,
@@ -83,7 +85,7 @@ def hearthlog(capfd):
 
 
 def day_of(sounds):
-    return (sounds.spans.starts - START) // DAY
+    return (sounds.starts - START) // DAY
 
 
 def test_sounds_are_described_by_the_embeddings_of_one_network_and_projection(days):
@@ -92,8 +94,8 @@ def test_sounds_are_described_by_the_embeddings_of_one_network_and_projection(da
         assert sounds.embedding == ONE.source.space
         assert sounds.embeddings.shape[1] == WIDTH
         assert set(day_of(sounds)[heard].tolist()) == {1, 4}
-        assert sounds.without_embedding == 3
-        assert sounds.other_embeddings == {OTHER.source.space, PROJECTED.source.space}
+        assert len(sounds.unfit) == 3
+        assert set(sounds.unfit) == {None, OTHER.source.space, PROJECTED.source.space}
         note = unembedded_note(sounds, discover(sounds, None)[0])
     assert note == (
         "3 of 5 logs are without embeddings of one as the groups are by (but of one, other, or of "
@@ -110,7 +112,7 @@ def test_groups_with_embeddings_know_their_sounds_on_days_without(days, tmp_path
     groups = load_groups(tmp_path / "groups")
     with read_sounds(home, "all", groups=groups) as sounds:
         again, of, _ = discover(sounds, groups)
-        known = (of != NO_GROUP) & (of < len(groups.numbers))
+        known = (of != NO_CLUSTER) & (of < len(groups.numbers))
         for day in range(len(EARS)):
             assert known[day_of(sounds) == day].mean() > 0.2
     assert again.numbers[: len(groups.numbers)].tolist() == groups.numbers.tolist()
@@ -121,10 +123,10 @@ def test_names_find_the_sounds_that_grouping_finds(days):
     with read_sounds(home, "all") as sounds:
         groups, _, _ = discover(sounds, None)
         _, of, _ = discover(sounds, groups)
-        expected = dict(zip(sounds.spans.starts.tolist(), of.tolist(), strict=True))
+        expected = dict(zip(sounds.starts.tolist(), of.tolist(), strict=True))
     for log in find_logs(days):
         for one in read_log_sounds(log, "all"):
-            found = groups.of_sounds(one.descriptors, one.embeddings, one.embedding)
+            found = groups_of(one, groups)
             assert found.tolist() == [expected[start] for start in one.spans.starts.tolist()]
 
 

@@ -8,9 +8,8 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 
 from spoken import START, record_conversation, two_voices
 
-from hearthlog.analyzer.discover.home_voices import find_voices
 from hearthlog.analyzer.discover.sounds import ALL, discover, read_sounds
-from hearthlog.analyzer.discover.speech import read_speech
+from hearthlog.analyzer.discover.speech import find_voices, read_speech
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.tools.lab.home.copies import copy_logs

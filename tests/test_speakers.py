@@ -11,7 +11,7 @@ import soundfile
 from spoken import ALLISON, START, THEO, two_voices
 from typer.testing import CliRunner
 
-from hearthlog.analyzer.discover.home_voices import check_voices, is_of_two
+from hearthlog.analyzer.discover.speech import check_voices, is_of_two
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.enrol import enrol_file, enrol_log
 from hearthlog.analyzer.training.dataset import Recording

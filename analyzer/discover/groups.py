@@ -1,31 +1,31 @@
 """Groups of similar sounds: descriptors, clusters, and the groups file."""
 
-import fcntl
-import hashlib
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final
 
 import numpy as np
-import safetensors
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import Field, StringConstraints
 
+from hearthlog.analyzer.discover.clusters import (
+    MOST_CLUSTERS,
+    NO_CLUSTER,
+    ClusterId,
+    ClusterKind,
+    ClusterNames,
+    Clusters,
+    StrictModel,
+    are_numbers,
+)
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.spans import ranges
-from hearthlog.models.classes import CLASS_NAME
 from hearthlog.models.classifiers.model import MOST_VALUES
-from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64, read_sealed, write_sealed
-from hearthlog.schemas.files import read_limited
-from hearthlog.schemas.logs.files import log_readers
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.messages.topics import EmbeddingSpace
-from hearthlog.schemas.new_files import open_lock, replaced_file
 
 LEAST = 8  # default minimum of sounds per group
-MOST_GROUPS = 1_000  # per file
 MOST_DIMENSIONS = 16
 _CLOSE = 3  # neighbours of a density estimate
 MOST_EXAMPLES = 200  # kept per group
@@ -36,8 +36,8 @@ _LARGEST_CLUSTER = (
 _RADIUS = 95  # percentile of the distances from examples to their nearest example
 _LEAST_RADIUS = 1e-6  # for groups of identical sounds
 _AT_ONCE = 1024  # points
+_MAPPED_AT_ONCE = 10_000  # sounds
 _ROUNDING = 1e-9  # error of squared distances computed by matrix products
-NO_GROUP = -1
 
 
 @dataclass(frozen=True)
@@ -70,12 +70,12 @@ class Space:
         return ((descriptors - self.mean) / self.scale) @ self.axes.T
 
     def find(self, points: Float64) -> Int64:
-        """Return the group row of each point; `NO_GROUP` for a point without a group.
+        """Return the group row of each point; `NO_CLUSTER` for a point without a group.
 
         If several groups match, the nearest example relative to the group's radius decides.
         """
         examples = [self.examples[self.of == row] for row in range(len(self.radii))]
-        nearest, found = np.full(len(points), np.inf), np.full(len(points), NO_GROUP)
+        nearest, found = np.full(len(points), np.inf), np.full(len(points), NO_CLUSTER)
         for first in range(0, len(points), _AT_ONCE):
             part = slice(first, first + _AT_ONCE)
             for row in np.unique(self.of):
@@ -85,66 +85,85 @@ class Space:
                 nearest[part][closer], found[part][closer] = away[closer], row
         return found
 
+    def with_group(self, points: Float64 | None) -> "Space":
+        """Return a copy with a group of points; None for a group without examples here."""
+        from scipy.spatial import cKDTree  # noqa: PLC0415
 
-_Space = TypeVar("_Space", bound=Space)
+        if points is None:
+            return replace(self, radii=np.append(self.radii, _LEAST_RADIUS))
+        count = min(len(points), MOST_EXAMPLES)
+        examples = points[np.linspace(0, len(points) - 1, count).astype(int)]
+        steps = cKDTree(examples).query(examples, 2)[0][:, 1]
+        radius = max(float(np.percentile(steps, _RADIUS)), _LEAST_RADIUS)
+        return replace(
+            self,
+            examples=np.concatenate([self.examples, examples]),
+            of=np.append(self.of, np.full(count, len(self.radii))),
+            radii=np.append(self.radii, radius),
+        )
 
 
 @dataclass(frozen=True)
-class Groups(Space):
+class Groups(Clusters):
     """Groups in two spaces: features alone, and features with embeddings.
 
     A group has examples in both spaces, or in the feature space alone.
 
     Attributes
     ----------
-    numbers : np.ndarray [shape=(g,)], int64
-        Group numbers, never reused.
-    names : list of str
-        Classes assigned by a person; empty for unnamed groups.
-    id : str
-        Unique id of these groups; identifies the groups file that a mark refers to.
     embedding : EmbeddingSpace or None
         Space of the embeddings in the descriptors; None without embeddings.
     """
 
     features: tuple[str, ...]
-    numbers: Int64
-    names: list[str] = field(default_factory=list)
-    id: str = ""
+    space: Space
     embedding: EmbeddingSpace | None = None
     embedded: Space | None = None
 
-    def of_sounds(
-        self, descriptors: Float32, embeddings: Float32, embedding: EmbeddingSpace | None
-    ) -> Int64:
-        """Return the group row of each sound; `NO_GROUP` for a sound without a group.
+    def points(self, descriptors: Float32, embeddings: Float32) -> tuple[Float64, Float64]:
+        """Return the points of sounds in both spaces.
 
         Parameters
         ----------
         descriptors : np.ndarray [shape=(n, width)], float32
         embeddings : np.ndarray [shape=(n, k)], float32
-            NaN for a sound without an embedding.
-        """
-        of, heard = np.empty(len(descriptors), np.int64), self.are_comparable(embeddings)
-        heard &= embedding == self.embedding
-        of[~heard] = self.find(self.points(descriptors[~heard]))
-        if self.embedded is not None and heard.any():
-            both = np.concatenate([descriptors[heard], embeddings[heard]], axis=1)
-            of[heard] = self.embedded.find(self.embedded.points(both))
-        return of
+            In the space of the groups' embeddings; NaN for a sound without.
 
-    def space(self, *, embedded: bool) -> Space:
-        """Return the space with embeddings if requested and available, else the feature space."""
-        return self.embedded if embedded and self.embedded is not None else self
+        Returns
+        -------
+        points : np.ndarray [shape=(n, d)], float64
+        embedded : np.ndarray [shape=(n, e)], float64
+            NaN for a sound without an embedding; no columns if the groups have none.
+        """
+        points = np.empty((len(descriptors), len(self.space.axes)))
+        width = 0 if self.embedded is None else len(self.embedded.axes)
+        embedded = np.full((len(points), width), np.nan)
+        for first in range(0, len(points), _MAPPED_AT_ONCE):
+            part = slice(first, first + _MAPPED_AT_ONCE)
+            points[part] = self.space.points(descriptors[part])
+            if self.embedded is not None and self.are_comparable(embeddings[part]).any():
+                both = np.concatenate([descriptors[part], embeddings[part]], axis=1)
+                embedded[part] = self.embedded.points(both)
+        return points, embedded
+
+    def find(self, points: Float64, embedded: Float64) -> Int64:
+        """Return the group row of each sound; `NO_CLUSTER` for a sound without a group."""
+        if self.embedded is None:
+            return self.space.find(points)
+        of, heard = np.empty(len(points), np.int64), is_embedded(embedded)
+        of[heard] = self.embedded.find(embedded[heard])
+        of[~heard] = self.space.find(points[~heard])
+        return of
 
     def are_comparable(self, embeddings: Float32) -> Bool:
         """Return which sounds have embeddings comparable with those of the groups."""
-        if self.embedded is None or embeddings.shape[1] != len(self.embedded.mean) - len(self.mean):
+        width = 0 if self.embedded is None else len(self.embedded.mean) - len(self.space.mean)
+        if embeddings.shape[1] != width:
             return np.zeros(len(embeddings), bool)
         return is_embedded(embeddings)
 
 
-def is_embedded(embeddings: Float32) -> Bool:
+def is_embedded(embeddings: Float32 | Float64) -> Bool:
     """Return which sounds have an embedding."""
     if not embeddings.shape[1]:
         return np.zeros(len(embeddings), bool)
@@ -191,11 +210,11 @@ def new_groups(
             both = np.concatenate([descriptors[heard], embeddings[heard]], axis=1)
             embedded = make_space(both)
     return Groups(
-        **vars(make_space(descriptors)),
-        features=tuple(features),
-        numbers=np.empty(0, np.int64),
-        embedding=None if embedded is None else embedding,
-        embedded=embedded,
+        np.empty(0, np.int64),
+        tuple(features),
+        make_space(descriptors),
+        None if embedded is None else embedding,
+        embedded,
     )
 
 
@@ -216,7 +235,7 @@ def add_groups(
     points : np.ndarray [shape=(n, d)], float64
         In time order.
     of : np.ndarray [shape=(n,)], int64
-        Group row of each point, or `NO_GROUP`. A cluster is new if most of its points have no
+        Group row of each point, or `NO_CLUSTER`. A cluster is new if most of its points have no
         group.
     least : int, optional
         Minimum of sounds per group.
@@ -237,19 +256,21 @@ def add_groups(
     sizes = np.bincount(labels[labels >= 0])
     for label in np.argsort(-sizes, kind="stable"):
         own = labels == label
-        new = own & (of == NO_GROUP)
-        if 2 * new.sum() > own.sum() and new.sum() >= least and len(groups.numbers) < MOST_GROUPS:
-            groups = _add(groups, points[new], None if embedded is None else embedded[new])
+        new = own & (of == NO_CLUSTER)
+        if 2 * new.sum() > own.sum() and new.sum() >= least and len(groups.numbers) < MOST_CLUSTERS:
+            in_both = groups.embedded and groups.embedded.with_group(
+                None if embedded is None else embedded[new]
+            )
+            space = groups.space.with_group(points[new])
+            groups = groups.with_new(1, space=space, embedded=in_both)
     return groups
 
 
 def identified(groups: Groups) -> Groups:
     """Assign an id to new groups; equal ids mean equal groups."""
-    arrays = [groups.mean, groups.scale, groups.axes, groups.examples, groups.of]
-    if groups.embedded is not None:
-        arrays.append(groups.embedded.examples)
-    digest = hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
-    return replace(groups, id=digest[:8])
+    space = groups.space
+    arrays = [space.mean, space.scale, space.axes, space.examples, space.of]
+    return groups.identified(arrays + ([groups.embedded.examples] if groups.embedded else []))
 
 
 def _distances(points: Float64, examples: Float64, radius: float) -> Float64:
@@ -265,36 +286,6 @@ def _distances(points: Float64, examples: Float64, radius: float) -> Float64:
     differences = points[near][:, np.newaxis] - examples
     away[near] = np.sqrt((differences**2).sum(axis=2).min(axis=1))
     return away
-
-
-def _add(groups: Groups, points: Float64, embedded: Float64 | None) -> Groups:
-    number, row = groups.numbers.max(initial=0) + 1, len(groups.numbers)
-    in_both = groups.embedded
-    if in_both is not None:
-        in_both = _with_examples(in_both, embedded, row)
-    return replace(
-        _with_examples(groups, points, row),
-        numbers=np.append(groups.numbers, number),
-        names=[*groups.names, ""],
-        embedded=in_both,
-    )
-
-
-def _with_examples(space: _Space, points: Float64 | None, row: int) -> _Space:
-    """Add a group to a space; None if the group has no examples there."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415
-
-    if points is None:
-        return replace(space, radii=np.append(space.radii, _LEAST_RADIUS))
-    examples = points[np.linspace(0, len(points) - 1, min(len(points), MOST_EXAMPLES)).astype(int)]
-    steps = cKDTree(examples).query(examples, 2)[0][:, 1]
-    radius = max(float(np.percentile(steps, _RADIUS)), _LEAST_RADIUS)
-    return replace(
-        space,
-        examples=np.concatenate([space.examples, examples]),
-        of=np.append(space.of, np.full(len(examples), row)),
-        radii=np.append(space.radii, radius),
-    )
 
 
 _ENERGY = "energy"
@@ -364,95 +355,31 @@ def _weights(values: Float32, names: Sequence[str]) -> Float64:
     return np.maximum(energy, _LEAST_ENERGY) ** _WEIGHT
 
 
-GROUPS = "groups.safetensors"  # in a folder of logs
-_KEY = "hearthlog_groups"
 _FORMAT: Final = 1
 _FORMAT_OF_EMBEDDINGS: Final = 2  # refused by versions without embedding support
-_LARGEST = 64 << 20  # bytes
-_LARGEST_HEADER = 1 << 20
-_Header = TypeVar("_Header", bound=BaseModel)
-_LEAST_NUMBER, _MOST_NUMBER = 1, (1 << 31) - 1
 _SMALL, _LARGE = 1e-6, 1e6  # limits of radii and scales; all other numbers are at most as large
 _ARRAYS = {"mean": 1, "scale": 1, "axes": 2, "examples": 2, "of": 1, "radii": 1}  # of a space
 _EMBEDDED = "embedded_"  # prefix of the arrays of the embedding space
 _WHOLE = {"of", "numbers"}
 
 _Name = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
-_Class = Annotated[str, StringConstraints(pattern=rf"^({CLASS_NAME.pattern})?$")]
 
 
-class _Embedding(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
+class _Embedding(StrictModel):
     network: _Name
     projection_sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
     width: Annotated[int, Field(ge=1, le=MOST_VALUES)]
 
 
-class _Head(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
+class _Header(StrictModel):
     format: Annotated[int, Field(ge=1, le=_FORMAT_OF_EMBEDDINGS)]
-    id: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{8}$")]
+    id: ClusterId
     features: Annotated[list[_Name], Field(min_length=1, max_length=256)]
-    names: Annotated[list[_Class], Field(max_length=MOST_GROUPS)]
+    names: ClusterNames
     embedding: _Embedding | None = None
 
 
-@contextmanager
-def locked_groups(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock on the groups file.
-
-    Raise `DataError` if its folder cannot be written.
-    """
-    lock_file = path.with_name(f".{path.name}.lock")
-    try:
-        lock = os.fdopen(open_lock(lock_file), "rb")
-    except OSError as error:
-        raise DataError(f"{lock_file}: cannot be written ({error.strerror})") from error
-    with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-
-
-def write_arrays(path: Path, key: str, arrays: dict[str, NDArray[Any]], head: BaseModel) -> None:
-    """Write a safetensors file of arrays with a header, replacing an existing one.
-
-    Raise `LogError` if it cannot be written.
-    """
-    data = write_sealed(arrays, key, head.model_dump_json(exclude_none=True))
-    with replaced_file(path, readers=log_readers(path.parent)) as temporary:
-        temporary.write_bytes(data)
-
-
-def read_arrays(
-    path: Path, what: str, key: str, limit: int, kind: type[_Header]
-) -> tuple[dict[str, NDArray[Any]], _Header]:
-    """Read a file as `write_arrays` writes it.
-
-    Parameters
-    ----------
-    what : str
-        Content of the file, for messages: `groups` or `voices`.
-    limit : int
-        Bytes of the file, at most.
-
-    Raises
-    ------
-    DataError
-        If it is no such file, is too large, or damaged.
-    """
-    data = read_limited(path, f"file of {what}", limit, DataError)
-    if int.from_bytes(data[:8], "little") > _LARGEST_HEADER:
-        raise DataError(f"{path}: is no file of {what} (its header is too large)")
-    try:
-        arrays, text, damaged = read_sealed(path, data, key)
-        head = kind.model_validate_json(text)
-    except (safetensors.SafetensorError, KeyError, ValidationError) as error:
-        raise DataError(f"{path}: is no file of {what} of this version of hearthlog") from error
-    if damaged:
-        raise DataError(damaged)
-    return arrays, head
+GROUPS: Final = ClusterKind("group", "discover", "3=doorbell", _Header, 64 << 20)
 
 
 def save_groups(groups: Groups, path: Path) -> None:
@@ -460,14 +387,19 @@ def save_groups(groups: Groups, path: Path) -> None:
 
     Raise `LogError` if it cannot be written.
     """
-    head = _Head(format=_FORMAT, id=groups.id, features=list(groups.features), names=groups.names)
-    arrays = {"numbers": groups.numbers, **{name: getattr(groups, name) for name in _ARRAYS}}
+    arrays = {"numbers": groups.numbers, **vars(groups.space)}
+    number, embedding = _FORMAT, None
     if groups.embedding is not None:
-        head.format = _FORMAT_OF_EMBEDDINGS
-        head.embedding = _Embedding(**groups.embedding._asdict())
-        arrays |= {_EMBEDDED + name: getattr(groups.embedded, name) for name in _ARRAYS}
-    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    write_arrays(path, _KEY, arrays, head)
+        number, embedding = _FORMAT_OF_EMBEDDINGS, _Embedding(**groups.embedding._asdict())
+        arrays |= {_EMBEDDED + name: array for name, array in vars(groups.embedded).items()}
+    header = _Header(
+        format=number,
+        id=groups.id,
+        features=list(groups.features),
+        names=groups.names,
+        embedding=embedding,
+    )
+    GROUPS.write(path, arrays, header)
 
 
 def load_groups(path: Path) -> Groups | None:
@@ -475,29 +407,31 @@ def load_groups(path: Path) -> Groups | None:
 
     Raise `DataError` if it is not a groups file, or damaged.
     """
-    if not path.exists():
+    found = GROUPS.read(path)
+    if found is None:
         return None
-    arrays, head = read_arrays(path, "groups", _KEY, _LARGEST, _Head)
-    if problem := _problem(head, arrays):
+    arrays, header = found
+    if problem := _problem(header, arrays):
         raise DataError(f"{path}: is damaged: {problem}; move it away to begin anew")
     embedding, embedded = None, None
-    if head.embedding is not None:
-        embedding = EmbeddingSpace(**head.embedding.model_dump())
-        embedded = Space(**{name: arrays.pop(_EMBEDDED + name) for name in _ARRAYS})
+    if header.embedding is not None:
+        embedding = EmbeddingSpace(**header.embedding.model_dump())
+        embedded = Space(**{name: arrays[_EMBEDDED + name] for name in _ARRAYS})
     return Groups(
-        **arrays,
-        features=tuple(head.features),
-        names=head.names,
-        id=head.id,
-        embedding=embedding,
-        embedded=embedded,
+        arrays["numbers"],
+        tuple(header.features),
+        Space(**{name: arrays[name] for name in _ARRAYS}),
+        embedding,
+        embedded,
+        names=header.names,
+        id=header.id,
     )
 
 
-def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
+def _problem(header: _Header, arrays: dict[str, NDArray[Any]]) -> str:
     """Return the inconsistency of a groups file; empty if there is none."""
     expected = {"numbers": 1, **_ARRAYS}
-    if head.embedding is not None:
+    if header.embedding is not None:
         expected |= {_EMBEDDED + name: dimensions for name, dimensions in _ARRAYS.items()}
     if arrays.keys() != expected.keys():
         return "it has other arrays"
@@ -508,17 +442,14 @@ def _problem(head: _Head, arrays: dict[str, NDArray[Any]]) -> str:
             return f"{name} is not as it has to be"
         if not whole and not (np.abs(array) <= _LARGE).all():
             return f"{name} has numbers that are too large, or none"
-    width, numbers = descriptor_width(head.features), arrays["numbers"]
+    width, numbers = descriptor_width(header.features), arrays["numbers"]
     fits = (
-        numbers.shape == (len(head.names),)
-        and len(np.unique(numbers)) == len(numbers)
-        and (numbers >= _LEAST_NUMBER).all()
-        and (numbers <= _MOST_NUMBER).all()
+        are_numbers(numbers, header.names)
         and _fits(arrays, "", len(numbers), (width, width))
         and np.array_equal(np.unique(arrays["of"]), np.arange(len(numbers)))
     )
-    if fits and head.embedding is not None:
-        widths = width + 1, width + head.embedding.width
+    if fits and header.embedding is not None:
+        widths = width + 1, width + header.embedding.width
         fits = _fits(arrays, _EMBEDDED, len(numbers), widths)
     return "" if fits else "its arrays do not fit each other"
 

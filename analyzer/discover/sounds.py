@@ -1,38 +1,55 @@
-"""Sounds of a home: spans, reading of logs, and group assignment."""
+"""Sounds of a home: reading of logs, group assignment, and marks of named groups."""
 
 import tempfile
-from collections.abc import Iterator, Sequence
-from collections.abc import Set as AbstractSet
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.discover.clusters import (
+    NO_CLUSTER,
+    NamedSpans,
+    Occurrences,
+    places,
+    read_each,
+)
 from hearthlog.analyzer.discover.groups import (
+    GROUPS,
     LEAST,
-    NO_GROUP,
     Groups,
     add_groups,
     describe,
     descriptor_width,
     identified,
+    is_embedded,
     new_groups,
 )
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.selection import checked_array_names
 from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
 from hearthlog.analyzer.logs.spans import ranges
+from hearthlog.analyzer.marks.marks import (
+    Mark,
+    MarkedSpan,
+    ReviewedSpan,
+    read_marks,
+    read_reviewed,
+    write_marks,
+)
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import EmbeddingSpace, topic
+from hearthlog.schemas.messages.topics import LIVE, EmbeddingSpace, topic
 
 ALL, UNSURE, NOT_KNOWN = CHOICES = ("all", "unsure", "unknown")
 # A sound has at least four frames and may contain two silent ones; stamps follow a clock.
@@ -40,26 +57,7 @@ _PAUSE = 3 * FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2
 _LEAST_NANOSECONDS = 3 * FRAME_NANOSECONDS - FRAME_NANOSECONDS // 2
 _BEFORE = np.int64(-1 << 62)  # before any time
 _UNSURE_CONFIDENCE = 0.5  # same as for clips that the model is unsure of
-
-
-class LabelledStamps(NamedTuple):
-    """Labels of frames.
-
-    Attributes
-    ----------
-    stamps : np.ndarray [shape=(n,)], int64
-        Ascending, in nanoseconds of UTC.
-    labels : np.ndarray [shape=(n,)] of str
-    confidence : np.ndarray [shape=(n,)], float32
-    """
-
-    stamps: Int64
-    labels: NDArray[np.object_]
-    confidence: Float32
-
-    def rows(self, rows: Bool) -> "LabelledStamps":
-        """Select rows."""
-        return LabelledStamps(self.stamps[rows], self.labels[rows], self.confidence[rows])
+_FIELDS = {"header.stamp", "values", "label", "confidence"}
 
 
 class SoundSpans(NamedTuple):
@@ -84,6 +82,10 @@ class SoundSpans(NamedTuple):
     labels: NDArray[np.str_]
     confidence: Float64
 
+    def rows(self, rows: Bool) -> "SoundSpans":
+        """Select rows."""
+        return SoundSpans(*map(itemgetter(rows), self))
+
     def chosen(self, choice: str) -> "SoundSpans":
         """Return all sounds, the sounds with unsure labels, or the sounds of unknown class."""
         if choice == ALL:
@@ -93,43 +95,36 @@ class SoundSpans(NamedTuple):
             keep |= self.confidence < _UNSURE_CONFIDENCE
         return self.rows(keep)
 
-    def rows(self, rows: Bool) -> "SoundSpans":
-        """Select rows."""
-        return SoundSpans(
-            self.starts[rows],
-            self.ends[rows],
-            self.first[rows],
-            self.last[rows],
-            self.labels[rows],
-            self.confidence[rows],
-        )
 
-
-def find_sounds(stamps: Int64, labels: LabelledStamps) -> SoundSpans:
+def _find_sounds(
+    stamps: Int64, label_stamps: Int64, labels: NDArray[np.object_], confidence: Float32
+) -> SoundSpans:
     """Return the sounds of a log: runs of labels other than silence.
 
     Parameters
     ----------
     stamps : np.ndarray [shape=(m,)], int64
         Of the frames with features, ascending.
+    label_stamps : np.ndarray [shape=(n,)], int64
+        Of the labels, ascending.
     """
-    heard = labels.rows(labels.labels != SILENCE)
-    rows = np.minimum(np.searchsorted(stamps, heard.stamps), max(len(stamps) - 1, 0))
-    there = stamps[rows] == heard.stamps if len(stamps) else np.zeros(len(rows), np.bool_)
-    heard, rows = heard.rows(there), rows[there]
-    first = np.flatnonzero(np.diff(heard.stamps, prepend=_BEFORE) > _PAUSE)
+    rows = np.minimum(np.searchsorted(stamps, label_stamps), max(len(stamps) - 1, 0))
+    there = labels != SILENCE
+    there &= stamps[rows] == label_stamps if len(stamps) else False
+    rows, sounding = rows[there], label_stamps[there]
+    first = np.flatnonzero(np.diff(sounding, prepend=_BEFORE) > _PAUSE)
     counts = np.diff(np.append(first, len(rows)))
-    enough = heard.stamps[first + counts - 1] - heard.stamps[first] >= _LEAST_NANOSECONDS
+    enough = sounding[first + counts - 1] - sounding[first] >= _LEAST_NANOSECONDS
     first, counts = first[enough], counts[enough]
     sound, inside = ranges(first, counts)
     begin, end = rows[first], rows[first + counts - 1]
-    sums = np.bincount(sound, heard.confidence[inside], len(first))
+    sums = np.bincount(sound, confidence[there][inside], len(first))
     return SoundSpans(
         stamps[begin],
         stamps[end] + FRAME_NANOSECONDS,
         begin.astype(np.int64),
         end.astype(np.int64) + 1,
-        _most_frequent(heard.labels[inside], sound, len(first)),
+        _most_frequent(labels[there][inside], sound, len(first)),
         sums / counts,
     )
 
@@ -140,9 +135,6 @@ def _most_frequent(labels: NDArray[Any], sound: Int64, count: int) -> NDArray[np
     shape = count, max(len(names), 1)
     counts = np.bincount(sound * shape[1] + codes, minlength=shape[0] * shape[1])
     return names[counts.reshape(shape).argmax(axis=1)] if count else names
-
-
-_FIELDS = {"header.stamp", "values", "label", "confidence"}
 
 
 class LogSounds(NamedTuple):
@@ -169,32 +161,26 @@ class LogSounds(NamedTuple):
 
 
 @dataclass(frozen=True)
-class HomeSounds:
-    """Sounds of a home, in the order of `logs`, and by time within a log.
+class HomeSounds(Occurrences):
+    """Sounds of a home.
 
     Attributes
     ----------
-    log, microphone : np.ndarray [shape=(n,)], int64
-        Indices of each sound into these lists.
+    labels : np.ndarray [shape=(n,)], str
     descriptors : np.ndarray [shape=(n, width)], float32
         On disk.
     embeddings : np.ndarray [shape=(n, k)], float32
         On disk; NaN without an embedding, or with an embedding of another network or projection.
+    unfit : list of EmbeddingSpace or None
+        Of each log whose sounds have NaN; None without embeddings.
     """
 
     features: tuple[str, ...]
-    logs: list[Path]
-    microphones: list[str]
-    log: Int64
-    microphone: Int64
-    spans: SoundSpans
+    labels: NDArray[np.str_]
     descriptors: Float32
     embedding: EmbeddingSpace | None
     embeddings: Float32
-    without_embedding: int
-    other_embeddings: AbstractSet[EmbeddingSpace]
-    losses: list[str]
-    without: int = 0
+    unfit: list[EmbeddingSpace | None]
 
 
 @contextmanager
@@ -228,12 +214,7 @@ def read_sounds(  # noqa: PLR0913, PLR0917
     ):
         reader = _Reader(choice, (start, end), groups, store, embedded)
         # Last log first: its descriptor format applies to all others.
-        for number, entry in enumerate(reversed(entries), 1):
-            try:
-                reader.read(entry.path)
-            except LogError as error:
-                reader.losses.append(str(error))
-            progress(number / len(entries))
+        read_each(entries[::-1], reader.read, reader.losses, progress)
         yield reader.sounds(home.losses)
 
 
@@ -252,8 +233,7 @@ def read_log_sounds(
             continue
         names = checked_array_names(log, features, "values")
         stamps, values = _by_time(features, "values")
-        spans = find_sounds(stamps, LabelledStamps(*_by_time(labels, "label", "confidence")))
-        spans = spans.chosen(choice)
+        spans = _find_sounds(stamps, *_by_time(labels, "label", "confidence")).chosen(choice)
         described = describe(values, names, spans.first, spans.last)
         is_finite: Bool = np.isfinite(described).min(axis=1, initial=True)
         lost = int((~is_finite).sum())
@@ -279,22 +259,19 @@ class _Reader:
         embedded: IO[bytes],
     ) -> None:
         self.losses: list[str] = []
-        self.without = 0
-        self._choice = choice
-        self._span = span
+        self._looked = choice, *span
         self._store, self._embedded = store, embedded
         self._features: tuple[str, ...] = ()
         self._any_embedding = groups is None
         self._embedding = None if groups is None else groups.embedding
         self._width = 0  # of the embeddings
-        self._without_embedding = self._count = 0
-        self._other_embeddings: set[EmbeddingSpace] = set()
-        self._logs: list[Path] = []
-        self._microphones: list[str] = []
-        self._parts: list[tuple[Int64, Int64, SoundSpans]] = []
+        self._without = self._count = 0
+        self._unfit: list[EmbeddingSpace | None] = []
+        self._parts: list[tuple[Path, str, SoundSpans]] = []
 
-    def read(self, log: Path) -> None:
-        for sounds in read_log_sounds(log, self._choice, *self._span):
+    def read(self, entry: HomeLog) -> None:
+        log, count = entry.path, len(self._parts)
+        for sounds in read_log_sounds(log, *self._looked):
             self._features = self._features or sounds.features
             if sounds.features != self._features:
                 raise LogError(f"{log}: has other features than the later logs; left out")
@@ -302,9 +279,8 @@ class _Reader:
                 self.losses.append(lost_text(log, sounds.lost))
             self._store.write(sounds.descriptors.tobytes())
             self._embed(sounds)
-            self._add(log, sounds.microphone, sounds.spans)
-        if log not in self._logs:
-            self.without += 1
+            self._parts.append((log, sounds.microphone, sounds.spans))
+        self._without += len(self._parts) == count
 
     def _embed(self, sounds: LogSounds) -> None:
         """Store embeddings that are comparable with those of later logs."""
@@ -317,39 +293,29 @@ class _Reader:
             self._width = own.shape[1]
             self._embedded.write(np.full((self._count, self._width), np.nan, np.float32).tobytes())
         if not fits:
-            self._without_embedding += 1
-            if sounds.embedding is not None:
-                self._other_embeddings.add(sounds.embedding)
+            self._unfit.append(sounds.embedding)
             own = np.full((len(own), self._width), np.nan, np.float32)
         self._embedded.write(own.tobytes())
         self._count += len(own)
-
-    def _add(self, log: Path, microphone: str, spans: SoundSpans) -> None:
-        if microphone not in self._microphones:
-            self._microphones.append(microphone)
-        count, place = len(spans.starts), self._microphones.index(microphone)
-        self._parts.append((np.full(count, len(self._logs)), np.full(count, place), spans))
-        self._logs.append(log)
 
     def sounds(self, losses: Sequence[str]) -> HomeSounds:
         if not self._features:
             what = self.losses[0] if self.losses else "no log has features and labels"
             raise DataError(what)
-        logs, microphones, spans = zip(*self._parts, strict=True)
+        parts = [spans for _, _, spans in self._parts]
+        starts, ends, _, _, labels, _ = map(np.concatenate, zip(*parts, strict=True))
         return HomeSounds(
+            *places(self._parts),
+            starts,
+            ends,
+            [*losses, *self.losses],
+            self._without,
             self._features,
-            self._logs,
-            self._microphones,
-            np.concatenate(logs),
-            np.concatenate(microphones),
-            SoundSpans(*(np.concatenate(each) for each in zip(*spans, strict=True))),
+            labels,
             _on_disk(self._store, self._count, descriptor_width(self._features)),
             self._embedding if self._width else None,
             _on_disk(self._embedded, self._count, self._width),
-            self._without_embedding,
-            self._other_embeddings,
-            [*losses, *self.losses],
-            self.without,
+            self._unfit,
         )
 
 
@@ -374,7 +340,6 @@ def _by_time(columns: Columns, *fields: str) -> tuple[Any, ...]:
 
 
 _MOST = 20_000  # sounds used to search for groups
-_AT_ONCE = 10_000
 
 
 def discover(
@@ -393,7 +358,7 @@ def discover(
     Returns
     -------
     of : np.ndarray [shape=(n,)], int64
-        Group row of each sound; `NO_GROUP` for a sound without a group.
+        Group row of each sound; `NO_CLUSTER` for a sound without a group.
     points : np.ndarray [shape=(n, d)], float64
         Points of the sounds in the feature space.
 
@@ -414,27 +379,26 @@ def discover(
             raise DataError(f"too few sounds to group: {count}, and it takes {2 * least}")
         described = sounds.descriptors[drawn], sounds.embedding, sounds.embeddings[drawn]
         groups = new_groups(sounds.features, *described)
-    points, embedded = _points(sounds, groups)
-    heard, of = groups.are_comparable(sounds.embeddings), np.full(count, NO_GROUP)
+    points, embedded = groups.points(sounds.descriptors, sounds.embeddings)
+    heard, of = is_embedded(embedded), np.full(count, NO_CLUSTER)
     for own, by_embedding in ((heard, True), (~heard, False)):
+        _assign(of, own, groups, points, embedded)
         inside = drawn[own[drawn]]
-        where = embedded if by_embedding else points
-        of[own] = groups.space(embedded=by_embedding).find(where[own])
-        groups = add_groups(
-            groups,
-            points[inside],
-            of[inside],
-            least,
-            embedded[inside] if by_embedding else None,
-        )
-        rest = own & (of == NO_GROUP)
-        of[rest] = groups.space(embedded=by_embedding).find(where[rest])
+        inside_embedded = embedded[inside] if by_embedding else None
+        groups = add_groups(groups, points[inside], of[inside], least, inside_embedded)
+        _assign(of, own, groups, points, embedded)
     return identified(groups) if is_new else groups, of, points
+
+
+def _assign(of: Int64, own: Bool, groups: Groups, points: Float64, embedded: Float64) -> None:
+    """Find groups, in place, for those of some sounds that have none yet."""
+    rest = own & (of == NO_CLUSTER)
+    of[rest] = groups.find(points[rest], embedded[rest])
 
 
 def unembedded_note(sounds: HomeSounds, groups: Groups) -> str:
     """Return a note on sounds grouped by features alone; empty if there are none."""
-    others = sorted({space.network for space in sounds.other_embeddings})
+    others = sorted({space.network for space in sounds.unfit if space})
     if groups.embedding is None:
         others = sorted({*others, sounds.embedding.network} if sounds.embedding else others)
         return (
@@ -443,33 +407,19 @@ def unembedded_note(sounds: HomeSounds, groups: Groups) -> str:
             if others
             else ""
         )
-    if not sounds.without_embedding:
+    if not sounds.unfit:
         return ""
     theirs = f" (but of {', '.join(others)}, or of another projection)" if others else ""
     return (
-        f"{sounds.without_embedding} of {len(sounds.logs)} logs are without embeddings of "
+        f"{len(sounds.unfit)} of {len(sounds.logs)} logs are without embeddings of "
         f"{groups.embedding.network} as the groups are by{theirs}: their sounds are known by their "
         "features alone"
     )
 
 
-def _points(sounds: HomeSounds, groups: Groups) -> tuple[Float64, Float64]:
-    """Return points in the feature space and the embedding space; NaN without an embedding."""
-    points = np.empty((len(sounds.descriptors), len(groups.axes)))
-    space = groups.embedded
-    embedded = np.full((len(points), 0 if space is None else len(space.axes)), np.nan)
-    for first in range(0, len(points), _AT_ONCE):
-        part = slice(first, first + _AT_ONCE)
-        descriptors, embeddings = sounds.descriptors[part], sounds.embeddings[part]
-        points[part] = groups.points(descriptors)
-        if space is not None and groups.are_comparable(embeddings).any():
-            embedded[part] = space.points(np.concatenate([descriptors, embeddings], axis=1))
-    return points, embedded
-
-
 def _drawn(sounds: HomeSounds) -> Int64:
     """Draw sounds by a hash of their times, sorted by that hash."""
-    starts = sounds.spans.starts
+    starts = sounds.starts
     rows = np.arange(len(starts))
     if len(rows) > _MOST:
         rows = np.argsort(_hashed(starts.astype(np.uint64)), kind="stable")[:_MOST]
@@ -483,20 +433,11 @@ def _hashed(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return numbers ^ (numbers >> np.uint64(31))
 
 
-class GroupSpans(NamedTuple):
-    """Sounds of existing groups, in time order.
-
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    texts : np.ndarray [shape=(n,)] of str
-        Group name, or `group 3`.
-    """
-
-    starts: Int64
-    ends: Int64
-    texts: NDArray[np.object_]
+def groups_of(sounds: LogSounds, groups: Groups) -> Int64:
+    """Return the group row of each sound of a log; `NO_CLUSTER` for a sound without a group."""
+    fits = sounds.embedding == groups.embedding
+    embeddings = sounds.embeddings if fits else sounds.embeddings[:, :0]
+    return groups.find(*groups.points(sounds.descriptors, embeddings))
 
 
 def group_spans(
@@ -505,8 +446,8 @@ def group_spans(
     start: int | None = None,
     end: int | None = None,
     progress: Progress = ignore_progress,
-) -> tuple[dict[str, GroupSpans], list[str]]:
-    """Find the sounds of existing groups; no group is added.
+) -> tuple[dict[str, NamedSpans], list[str]]:
+    """Find the sounds of existing groups by microphone; no group is added.
 
     Parameters
     ----------
@@ -518,20 +459,130 @@ def group_spans(
     DataError
         If no log has features and labels, or the groups use other features.
     """
-    texts = np.array(
-        [
-            name or f"group {number}"
-            for name, number in zip(groups.names, groups.numbers.tolist(), strict=True)
-        ],
-        object,
-    )
-    found = {}
     with read_sounds(home, ALL, start, end, progress, groups) as sounds:
         _, of, _ = discover(sounds, groups)
-        of = np.where(of < len(texts), of, NO_GROUP)
-        order = np.argsort(sounds.spans.starts, kind="stable")
-        for place, name in enumerate(sounds.microphones):
-            rows = order[(sounds.microphone[order] == place) & (of[order] != NO_GROUP)]
-            spans = sounds.spans.starts[rows], sounds.spans.ends[rows]
-            found[name] = GroupSpans(*spans, texts[of[rows]])
-    return found, sounds.losses
+        of = np.where(of < len(groups.numbers), of, NO_CLUSTER)
+        return sounds.spans(of, groups.texts(GROUPS)), sounds.losses
+
+
+class Looked(NamedTuple):
+    """Selection of sounds to search for named groups."""
+
+    choice: str
+    start: int | None = None
+    end: int | None = None
+
+
+class Marked(NamedTuple):
+    """Changes made by naming a group."""
+
+    made: int = 0
+    left: int = 0
+
+
+def name_groups(  # noqa: PLR0913, PLR0917
+    home: HomeLogs,
+    groups: Groups,
+    names: Mapping[int, str],
+    looked: Looked,
+    reviewer: str,
+    progress: Progress = ignore_progress,
+) -> tuple[dict[int, Marked], list[str]]:
+    """Mark the sounds of groups; existing marks of a group get its new name.
+
+    Logs are read one at a time, so a box with little memory can name groups found by another.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Receives the share of the logs read, 0 to 1.
+
+    Raises
+    ------
+    LogError
+        If a review layer cannot be read or written.
+    """
+    marked, losses = dict.fromkeys(names, Marked()), list(home.losses)
+    logs = home.between()
+    inside = {entry.path for entry in home.between(looked.start, looked.end)}
+    for count, (log, *_) in enumerate(logs, 1):
+        spans: dict[int, list[MarkedSpan]] = {}
+        if log in inside:
+            try:
+                spans = _spans(log, groups, looked, losses)
+            except LogError as error:
+                losses.append(str(error))
+        for number, label in names.items():
+            made, left = _mark(
+                log, spans.get(number, []), reason_of(groups, number), label, reviewer
+            )
+            before = marked[number]
+            marked[number] = Marked(before.made + made, before.left + left)
+        progress(count / len(logs))
+    return marked, losses
+
+
+def _spans(
+    log: Path, groups: Groups, looked: Looked, losses: list[str]
+) -> dict[int, list[MarkedSpan]]:
+    """Return the sounds of groups in a log, by group number."""
+    found: dict[int, list[MarkedSpan]] = {}
+    for sounds in read_log_sounds(log, *looked):
+        if sounds.features != groups.features:
+            raise LogError(f"{log}: has other features than the groups; left out")
+        if sounds.lost:
+            losses.append(lost_text(log, sounds.lost))
+        of = groups_of(sounds, groups)
+        starts, ends = sounds.spans.starts.tolist(), sounds.spans.ends.tolist()
+        for row, start, end in zip(of.tolist(), starts, ends, strict=True):
+            if row >= 0:
+                span = MarkedSpan(sounds.microphone, start, end)
+                found.setdefault(int(groups.numbers[row]), []).append(span)
+    return found
+
+
+def _mark(
+    log: Path, wanted: Sequence[MarkedSpan], reason: str, label: str, reviewer: str
+) -> Marked:
+    """Mark sounds of a log; marks with this reason get the label."""
+    now, old, reviewed = time.time_ns(), read_marks(log), read_reviewed(log)
+    own = [mark for mark in old if mark.reason == reason]
+    others: list[Mark | ReviewedSpan] = [mark for mark in old if mark.reason != reason]
+    others += reviewed
+    spans = [span for span in wanted if not _any_overlap(span, own)]
+    free = [span for span in spans if not _any_overlap(span, others)]
+    new = [Mark(*span, label, reviewer, now, LIVE, reason) for span in free]
+    new += [
+        mark._replace(label=label, reviewer=reviewer, made=now)
+        for mark in own
+        if mark.label != label
+    ]
+    if new:
+        write_marks(log, new)
+    return Marked(len(new), len(spans) - len(free))
+
+
+def unmark_group(logs: Iterable[Path], reason: str) -> int:
+    """Remove the marks of a group; return their number.
+
+    Raise `LogError` if a review layer cannot be read or written.
+    """
+    count = 0
+    for log in logs:
+        own = [mark for mark in read_marks(log) if mark.reason == reason]
+        if own:
+            write_marks(log, [], [MarkedSpan(*mark[:3]) for mark in own])
+        count += len(own)
+    return count
+
+
+def reason_of(groups: Groups, number: int) -> str:
+    """Return the reason stored in a group's marks, unique to this groups file."""
+    return f"group {number} of {groups.id}"
+
+
+def _any_overlap(span: MarkedSpan, others: Iterable[Mark | ReviewedSpan]) -> bool:
+    return any(
+        other.microphone == span.microphone and other.start < span.end and span.start < other.end
+        for other in others
+    )

@@ -1,30 +1,48 @@
-"""Speech of a home: spans, loudest microphone, and voice turns."""
+"""Speech of a home: spans, loudest microphone, turns of voices, and their enrolment."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.discover.clusters import (
+    NO_CLUSTER,
+    NamedSpans,
+    Occurrences,
+    places,
+    read_each,
+)
 from hearthlog.analyzer.discover.voices import (
     ENERGY,
+    VOICES,
     WINDOW_FRAMES,
+    HomeVoices,
     VoiceEvidence,
     describe_speech,
     has_voices,
+    no_evidence,
+    recognised,
+    same_voice,
     summed,
     tell_apart,
     voice_space,
     window_starts,
+    with_new_voices,
 )
+from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.selection import array_names, checked_array_names
 from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
+from hearthlog.analyzer.marks.enrol import Enrolled, cut_path, enrol_log
+from hearthlog.analyzer.training.dataset import Recording
+from hearthlog.analyzer.training.speakers import APART, is_voice
 from hearthlog.models.classes import SILENCE, SPEECH, class_name
+from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
-from hearthlog.schemas.errors import LogError, Progress, ignore_progress
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
+from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, time_text
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.mcap.chunks import TopicChoice
 from hearthlog.schemas.messages import message_types
@@ -184,56 +202,50 @@ def _is_louder(own: SpeechFrames, counts: Int64, other: SpeechFrames, *, or_as_l
 _FIELDS = {"header.stamp", "values", "duration", "label", "probabilities"}
 _NEVER = 1 << 62
 _PAUSE = 30 * NANOSECONDS  # between conversations
-_MOST_FRAMES = 6_000  # per conversation: five minutes
+_MOST_FRAMES = 6_000  # per conversation, or enrolled voice: five minutes
+LEAST_SECONDS = 20.0  # of speech needed to search for voices
 _LEAST_FRAMES = 10
 LEAST_WINDOWS = 10  # per voice in a conversation: five seconds
 _LARGE = 1e6  # limit of a plausible feature value
 _BREATH = FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2  # pause within a turn; stamps follow a clock
 
 
-class Turns(NamedTuple):
-    """Turns (speech without a pause), in the order of logs, and by time within a log.
-
-    Speech recorded by several microphones belongs to the loudest.
-
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    log, microphone : np.ndarray [shape=(n,)], int64
-        Indices into the lists of `HomeSpeech`.
-    voice : np.ndarray [shape=(n,)], int64
-        Row of the conversation voice.
-    """
+class _Turns(NamedTuple):
+    """Turns of one microphone in one log."""
 
     starts: Int64
     ends: Int64
-    log: Int64
-    microphone: Int64
     voice: Int64
 
 
+_NO_TURNS = _Turns(*(np.empty(0, np.int64) for _ in _Turns._fields))
+
+
 @dataclass(frozen=True)
-class HomeSpeech:
-    """Speech of a home.
+class HomeSpeech(Occurrences):
+    """Turns of a home: speech without a pause, of the microphone that records it loudest.
 
     Attributes
     ----------
     without : int
         Number of logs without segments, or with speech but without the features for voices.
+    voice : np.ndarray [shape=(n,)], int64
+        Row of the conversation voice.
+    voices : VoiceEvidence
+        Of the voices of conversations.
     """
 
-    logs: list[Path]
-    microphones: list[str]
-    turns: Turns
+    voice: Int64
     voices: VoiceEvidence
-    losses: list[str]
-    without: int
 
     @property
     def seconds(self) -> float:
         """Total duration of speech."""
-        return float((self.turns.ends - self.turns.starts).sum()) / NANOSECONDS
+        return float((self.ends - self.starts).sum()) / NANOSECONDS
+
+    def longest(self, rows: Int64) -> Int64:
+        """Sort turns by length, longest first."""
+        return rows[np.argsort(-(self.ends - self.starts)[rows], kind="stable")]
 
 
 def read_speech(
@@ -251,12 +263,7 @@ def read_speech(
     """
     reader = _Reader(start, end)
     entries = home.between(start or 0, end or _NEVER)
-    for number, entry in enumerate(entries, 1):
-        try:
-            reader.read(entry)
-        except LogError as error:
-            reader.losses.append(str(error))
-        progress(number / len(entries))
+    read_each(entries, reader.read, reader.losses, progress)
     return reader.speech(home.losses)
 
 
@@ -264,13 +271,10 @@ class _Reader:
     def __init__(self, start: int | None, end: int | None) -> None:
         self.losses: list[str] = []
         self._span = start, end
-        self._logs: list[Path] = []
-        self._microphones: list[str] = []
-        self._turns = [Turns(*(np.empty(0, np.int64) for _ in Turns._fields))]
-        self._recent: list[tuple[Turns, SpeechFrames]] = []  # logs that overlap in time
+        self._parts: list[tuple[Path, str, _Turns]] = []
+        self._recent: list[tuple[Path, str, _Turns, SpeechFrames]] = []  # overlap in time
         self._recent_end = 0
-        dimensions = len(voice_space().spread)
-        self._voices = [VoiceEvidence(np.empty(0), np.empty((0, dimensions)))]
+        self._voices = [no_evidence()]
         self._count = self._without = 0
 
     def read(self, entry: HomeLog) -> None:
@@ -309,70 +313,52 @@ class _Reader:
         """
         start, end = self._span
         starts = segments["header.stamp"]
-        inside = np.ones(len(starts), np.bool_)
-        if start is not None:
-            inside &= starts + segments["duration"] > start
-        if end is not None:
-            inside &= starts < end
+        inside = starts + segments["duration"] > (-_NEVER if start is None else start)
+        inside &= starts < (_NEVER if end is None else end)
         return segments.take(np.flatnonzero(inside))
 
     def _add(
         self, log: Path, microphone: str, features: Columns, names: Sequence[str], speech: Spans
     ) -> None:
-        if log not in self._logs:
-            self._logs.append(log)
-        if microphone not in self._microphones:
-            self._microphones.append(microphone)
-        place = len(self._logs) - 1, self._microphones.index(microphone)
         stamps, values = features["header.stamp"], features["values"]
         order = np.argsort(stamps, kind="stable")  # a clock may have been set back
         order = order[rows_at(speech, stamps[order]) >= 0]
         order = order[_can_be(values[order], names)]
-        stamps, values = stamps[order], values[order]
-        conversations = [*_conversations(stamps)]
-        if not conversations:
-            return
-        turns_of_each = [
-            self._tell_apart(stamps[rows], values[rows], names) for rows in conversations
-        ]
-        starts, ends, voice = (np.concatenate(each) for each in zip(*turns_of_each, strict=True))
-        in_log, of_microphone = (np.full(len(starts), each) for each in place)
-        kept = np.concatenate([np.arange(rows.start, rows.stop) for rows in conversations])
+        conversations = [order[rows] for rows in _conversations(stamps[order])]
+        found = [_NO_TURNS]
+        for rows in conversations:
+            starts, ends, voice, evidence = speech_voices(stamps[rows], values[rows], names)
+            found.append(_Turns(starts, ends, voice + self._count))
+            self._voices.append(evidence)
+            self._count += len(evidence.counts)
+        turns = _Turns(*map(np.concatenate, zip(*found, strict=True)))
+        kept = np.concatenate([order[:0], *conversations])
         energy = values[kept, list(names).index(ENERGY)]
-        turns = Turns(starts, ends, in_log, of_microphone, voice)
-        self._recent.append((turns, speech_frames(stamps[kept], energy, starts)))
-        self._recent_end = max(self._recent_end, int(starts[-1]))
-
-    def _tell_apart(
-        self, stamps: Int64, values: Float32, names: Sequence[str]
-    ) -> tuple[Int64, Int64, Int64]:
-        of, points = voices_of(values, names)
-        count = int(of.max()) + 1
-        starts, ends, voice = _turns(stamps, _of_frames(of, len(stamps)))
-        self._voices.append(summed(points, of, count))
-        self._count += count
-        return starts, ends, voice + self._count - count
+        frames = speech_frames(stamps[kept], energy, turns.starts)
+        self._recent.append((log, microphone, turns, frames))
+        self._recent_end = int(turns.starts.max(initial=self._recent_end))
 
     def _settle(self) -> None:
         """Drop turns that another microphone records louder, as far as logs were read."""
-        if self._recent:
-            turns, speech = zip(*self._recent, strict=True)
-            for own, louder in zip(turns, louder_elsewhere(speech), strict=True):
-                self._turns.append(Turns(*(each[~louder] for each in own)))
+        is_louder = louder_elsewhere([frames for *_, frames in self._recent])
+        for (log, microphone, turns, _), louder in zip(self._recent, is_louder, strict=True):
+            kept = _Turns(*(each[~louder] for each in turns))
+            self._parts.append((log, microphone, kept))
         self._recent = []
 
     def speech(self, losses: Sequence[str]) -> HomeSpeech:
         self._settle()
-        turns = Turns(*(np.concatenate(each) for each in zip(*self._turns, strict=True)))
-        voices = VoiceEvidence(*(np.concatenate(each) for each in zip(*self._voices, strict=True)))
-        rows, voice = np.unique(turns.voice, return_inverse=True)
+        turns = [_NO_TURNS, *(turns for *_, turns in self._parts)]
+        starts, ends, voice = map(np.concatenate, zip(*turns, strict=True))
+        rows, voice = np.unique(voice, return_inverse=True)
         return HomeSpeech(
-            self._logs,
-            self._microphones,
-            turns._replace(voice=voice),
-            voices.rows(rows),
+            *places(self._parts),
+            starts,
+            ends,
             [*losses, *self.losses],
             self._without,
+            voice,
+            VoiceEvidence(*map(np.concatenate, zip(*self._voices, strict=True))).rows(rows),
         )
 
 
@@ -387,7 +373,7 @@ def _is_segments(name: str) -> bool:
     return parts is not None and (parts.labelling, parts.kind) == (LIVE, "segment")
 
 
-def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, Float64]:
+def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, VoiceEvidence]:
     """Separate the voices in the features of a conversation.
 
     Parameters
@@ -397,20 +383,20 @@ def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, Float64]:
 
     Returns
     -------
-    of : np.ndarray [shape=(n,)], int64
+    np.ndarray [shape=(n,)], int64
         Voice of each window, from 0.
-    points : np.ndarray [shape=(n, d)], float64
-        Points of the windows in the voice space.
+    VoiceEvidence
+        Of each voice.
     """
-    space = voice_space()
-    points = space.points(describe_speech(values, names))
-    return tell_apart(points, space.spread, LEAST_WINDOWS), points
+    points = voice_space().points(describe_speech(values, names))
+    of = tell_apart(points, LEAST_WINDOWS)
+    return of, summed(points, of, int(of.max()) + 1)
 
 
 def speech_voices(
     stamps: Int64, values: Float32, names: Sequence[str]
-) -> tuple[Int64, Int64, Int64]:
-    """Return the turns of a conversation: starts, ends and voices.
+) -> tuple[Int64, Int64, Int64, VoiceEvidence]:
+    """Return the turns of a conversation: starts, ends and voices; and the voices.
 
     Parameters
     ----------
@@ -418,8 +404,8 @@ def speech_voices(
         Of frames of speech, in nanoseconds, ascending.
     values : np.ndarray [shape=(frames, f)], float32
     """
-    of, _ = voices_of(values, names)
-    return _turns(stamps, _of_frames(of, len(stamps)))
+    of, voices = voices_of(values, names)
+    return *_turns(stamps, _of_frames(of, len(stamps))), voices
 
 
 def _can_be(values: Float32, names: Sequence[str]) -> Bool:
@@ -451,3 +437,149 @@ def _turns(stamps: Int64, voice: Int64) -> tuple[Int64, Int64, Int64]:
     first = np.concatenate([[0], np.flatnonzero(is_new) + 1])
     last = np.append(first[1:], len(stamps)) - 1
     return stamps[first], stamps[last] + FRAME_NANOSECONDS, voice[first]
+
+
+def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoices, Int64]:
+    """Find the voices of a home in its conversations.
+
+    Parameters
+    ----------
+    known : HomeVoices or None
+        Voices of an earlier run, which stay unchanged; None for the first run.
+
+    Returns
+    -------
+    of : np.ndarray [shape=(n,)], int64
+        Home voice row of each conversation voice; `NO_CLUSTER` if none matches.
+
+    Raises
+    ------
+    DataError
+        If there are no earlier voices and too little speech to separate voices.
+    """
+    if known is None and speech.seconds < LEAST_SECONDS:
+        raise DataError(
+            f"{speech.seconds:.0f} s of speech are too few to tell voices apart: it takes "
+            f"{LEAST_SECONDS:.0f} s"
+        )
+    voices = known or HomeVoices(np.empty(0, np.int64), no_evidence())
+    while True:
+        of = recognised(speech.voices, voices.evidence)
+        added = with_new_voices(voices, speech.voices.rows(of == NO_CLUSTER))
+        if len(added.numbers) == len(voices.numbers):
+            break
+        voices = added
+    return (voices if voices.id else voices.identified(voices.evidence)), of
+
+
+def spoken_spans(speech: HomeSpeech, voices: HomeVoices, of: Int64) -> dict[str, NamedSpans]:
+    """Return the voice turns of each microphone; turns that match no voice are `no voice`.
+
+    Parameters
+    ----------
+    of : np.ndarray [shape=(n,)], int64
+        Result of `find_voices`.
+    """
+    texts = [*voices.texts(VOICES), "no voice"]
+    own = of[speech.voice]
+    return speech.spans(np.where(own == NO_CLUSTER, len(voices.numbers), own), texts)
+
+
+_QUIET = 10 ** (-30 / 10)  # of the loud frames
+_SURELY = 2.0  # log likelihood ratio of two voices over one
+
+
+def check_voices(recordings: Iterable[Recording], features: FeatureSet) -> None:
+    """Check that each enrolled recording set holds one voice.
+
+    Raise `DataError` if one person's recordings contain two voices.
+    """
+    if not has_voices(features.feature_names):
+        return
+    by_name: dict[str, list[Recording]] = {}
+    for one in recordings:
+        if is_voice(one.label):
+            by_name.setdefault(one.label, []).append(one)
+    for name, own in by_name.items():
+        if is_of_two(np.concatenate([_loud(one.features, features) for one in own]), features):
+            times = ", ".join(sorted(time_text(one.span[0])[:19] for one in own if one.span))
+            raise DataError(
+                f"{name}: two voices are heard in what is enrolled ({times}); delete what is of "
+                "another person, or enrol the other voice under a name of its own"
+            )
+
+
+def is_of_two(values: Float32, features: FeatureSet) -> bool:
+    """Return whether speech contains two voices; False for less than a window."""
+    if len(values) < WINDOW_FRAMES:
+        return False
+    _, voices = voices_of(values[:_MOST_FRAMES], features.feature_names)
+    for row in range(1, len(voices.counts)):
+        rest = voices.rows(np.arange(row))
+        ratio = same_voice(voices.rows(np.array([row])), rest)
+        if ratio.min() < -_SURELY:
+            return True
+    return False
+
+
+def _loud(values: Float32, features: FeatureSet) -> Float32:
+    power = features.power(values)
+    return values[power > np.percentile(power, 90) * _QUIET]
+
+
+_LEAST_TURN = 2 * NANOSECONDS  # to enrol
+_ENOUGH = 60 * NANOSECONDS
+
+
+def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list[Enrolled]:
+    """Enrol one minute of a voice's longest turns in a training set of voices.
+
+    The turns are spread over as many separate times as possible. Existing recordings count.
+
+    Parameters
+    ----------
+    rows : np.ndarray [shape=(n,)], int64
+        Turns of the voice.
+
+    Raises
+    ------
+    DataError
+        If no turn of the voice lasts two seconds.
+    LogError
+        If a log is damaged, or nothing can be written.
+    """
+    lengths = (speech.ends - speech.starts)[rows]
+    enrolled: dict[Path, Enrolled] = {}
+    left = _ENOUGH
+    for row in _of_all_times(speech, rows[lengths >= _LEAST_TURN]).tolist():
+        start = int(speech.starts[row])
+        path = cut_path(home, label, start)
+        if path in enrolled:  # already enrolled from another microphone
+            continue
+        if left < _LEAST_TURN:
+            break
+        end = min(int(speech.ends[row]), start + left)
+        if path.exists():
+            enrolled[path] = Enrolled(path, (end - start) / NANOSECONDS)
+        else:
+            log = speech.logs[speech.log[row]]
+            microphone = speech.microphones[speech.microphone[row]]
+            enrolled[path] = enrol_log(home, label, log, start, end, microphone)
+        left -= end - start
+    if not enrolled:
+        raise DataError(f"{label} never speaks for two seconds without a pause; enrol a file")
+    return list(enrolled.values())
+
+
+def _of_all_times(speech: HomeSpeech, rows: Int64) -> Int64:
+    """Order turns: the longest of each time, the second longest of each, and so on."""
+    rows = speech.longest(rows)
+    starts = speech.starts[rows]
+    order = np.argsort(starts, kind="stable")
+    time = np.empty(len(rows), np.int64)
+    time[order] = np.cumsum(np.diff(starts[order], prepend=starts[order][:1]) >= APART)
+    by_time = np.argsort(time, kind="stable")
+    first = np.searchsorted(time[by_time], time[by_time])
+    place = np.empty(len(rows), np.int64)
+    place[by_time] = np.arange(len(rows)) - first
+    return rows[np.argsort(place, kind="stable")]

@@ -1,19 +1,28 @@
-"""Summaries of the groups of a home, and their file for pages."""
+"""Summaries of the groups and voices of a home, and the file of groups for pages."""
 
 import json
 from collections.abc import Mapping
-from datetime import date, tzinfo
+from datetime import tzinfo
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
+from hearthlog.analyzer.discover.clusters import (
+    HOURS,
+    MOST_CLUSTERS,
+    MOST_NUMBER,
+    ClusterId,
+    ClusterName,
+    Occurrences,
+    StrictModel,
+)
 from hearthlog.analyzer.discover.groups import Groups
 from hearthlog.analyzer.discover.sounds import HomeSounds
+from hearthlog.analyzer.discover.speech import HomeSpeech
+from hearthlog.analyzer.discover.voices import HomeVoices
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import printable, shortened
 from hearthlog.schemas.files import read_limited
@@ -22,12 +31,10 @@ from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.new_files import replaced_file
 
 SUMMARY: Final = "groups.safetensors.json"  # in a folder of logs, next to the groups file
-MOST_GROUPS = 1_000  # per file
 MOST_LABELS, MOST_MICROPHONES = 8, 64  # per group
 LONGEST_TEXT = 200  # characters
 _FORMAT: Final = 1
 _LARGEST = 4 << 20  # bytes
-_MOST_COUNT = (1 << 31) - 1
 _LATEST = (1 << 32) * NANOSECONDS  # beyond the range of message times
 
 
@@ -37,18 +44,14 @@ def _is_time(text: str) -> str:
     return text
 
 
-_Count = Annotated[int, Field(ge=0, le=_MOST_COUNT)]
+_Count = Annotated[int, Field(ge=0, le=MOST_NUMBER)]
 _Text = Annotated[str, Field(max_length=LONGEST_TEXT)]
 _Time = Annotated[str, Field(max_length=40), AfterValidator(_is_time)]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class Example(_Part):
-    """Example sound of a group; times in ISO 8601, UTC."""
+class Example(StrictModel):
+    """Example of a group or voice; times in ISO 8601, UTC."""
 
     log: Annotated[str, Field(max_length=4096)]
     microphone: _Text
@@ -56,7 +59,7 @@ class Example(_Part):
     end: _Time
 
 
-class GroupSummary(_Part):
+class GroupSummary(StrictModel):
     """Summary of a group of similar sounds.
 
     Attributes
@@ -73,11 +76,11 @@ class GroupSummary(_Part):
         Share of each of the most frequent labels, most frequent first.
     """
 
-    number: Annotated[int, Field(ge=1, le=_MOST_COUNT)]
-    name: Annotated[str, Field(pattern=rf"^({CLASS_NAME.pattern})?$")]
-    times: Annotated[int, Field(ge=1, le=_MOST_COUNT)]
-    days: Annotated[int, Field(ge=1, le=_MOST_COUNT)]
-    hours: Annotated[list[_Count], Field(min_length=24, max_length=24)]
+    number: Annotated[int, Field(ge=1, le=MOST_NUMBER)]
+    name: ClusterName
+    times: Annotated[int, Field(ge=1, le=MOST_NUMBER)]
+    days: Annotated[int, Field(ge=1, le=MOST_NUMBER)]
+    hours: Annotated[list[_Count], Field(min_length=HOURS, max_length=HOURS)]
     seconds: Annotated[float, Field(ge=0.0, le=1e6)]
     alike: _Share
     labels: Annotated[dict[_Text, _Share], Field(max_length=MOST_LABELS)]
@@ -85,15 +88,37 @@ class GroupSummary(_Part):
     examples: Annotated[list[Example], Field(min_length=1, max_length=3)]
 
 
-class GroupsSummary(_Part):
+class VoiceSummary(StrictModel):
+    """Summary of a voice.
+
+    Attributes
+    ----------
+    name : str
+        Assigned by a person; empty if unnamed.
+    days : int
+        Number of local days with this voice.
+    hours : list of int
+        Number of turns that began in each local hour of the day.
+    """
+
+    number: int
+    name: str
+    minutes: float
+    turns: int
+    days: int
+    hours: list[int]
+    examples: list[Example]
+
+
+class GroupsSummary(StrictModel):
     """Groups of a home from the last run, largest first."""
 
     format: Annotated[int, Field(ge=1, le=_FORMAT)] = _FORMAT
-    id: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
+    id: ClusterId
     sounds: _Count
     timezone: _Text
     groups_file: Annotated[str, Field(max_length=4096)]
-    groups: Annotated[list[GroupSummary], Field(max_length=MOST_GROUPS)]
+    groups: Annotated[list[GroupSummary], Field(max_length=MOST_CLUSTERS)]
 
     def named(self, names: Mapping[int, str]) -> "GroupsSummary":
         """Return a copy with other group names, by number."""
@@ -134,7 +159,6 @@ def load_summary(path: Path) -> GroupsSummary:
         ) from error
 
 
-_HOURS = 24
 _SHOWN = 3
 
 
@@ -146,55 +170,75 @@ def summarise(
     found = []
     for row, number in enumerate(groups.numbers.tolist()):
         rows = np.flatnonzero(of == row)
-        if len(rows):
-            found.append(_summary(sounds, groups.names[row], number, rows, points, apart, zone))
+        if not len(rows):
+            continue
+        days, hours = sounds.days_and_hours(rows, zone)
+        labels, counts = np.unique(sounds.labels[rows], return_counts=True)
+        order = np.argsort(-counts, kind="stable")[:MOST_LABELS]
+        away = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
+        seconds = np.median(sounds.ends[rows] - sounds.starts[rows]) / NANOSECONDS
+        names = sorted({sounds.microphones[i] for i in sounds.microphone[rows]})
+        summary = GroupSummary(
+            number=number,
+            name=groups.names[row],
+            times=len(rows),
+            days=days,
+            hours=hours,
+            seconds=float(seconds),
+            alike=max(1.0 - float(np.median(away)) / apart, 0.0) if apart else 1.0,
+            labels={
+                shortened(str(labels[i]), LONGEST_TEXT): float(counts[i]) / len(rows) for i in order
+            },
+            microphones=[shortened(each, LONGEST_TEXT) for each in names[:MOST_MICROPHONES]],
+            examples=_examples(sounds, rows[np.argsort(away, kind="stable")]),
+        )
+        found.append(summary)
     return sorted(found, key=lambda each: (-each.times, each.number))
 
 
-def _summary(  # noqa: PLR0913, PLR0917
-    sounds: HomeSounds,
-    name: str,
-    number: int,
-    rows: Int64,
-    points: Float64,
-    apart: float,
-    zone: tzinfo,
-) -> GroupSummary:
-    spans = sounds.spans
-    moments = [local_time(start, zone) for start in spans.starts[rows].tolist()]
-    days: set[date] = {moment.date() for moment in moments}
-    hours = np.bincount([moment.hour for moment in moments], minlength=_HOURS)
-    labels, counts = np.unique(spans.labels[rows], return_counts=True)
-    order = np.argsort(-counts, kind="stable")
-    away = np.linalg.norm(points[rows] - np.median(points[rows], axis=0), axis=1)
-    seconds = np.median(spans.ends[rows] - spans.starts[rows]) / NANOSECONDS
-    middle = rows[np.argsort(away, kind="stable")[:_SHOWN]]
-    names = {sounds.microphones[i] for i in sounds.microphone[rows]}
-    return GroupSummary(
-        number=number,
-        name=name,
-        times=len(rows),
-        days=len(days),
-        hours=hours.tolist(),
-        seconds=float(seconds),
-        alike=max(1.0 - float(np.median(away)) / apart, 0.0) if apart else 1.0,
-        labels={
-            shortened(str(labels[i]), LONGEST_TEXT): float(counts[i]) / len(rows)
-            for i in order[:MOST_LABELS]
-        },
-        microphones=[shortened(each, LONGEST_TEXT) for each in sorted(names)[:MOST_MICROPHONES]],
-        examples=[_example(sounds, row) for row in middle.tolist()],
-    )
+def summarise_voices(
+    speech: HomeSpeech, voices: HomeVoices, of: Int64, zone: tzinfo
+) -> list[VoiceSummary]:
+    """Summarise the voices that speak, most speech first.
+
+    Parameters
+    ----------
+    of : np.ndarray [shape=(n,)], int64
+        Result of `find_voices`.
+    """
+    found = []
+    for row, number in enumerate(voices.numbers.tolist()):
+        rows = np.flatnonzero(of[speech.voice] == row)
+        if not len(rows):
+            continue
+        days, hours = speech.days_and_hours(rows, zone)
+        seconds = (speech.ends - speech.starts)[rows] / NANOSECONDS
+        summary = VoiceSummary(
+            number=number,
+            name=voices.names[row],
+            minutes=float(seconds.sum()) / 60.0,
+            turns=len(rows),
+            days=days,
+            hours=hours,
+            examples=_examples(speech, speech.longest(rows)),
+        )
+        found.append(summary)
+    return sorted(found, key=lambda each: (-each.minutes, each.number))
 
 
-def _example(sounds: HomeSounds, row: int) -> Example:
-    spans = sounds.spans
-    return Example(
-        log=printable(sounds.logs[sounds.log[row]]),
-        microphone=shortened(sounds.microphones[sounds.microphone[row]], LONGEST_TEXT),
-        start=time_text(int(spans.starts[row])),
-        end=time_text(int(spans.ends[row])),
-    )
+def _examples(occurrences: Occurrences, rows: Int64) -> list[Example]:
+    """Return the first of some occurrences."""
+    return [
+        Example(
+            log=printable(occurrences.logs[occurrences.log[row]]),
+            microphone=shortened(
+                occurrences.microphones[occurrences.microphone[row]], LONGEST_TEXT
+            ),
+            start=time_text(int(occurrences.starts[row])),
+            end=time_text(int(occurrences.ends[row])),
+        )
+        for row in rows[:_SHOWN]
+    ]
 
 
 def _typical_distance(points: Float64) -> float:
@@ -220,9 +264,9 @@ def busiest_hours(hours: list[int]) -> str:
         Empty if the span exceeds half a day.
     """
     twice = np.cumsum([0, *hours, *hours])
-    for length in range(1, _HOURS // 2 + 1):
-        sums = twice[length : length + _HOURS] - twice[:_HOURS]
+    for length in range(1, HOURS // 2 + 1):
+        sums = twice[length : length + HOURS] - twice[:HOURS]
         if sums.max() >= _USUAL * sum(hours):
             first = int(sums.argmax())
-            return f"{first:02d} to {(first + length) % _HOURS:02d}"
+            return f"{first:02d} to {(first + length) % HOURS:02d}"
     return ""

@@ -1,13 +1,28 @@
-"""Voices: seconds of speech as points of a learned space, and their similarity."""
+"""Voices: seconds of speech as points of a learned space, their similarity, and the voices file."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import NamedTuple
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 from safetensors.numpy import load
 
+from hearthlog.analyzer.discover.clusters import (
+    MOST_CLUSTERS,
+    NO_CLUSTER,
+    ClusterId,
+    ClusterKind,
+    ClusterNames,
+    Clusters,
+    StrictModel,
+    are_numbers,
+)
+from hearthlog.analyzer.errors import DataError
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 
 _INDEPENDENT = 0.2  # share of a window: windows overlap, and speech is correlated
@@ -48,22 +63,18 @@ def summed(points: Float64, of: Int64, count: int) -> VoiceEvidence:
     return VoiceEvidence(own.sum(axis=1), own @ points)
 
 
-def same_voice(one: VoiceEvidence, others: VoiceEvidence, spread: Float64) -> Float64:
+def same_voice(one: VoiceEvidence, others: VoiceEvidence) -> Float64:
     """Return the log likelihood ratio of one voice over two.
 
     Evidence is a mean of points; points of one voice have variance 1 around the voice's mean, and
-    voice means have variance `spread` (the two-covariance model of Brümmer and de Villiers,
-    Odyssey 2010).
-
-    Parameters
-    ----------
-    spread : np.ndarray [shape=(d,)], float64
+    voice means have the variance `spread` of the voice space (the two-covariance model of Brümmer
+    and de Villiers, Odyssey 2010).
 
     Returns
     -------
     np.ndarray [shape=(n,)], float64
     """
-    return _ratio(_weighed(one, spread), _weighed(others, spread), spread)
+    return _ratio(_weighed(one), _weighed(others))
 
 
 class _Weighed(NamedTuple):
@@ -77,34 +88,30 @@ class _Weighed(NamedTuple):
         return _Weighed(self.counts[rows], self.sums[:, rows], self.likelihood[rows])
 
 
-def _weighed(evidence: VoiceEvidence, spread: Float64) -> _Weighed:
+def _weighed(evidence: VoiceEvidence) -> _Weighed:
     """Return evidence with equal means and the effective number of independent points."""
     counts = _INDEPENDENT * evidence.counts
     counts = counts / (1.0 + counts / _MOST_CERTAIN)
     sums = np.ascontiguousarray(evidence.sums.T) * (counts / evidence.counts)
-    return _Weighed(counts, sums, _likelihood(counts, sums, spread))
+    return _Weighed(counts, sums, _likelihood(counts, sums))
 
 
-def _ratio(one: _Weighed, others: _Weighed, spread: Float64) -> Float64:
-    both = _likelihood(one.counts + others.counts, one.sums + others.sums, spread)
+def _ratio(one: _Weighed, others: _Weighed) -> Float64:
+    both = _likelihood(one.counts + others.counts, one.sums + others.sums)
     return both - one.likelihood - others.likelihood
 
 
-def _likelihood(counts: Float64, sums: Float64, spread: Float64) -> Float64:
+def _likelihood(counts: Float64, sums: Float64) -> Float64:
     """Return the log likelihood of one voice, relative to the mean of all voices."""
-    variance = spread[:, np.newaxis]
+    variance = voice_space().spread[:, np.newaxis]
     scale = 1.0 + counts * variance
     terms = (sums**2 * (variance / scale)).sum(axis=0)
     likelihood: Float64 = 0.5 * (terms - np.log(scale.prod(axis=0)))
     return likelihood
 
 
-def merged_voices(evidence: VoiceEvidence, spread: Float64) -> Int64:
+def merged_voices(evidence: VoiceEvidence) -> Int64:
     """Merge evidence that is likelier of one voice than of two, likeliest first.
-
-    Parameters
-    ----------
-    spread : np.ndarray [shape=(d,)], float64
 
     Returns
     -------
@@ -114,12 +121,12 @@ def merged_voices(evidence: VoiceEvidence, spread: Float64) -> Int64:
     counts, sums = evidence.counts.copy(), evidence.sums.copy()
     size = len(counts)
     of = np.arange(size)
-    weighed = _weighed(evidence, spread)
+    weighed = _weighed(evidence)
     ratios = np.full((size, size), -np.inf)
     for row in range(size - 1):
         later = slice(row + 1, size)
         one = weighed.rows(slice(row, row + 1))
-        ratios[row, later] = ratios[later, row] = _ratio(one, weighed.rows(later), spread)
+        ratios[row, later] = ratios[later, row] = _ratio(one, weighed.rows(later))
     best = ratios.max(axis=1, initial=-np.inf)
     while size and best.max() > 0.0:
         row = int(best.argmax())
@@ -130,10 +137,10 @@ def merged_voices(evidence: VoiceEvidence, spread: Float64) -> Int64:
         stale = np.isfinite(best) & ((ratios[row] == best) | (ratios[other] == best))
         ratios[other] = ratios[:, other] = -np.inf
         there = np.flatnonzero(np.isfinite(ratios[row]))
-        now = _weighed(VoiceEvidence(counts[[row]], sums[[row]]), spread)
+        now = _weighed(VoiceEvidence(counts[[row]], sums[[row]]))
         for kept, value in zip(weighed, now, strict=True):
             kept[..., row] = value[..., 0]
-        ratios[row, there] = ratios[there, row] = _ratio(now, weighed.rows(there), spread)
+        ratios[row, there] = ratios[there, row] = _ratio(now, weighed.rows(there))
         stale[[row, other]] = True
         np.maximum(best, ratios[row], out=best)
         best[stale] = ratios[stale].max(axis=1)
@@ -141,33 +148,33 @@ def merged_voices(evidence: VoiceEvidence, spread: Float64) -> Int64:
     return of.astype(np.int64)
 
 
-def tell_apart(points: Float64, spread: Float64, least: int) -> Int64:
+def tell_apart(points: Float64, least: int) -> Int64:
     """Separate the voices of a conversation.
 
     Parameters
     ----------
     points : np.ndarray [shape=(n, d)], float64
         Points of its windows, in time order.
-    spread : np.ndarray [shape=(d,)], float64
 
     Returns
     -------
     np.ndarray [shape=(n,)], int64
         Voice of each window, from 0.
     """
-    of = merged_voices(VoiceEvidence(np.ones(len(points)), points), spread)
+    of = merged_voices(VoiceEvidence(np.ones(len(points)), points))
     for _ in range(_ROUNDS):
         counts = np.bincount(of)
         kept = np.flatnonzero(counts >= min(least, counts.max()))
         voices = summed(points, of, len(counts)).rows(kept)
-        of = _smoothed(_likeness(points, voices, spread)).argmax(axis=1)
+        of = _smoothed(_likeness(points, voices)).argmax(axis=1)
         _, of = np.unique(of, return_inverse=True)
     return of.astype(np.int64)
 
 
-def _likeness(points: Float64, voices: VoiceEvidence, spread: Float64) -> Float64:
+def _likeness(points: Float64, voices: VoiceEvidence) -> Float64:
     """Return the expected log likelihoods of points, up to a term common to all voices."""
     counts, sums = _INDEPENDENT * voices.counts, _INDEPENDENT * voices.sums
+    spread = voice_space().spread
     variance = spread / (1.0 + counts[:, np.newaxis] * spread)
     mean = variance * sums
     likeness: Float64 = points @ mean.T - 0.5 * (mean**2 + variance).sum(axis=1)
@@ -263,3 +270,110 @@ def describe_speech(values: Float32, names: Sequence[str]) -> Float64:
     variance = (weights * (x - mean[:, :, np.newaxis]) ** 2).sum(axis=2)
     deviation = np.log(np.sqrt(variance + _TINY) + _LEAST_DEVIATION)
     return np.concatenate([mean, deviation], axis=1)
+
+
+def no_evidence() -> VoiceEvidence:
+    """Return the evidence of no voice."""
+    return VoiceEvidence(np.empty(0), np.empty((0, len(voice_space().spread))))
+
+
+_LEAST_WINDOWS = 20  # per voice of a home: ten seconds
+_MOST = 2_000  # conversation voices among which home voices are searched
+
+
+@dataclass(frozen=True)
+class HomeVoices(Clusters):
+    """Voices of a home."""
+
+    evidence: VoiceEvidence
+
+
+def recognised(evidence: VoiceEvidence, known: VoiceEvidence) -> Int64:
+    """Return the likeliest existing voice of each row, if one voice is likelier than two.
+
+    Returns
+    -------
+    np.ndarray [shape=(n,)], int64
+        `NO_CLUSTER` if none matches.
+    """
+    best = np.zeros(len(evidence.counts))
+    of = np.full(len(best), NO_CLUSTER)
+    for row in range(len(known.counts)):
+        ratio = same_voice(known.rows(np.array([row])), evidence)
+        better = ratio > best
+        best[better], of[better] = ratio[better], row
+    return of
+
+
+def with_new_voices(voices: HomeVoices, rest: VoiceEvidence) -> HomeVoices:
+    """Add voices from unmatched evidence, if a voice speaks long enough."""
+    largest = np.sort(np.argsort(-rest.counts, kind="stable")[:_MOST])
+    rest = rest.rows(largest)
+    if not len(rest.counts):
+        return voices
+    of = merged_voices(rest)
+    own = (of == np.arange(of.max() + 1)[:, np.newaxis]).astype(np.float64)
+    found = VoiceEvidence(own @ rest.counts, own @ rest.sums)
+    order = np.argsort(-found.counts, kind="stable")
+    order = order[found.counts[order] >= _LEAST_WINDOWS][: MOST_CLUSTERS - len(voices.numbers)]
+    both = zip(voices.evidence, found.rows(order), strict=True)
+    return voices.with_new(len(order), evidence=VoiceEvidence(*map(np.concatenate, both)))
+
+
+_FORMAT: Final = 1
+_LARGE = 1e9  # of counts and sums
+
+
+class _Header(StrictModel):
+    format: Annotated[int, Field(ge=1, le=_FORMAT)]
+    id: ClusterId
+    names: ClusterNames
+
+
+VOICES: Final = ClusterKind("voice", "voices", "2=anna", _Header, 4 << 20)
+
+
+def save_voices(voices: HomeVoices, path: Path) -> None:
+    """Write the voices file, replacing an existing one.
+
+    Raise `DataError` if the voice features are too large for the file to be read again. Raise
+    `LogError` if the file cannot be written.
+    """
+    header = _Header(format=_FORMAT, id=voices.id, names=voices.names)
+    arrays = {"numbers": voices.numbers, **voices.evidence._asdict()}
+    if not _fits(header, arrays):
+        raise DataError(
+            f"{path}: not written, for some speech has features that no sound has; leave out logs "
+            "that hearthlog did not record"
+        )
+    VOICES.write(path, arrays, header)
+
+
+def load_voices(path: Path) -> HomeVoices | None:
+    """Read the voices file; None if it does not exist.
+
+    Raise `DataError` if it is not a voices file, or damaged.
+    """
+    found = VOICES.read(path)
+    if found is None:
+        return None
+    arrays, header = found
+    if not _fits(header, arrays):
+        raise DataError(f"{path}: is damaged; move it away to begin anew")
+    evidence = VoiceEvidence(arrays["counts"], arrays["sums"])
+    return HomeVoices(arrays["numbers"], evidence, names=header.names, id=header.id)
+
+
+def _fits(header: _Header, arrays: Mapping[str, NDArray[Any]]) -> bool:
+    count, dimensions = len(header.names), len(voice_space().spread)
+    expected = {
+        "numbers": ("int64", count),
+        "counts": ("float64", count),
+        "sums": ("float64", count, dimensions),
+    }
+    return (
+        {name: (array.dtype.name, *array.shape) for name, array in arrays.items()} == expected
+        and are_numbers(arrays["numbers"], header.names)
+        and bool(((arrays["counts"] >= 1.0) & (arrays["counts"] <= _LARGE)).all())
+        and bool((np.abs(arrays["sums"]) <= _LARGE).all())
+    )

@@ -1,8 +1,7 @@
 """`hearthlog discover` and `hearthlog voices`: recurring sound groups and voices of a home."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,13 +31,15 @@ from hearthlog.tools.cli.terminal import (
 if TYPE_CHECKING:
     from datetime import tzinfo
 
+    from hearthlog.analyzer.discover.clusters import ClusterKind, Clusters, NamedSpans
     from hearthlog.analyzer.discover.groups import Groups
-    from hearthlog.analyzer.discover.home_voices import HomeVoices, VoiceSummary
-    from hearthlog.analyzer.discover.naming import Looked
+    from hearthlog.analyzer.discover.sounds import Looked
     from hearthlog.analyzer.discover.speech import HomeSpeech
-    from hearthlog.analyzer.discover.summary import GroupsSummary, GroupSummary
+    from hearthlog.analyzer.discover.summary import GroupsSummary, GroupSummary, VoiceSummary
+    from hearthlog.analyzer.discover.voices import HomeVoices
+    from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.logs.home_logs import HomeLogs
-    from hearthlog.analyzer.review.timeline import Timeline
+    from hearthlog.analyzer.review.timeline import LabelledSpans, MicrophoneTimeline, Timeline
     from hearthlog.schemas.arrays import Int64
 
 
@@ -78,23 +79,24 @@ def discover(
     Groups keep their numbers in later runs. Where a person has marked a sound already, it stays so.
     Exit status 3: a log is damaged, unfinished or of other features; the others were used.
     """
-    from hearthlog.analyzer.discover.groups import locked_groups
-    from hearthlog.analyzer.discover.naming import Looked
-    from hearthlog.analyzer.discover.sounds import CHOICES
+    from hearthlog.analyzer.discover.clusters import locked_file
+    from hearthlog.analyzer.discover.groups import GROUPS
+    from hearthlog.analyzer.discover.sounds import CHOICES, Looked
     from hearthlog.analyzer.extras import require
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
+    from hearthlog.models.classes import SILENCE
 
     if of not in CHOICES:
         wrong_use(f"--of {of}: it is one of {', '.join(CHOICES)}")
     if not (name or undo):
         require("sklearn", "scipy")
     looked = Looked(of, *parse_span(start, end))
-    names, who = _names(name or []), reviewer_name(reviewer)
+    names, who = _names(GROUPS, name or [], "a class", {SILENCE}), reviewer_name(reviewer)
     home = find_home_logs(logs)
     zone = home_zone(timezone, home.records())
-    file = groups or _default_file(logs)
-    with locked_groups(file):
+    file = groups or _default_file(GROUPS, logs, "the groups")
+    with locked_file(file):
         if names or undo:
             summary, losses = _name(home, file, undo or [], names, looked, who)
         else:
@@ -103,34 +105,51 @@ def discover(
         print_json(summary.model_dump())
     else:
         _print(summary, zone)
-        _tell_next(summary, logs, groups)
+        _suggest_next(GROUPS, summary.groups, logs, groups)
     end_with_warnings(losses)
 
 
-def _default_file(logs: Sequence[Path]) -> Path:
-    from hearthlog.analyzer.discover.groups import GROUPS
-
+def _default_file(kind: "ClusterKind[Any]", logs: Sequence[Path], what: str) -> Path:
     if len(logs) > 1 or not logs[0].is_dir():
-        wrong_use("--groups: say in which file the groups are kept, where LOGS is no single folder")
-    return logs[0] / GROUPS
+        wrong_use(
+            f"--{kind.plural}: say in which file {what} are kept, where LOGS is no single folder"
+        )
+    return logs[0] / kind.file
 
 
-def _names(given: Sequence[str]) -> dict[int, str]:
+def _names(
+    kind: "ClusterKind[Any]", given: Sequence[str], what: str, excluded: Container[str] = ()
+) -> dict[int, str]:
     """Parse the options --name."""
-    from hearthlog.models.classes import CLASS_NAME, SILENCE
+    from hearthlog.models.classes import CLASS_NAME
     from hearthlog.schemas.messages.topics import spelt
 
     names: dict[int, str] = {}
     for text in given:
-        group, _, label = text.partition("=")
+        place, _, label = text.partition("=")
         label = spelt(label)
-        is_number = re.fullmatch(r" *[0-9]{1,9} *", group)
-        if not is_number or not CLASS_NAME.fullmatch(label) or label == SILENCE:
-            wrong_use(f"--name {text[:64]!r}: say the number of a group and a class, as 3=doorbell")
-        if int(group) in names:
-            wrong_use(f"--name {text[:64]!r}: group {int(group)} has another name already")
-        names[int(group)] = label
+        is_number = re.fullmatch(r" *[0-9]{1,9} *", place)
+        if not is_number or not CLASS_NAME.fullmatch(label) or label in excluded:
+            wrong_use(
+                f"--name {text[:64]!r}: say the number of a {kind.noun} and {what}, "
+                f"as {kind.example}"
+            )
+        if int(place) in names:
+            wrong_use(f"--name {text[:64]!r}: {kind.noun} {int(place)} has another name already")
+        names[int(place)] = label
     return names
+
+
+def _check_numbers(
+    kind: "ClusterKind[Any]", clusters: "Clusters | None", numbers: Iterable[int]
+) -> None:
+    from hearthlog.analyzer.errors import DataError
+
+    for each in numbers:
+        if clusters is None or each not in clusters.numbers:
+            raise DataError(
+                f"there is no {kind.noun} {each}; `hearthlog {kind.verb} LOGS` lists them"
+            )
 
 
 def _group(
@@ -178,11 +197,13 @@ def _name(
     reviewer: str,
 ) -> tuple["GroupsSummary", list[str]]:
     """Remove and assign names of existing groups, without new grouping."""
-    from hearthlog.analyzer.discover.groups import load_groups
-    from hearthlog.analyzer.discover.naming import name_groups, reason_of, unmark_group
+    from hearthlog.analyzer.discover.groups import GROUPS, load_groups
+    from hearthlog.analyzer.discover.sounds import name_groups, reason_of, unmark_group
     from hearthlog.analyzer.discover.summary import load_summary, summary_path
 
-    groups = _known(load_groups(file), [*undo, *names])
+    groups = load_groups(file)
+    _check_numbers(GROUPS, groups, [*undo, *names])
+    assert groups is not None
     summary = load_summary(summary_path(file))
     for each in undo:
         count = unmark_group([log.path for log in home.between()], reason_of(groups, each))
@@ -199,17 +220,6 @@ def _name(
     return summary, losses
 
 
-def _known(groups: "Groups | None", numbers: Iterable[int]) -> "Groups":
-    """Return the groups; raise if one of the numbers does not exist."""
-    from hearthlog.analyzer.errors import DataError
-
-    for each in numbers:
-        if groups is None or each not in groups.numbers:
-            raise DataError(f"there is no group {each}; `hearthlog discover LOGS` lists them")
-    assert groups is not None
-    return groups
-
-
 def _renamed(
     groups: "Groups", summary: "GroupsSummary", names: Mapping[int, str], file: Path
 ) -> tuple["Groups", "GroupsSummary"]:
@@ -217,9 +227,7 @@ def _renamed(
     from hearthlog.analyzer.discover.groups import save_groups
     from hearthlog.analyzer.discover.summary import save_summary, summary_path
 
-    numbers = groups.numbers.tolist()
-    kept = [names.get(each, name) for each, name in zip(numbers, groups.names, strict=True)]
-    groups, summary = replace(groups, names=kept), summary.named(names)
+    groups, summary = groups.named(names), summary.named(names)
     save_groups(groups, file)
     save_summary(summary, summary_path(file))
     return groups, summary
@@ -249,21 +257,27 @@ def _print(summary: "GroupsSummary", zone: "tzinfo") -> None:
     print(f"{total}, of which {grouped} recur in {number(len(rows), 'group')}")
 
 
-def _place(group: "GroupSummary", zone: "tzinfo") -> str:
+def _place(summary: "GroupSummary | VoiceSummary", zone: "tzinfo") -> str:
     from hearthlog.analyzer.logs.local_time import local_time
     from hearthlog.schemas.frames import read_time
 
-    example = group.examples[0]
+    example = summary.examples[0]
     start = local_time(read_time(example.start), zone)
     return f"{start:%Y-%m-%d %H:%M:%S} {example.microphone}"
 
 
-def _tell_next(summary: "GroupsSummary", logs: Sequence[Path], file: Path | None) -> None:
-    unnamed = [each.number for each in summary.groups if not each.name]
+def _suggest_next(
+    kind: "ClusterKind[Any]",
+    summaries: "Sequence[GroupSummary] | Sequence[VoiceSummary]",
+    logs: Sequence[Path],
+    file: Path | None,
+) -> None:
+    unnamed = [each.number for each in summaries if not each.name]
     if unnamed:
         where = " ".join(quote(str(log)) for log in logs)
-        where += f" --groups {quote(str(file))}" if file else ""
-        print_notice(f"next: name one: hearthlog discover {where} --name {unnamed[0]}=doorbell")
+        where += f" --{kind.plural} {quote(str(file))}" if file else ""
+        name = f"{unnamed[0]}={kind.example.partition('=')[2]}"
+        print_notice(f"next: name one: hearthlog {kind.verb} {where} --name {name}")
 
 
 def voices(
@@ -302,14 +316,10 @@ def voices(
     Voices keep their numbers in later runs. Exit status 3: a log is damaged, or has no features by
     which voices can be told apart; the others were used.
     """
-    from hearthlog.analyzer.discover.groups import locked_groups
-    from hearthlog.analyzer.discover.home_voices import (
-        find_voices,
-        load_voices,
-        save_voices,
-        summarise,
-    )
-    from hearthlog.analyzer.discover.speech import read_speech
+    from hearthlog.analyzer.discover.clusters import locked_file
+    from hearthlog.analyzer.discover.speech import find_voices, read_speech
+    from hearthlog.analyzer.discover.summary import summarise_voices
+    from hearthlog.analyzer.discover.voices import VOICES, load_voices, save_voices
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.tools.cli.options import check_output
@@ -322,78 +332,49 @@ def voices(
     span = parse_span(start, end)
     found = find_home_logs(logs)
     zone = home_zone(timezone, found.records())
-    path = file or _voices_file(logs)
-    with locked_groups(path):
+    path = file or _default_file(VOICES, logs, "voices")
+    with locked_file(path):
         known = load_voices(path)
         with share_done("reading what was said") as progress:
             speech = read_speech(found, *span, progress)
         heard, of = find_voices(speech, known)
-        _check_numbers(heard, [*(undo or []), *names])
-        heard = _named(heard, dict.fromkeys(undo or [], "") | names)
+        _check_numbers(VOICES, heard, [*(undo or []), *names])
+        heard = heard.named(dict.fromkeys(undo or [], "") | names)
         if home is not None:
             _enrol(home, speech, heard, of, names)
         save_voices(heard, path)
     if output is not None:
         _write_turns(output, speech, heard, of)
-    summaries = summarise(speech, heard, of, zone)
+    summaries = summarise_voices(speech, heard, of, zone)
     if as_json:
-        print_json(_voices_as_json(summaries, speech, path, zone))
+        result = {"seconds": speech.seconds, "timezone": str(zone), "voices_file": str(path)}
+        print_json({**result, "voices": [each.model_dump() for each in summaries]})
     else:
         _print_voices(summaries, speech, zone)
-        _suggest_next_of_voices(summaries, logs, file)
+        _suggest_next(VOICES, summaries, logs, file)
     end_with_warnings(speech.losses)
 
 
-def _voices_file(logs: Sequence[Path]) -> Path:
-    from hearthlog.analyzer.discover.home_voices import VOICES
-
-    if len(logs) > 1 or not logs[0].is_dir():
-        wrong_use("--voices: say in which file voices are kept, where LOGS is no single folder")
-    return logs[0] / VOICES
-
-
 def _voice_names(given: Sequence[str]) -> dict[int, str]:
-    """Parse the options --name."""
-    from hearthlog.models.classes import CLASS_NAME, find_class
-    from hearthlog.schemas.messages.topics import spelt
+    from hearthlog.analyzer.discover.voices import VOICES
+    from hearthlog.models.classes import find_class
 
-    names: dict[int, str] = {}
-    for text in given:
-        voice, _, label = text.partition("=")
-        label = spelt(label)
-        is_number = re.fullmatch(r" *[0-9]{1,9} *", voice)
-        if not is_number or not CLASS_NAME.fullmatch(label):
-            wrong_use(f"--name {text[:64]!r}: say the number of a voice and a name, as 2=anna")
+    names = _names(VOICES, given, "a name")
+    for text, label in zip(given, names.values(), strict=True):
         if find_class(label) is not None:
             wrong_use(f"--name {text[:64]!r}: {label} is a class of sound; give a person's name")
-        if int(voice) in names:
-            wrong_use(f"--name {text[:64]!r}: voice {int(voice)} has another name already")
-        names[int(voice)] = label
     return names
-
-
-def _check_numbers(voices: "HomeVoices", numbers: Iterable[int]) -> None:
-    from hearthlog.analyzer.errors import DataError
-
-    for each in numbers:
-        if each not in voices.numbers:
-            raise DataError(f"there is no voice {each}; `hearthlog voices LOGS` lists them")
-
-
-def _named(voices: "HomeVoices", names: dict[int, str]) -> "HomeVoices":
-    pairs = zip(voices.numbers.tolist(), voices.names, strict=True)
-    return replace(voices, names=[names.get(number, name) for number, name in pairs])
 
 
 def _enrol(
     home: Path, speech: "HomeSpeech", voices: "HomeVoices", of: "Int64", names: dict[int, str]
 ) -> None:
     """Enrol the longest turns of voices."""
-    from hearthlog.analyzer.discover.home_voices import enrol_voice
+    from hearthlog.analyzer.discover.speech import enrol_voice
 
     for each, label in names.items():
         row = voices.numbers.tolist().index(each)
-        done = enrol_voice(home, label, speech, (of[speech.turns.voice] == row).nonzero()[0])
+        done = enrol_voice(home, label, speech, (of[speech.voice] == row).nonzero()[0])
         seconds = sum(one.seconds for one in done)
         print_notice(f"voice {each}: {seconds:.0f} s of {label} enrolled in {home}")
 
@@ -402,7 +383,7 @@ def _write_turns(output: Path, speech: "HomeSpeech", voices: "HomeVoices", of: "
     """Write the table of voice turns."""
     import csv
 
-    from hearthlog.analyzer.discover.home_voices import spoken_spans
+    from hearthlog.analyzer.discover.speech import spoken_spans
     from hearthlog.analyzer.logs.text_files import disarmed
     from hearthlog.schemas.frames import time_text
     from hearthlog.schemas.new_files import new_file
@@ -429,7 +410,7 @@ def _print_voices(
         (
             str(each.number),
             each.name,
-            _voice_place(each, zone),
+            _place(each, zone),
             f"{each.minutes:.1f}",
             str(each.turns),
             str(each.days),
@@ -445,63 +426,23 @@ def _print_voices(
         print(f"{number(speech.without, 'log')} without features of voices, or segments")
 
 
-def _voice_place(summary: "VoiceSummary", zone: "tzinfo") -> str:
-    from hearthlog.analyzer.logs.local_time import local_time
-
-    turn = summary.examples[0]
-    return f"{local_time(turn.start, zone):%Y-%m-%d %H:%M:%S} {turn.microphone}"
-
-
-def _suggest_next_of_voices(
-    summaries: "Sequence[VoiceSummary]", logs: Sequence[Path], file: Path | None
-) -> None:
-    unnamed = [each.number for each in summaries if not each.name]
-    if unnamed:
-        where = " ".join(quote(str(log)) for log in logs)
-        where += f" --voices {quote(str(file))}" if file else ""
-        print_notice(f"next: name one: hearthlog voices {where} --name {unnamed[0]}=anna")
-
-
-def _voices_as_json(
-    summaries: "Sequence[VoiceSummary]", speech: "HomeSpeech", file: Path, zone: "tzinfo"
-) -> dict[str, Any]:
-    from hearthlog.schemas.frames import time_text
-
-    def turn(each: Any) -> dict[str, Any]:
-        times = {key: time_text(getattr(each, key)) for key in ("start", "end")}
-        return {"log": str(each.log), "microphone": each.microphone, **times}
-
-    return {
-        "seconds": speech.seconds,
-        "timezone": str(zone),
-        "voices_file": str(file),
-        "voices": [
-            {**asdict(each), "examples": [turn(one) for one in each.examples]} for each in summaries
-        ],
-    }
-
-
 def add_groups(timeline: "Timeline", logs: list[Path], file: Path) -> None:
     """Add the sounds of a groups file to a timeline.
 
     Raise `DataError` if the file does not exist.
     """
-    from hearthlog.analyzer.discover.groups import load_groups
+    from hearthlog.analyzer.discover.groups import GROUPS, load_groups
     from hearthlog.analyzer.discover.sounds import group_spans
-    from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.review.timeline import LabelledSpans
 
     groups = load_groups(file)
     if groups is None:
-        raise DataError(f"{file}: no such file of groups; `hearthlog discover` makes one")
+        raise _missing(GROUPS, file)
     span = timeline.grid.start, timeline.grid.end
     with share_done("finding what recurs") as progress:
-        spans_by_name, losses = group_spans(find_home_logs(logs), groups, *span, progress)
-    for name, spans in spans_by_name.items():
-        if name in timeline.microphones:
-            timeline.microphones[name].recurring = LabelledSpans(*spans)
-    timeline.losses += [text for text in losses if text not in timeline.losses]
+        spans, losses = group_spans(find_home_logs(logs), groups, *span, progress)
+    for microphone, labelled in _lanes(timeline, spans, losses):
+        microphone.recurring = labelled
 
 
 def add_voices(timeline: "Timeline", logs: list[Path], file: Path) -> None:
@@ -509,20 +450,33 @@ def add_voices(timeline: "Timeline", logs: list[Path], file: Path) -> None:
 
     Raise `DataError` if the file does not exist.
     """
-    from hearthlog.analyzer.discover.home_voices import find_voices, load_voices, spoken_spans
-    from hearthlog.analyzer.discover.speech import read_speech
-    from hearthlog.analyzer.errors import DataError
+    from hearthlog.analyzer.discover.speech import find_voices, read_speech, spoken_spans
+    from hearthlog.analyzer.discover.voices import VOICES, load_voices
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.review.timeline import LabelledSpans
 
     known = load_voices(file)
     if known is None:
-        raise DataError(f"{file}: no such file of voices; `hearthlog voices` makes one")
+        raise _missing(VOICES, file)
     with share_done("telling voices apart") as progress:
         span = timeline.grid.start, timeline.grid.end
         speech = read_speech(find_home_logs(logs), *span, progress)
-    voices, of = find_voices(speech, known)
-    for name, spans in spoken_spans(speech, voices, of).items():
-        if name in timeline.microphones:
-            timeline.microphones[name].spoken = LabelledSpans(*spans)
-    timeline.losses += [text for text in speech.losses if text not in timeline.losses]
+    spans = spoken_spans(speech, *find_voices(speech, known))
+    for microphone, labelled in _lanes(timeline, spans, speech.losses):
+        microphone.spoken = labelled
+
+
+def _missing(kind: "ClusterKind[Any]", file: Path) -> "DataError":
+    from hearthlog.analyzer.errors import DataError
+
+    return DataError(f"{file}: no such file of {kind.plural}; `hearthlog {kind.verb}` makes one")
+
+
+def _lanes(
+    timeline: "Timeline", spans: "Mapping[str, NamedSpans]", losses: Iterable[str]
+) -> "list[tuple[MicrophoneTimeline, LabelledSpans]]":
+    """Return the spans of each microphone of a timeline, which gets the losses."""
+    from hearthlog.analyzer.review.timeline import LabelledSpans
+
+    timeline.losses += [text for text in losses if text not in timeline.losses]
+    known = timeline.microphones
+    return [(known[name], LabelledSpans(*each)) for name, each in spans.items() if name in known]

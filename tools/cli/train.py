@@ -332,7 +332,7 @@ def _learned_voices(
     left_out: "list[SkippedClip]",
 ) -> tuple["Model", "Dataset"]:
     """Train a model of the enrolled speakers."""
-    from hearthlog.analyzer.discover.home_voices import check_voices
+    from hearthlog.analyzer.discover.speech import check_voices
     from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
     from hearthlog.analyzer.training.speakers import (
         others_of,

@@ -19,7 +19,7 @@ import typer
 from numpy.typing import NDArray
 from sklearn.metrics import adjusted_rand_score
 
-from hearthlog.analyzer.discover.groups import NO_GROUP
+from hearthlog.analyzer.discover.clusters import NO_CLUSTER
 from hearthlog.analyzer.discover.sounds import ALL, HomeSounds, discover, read_sounds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -71,7 +71,7 @@ class _Grouped(NamedTuple):
     Attributes
     ----------
     of : np.ndarray [shape=(n,)], int64
-        The row of the group of each, or `NO_GROUP`.
+        The row of the group of each, or `NO_CLUSTER`.
     kinds : np.ndarray [shape=(n,)], str
         What each was.
     events : np.ndarray [shape=(n,)], int64
@@ -121,20 +121,22 @@ def _samples(path: Path) -> Float32:
 
 def _grouped(sounds: HomeSounds, truth: Sequence[Sounded]) -> tuple[_Grouped, int]:
     """Group the sounds of the first day, and know those of all days by these groups."""
-    names, events = names_of(sounds.spans, truth)
-    is_early = sounds.spans.starts < _START + _DAY
+    names, events = names_of(sounds, truth)
+    is_early = sounds.starts < _START + _DAY
     first = replace(
         sounds,
         log=sounds.log[is_early],
         microphone=sounds.microphone[is_early],
-        spans=sounds.spans.rows(is_early),
+        starts=sounds.starts[is_early],
+        ends=sounds.ends[is_early],
+        labels=sounds.labels[is_early],
         descriptors=sounds.descriptors[is_early],
         embeddings=sounds.embeddings[is_early],
     )
     groups, _, _ = discover(first, None)
     _, of, _ = discover(sounds, groups)
     known = len(groups.numbers)
-    of = np.where(of < known, of, NO_GROUP)
+    of = np.where(of < known, of, NO_CLUSTER)
     return _Grouped(of, np.array(names), np.array(events), is_early), known
 
 
@@ -143,7 +145,7 @@ def _rows(
 ) -> list[Row]:
     names = np.array([*(_name(sounds, group) for group in range(groups)), OTHER])
     named = names[sounds.of]  # the last one for those of no group
-    recurs, is_grouped = sounds.kinds != OTHER, sounds.of != NO_GROUP
+    recurs, is_grouped = sounds.kinds != OTHER, sounds.of != NO_CLUSTER
     right = sum(
         np.unique(sounds.kinds[sounds.of == g], return_counts=True)[1].max(initial=0)
         for g in range(groups)
@@ -188,7 +190,7 @@ def _share(
 def _is_one_group(kind: str, sounds: _Grouped) -> bool:
     """Tell whether most of the sounds of a kind are one group, and most of that group is this."""
     own = sounds.of[sounds.kinds == kind]
-    counts = np.bincount(own[own != NO_GROUP], minlength=1)
+    counts = np.bincount(own[own != NO_CLUSTER], minlength=1)
     group = int(counts.argmax())
     is_whole = 2 * counts[group] > len(own)
     return bool(is_whole and (sounds.kinds[sounds.of == group] == kind).mean() > 0.5)

@@ -10,8 +10,8 @@ import numpy as np
 import soundfile
 from scipy.signal import fftconvolve
 
-from hearthlog.analyzer.discover.sounds import SoundSpans
 from hearthlog.analyzer.evaluation.scenes import background
+from hearthlog.analyzer.logs.spans import Timed
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
@@ -94,7 +94,7 @@ def _another_take(clip: Float32, rng: random.Random, noises: np.random.Generator
     return (sound / max(float(np.abs(sound).max()), 1e-9) * level).astype(np.float32)
 
 
-def names_of(spans: SoundSpans, truth: Sequence[Sounded]) -> tuple[list[str], list[int]]:
+def names_of(spans: Timed, truth: Sequence[Sounded]) -> tuple[list[str], list[int]]:
     """Tell what each of some sounds was: that with which it has most time in common.
 
     Returns

@@ -17,7 +17,7 @@ import soundfile
 import typer
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.discover.home_voices import is_of_two
+from hearthlog.analyzer.discover.speech import is_of_two
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.enrol import enrol_file
 from hearthlog.analyzer.training.dataset import cut_recordings

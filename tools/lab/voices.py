@@ -16,8 +16,7 @@ import typer
 from pyannote.core import Annotation, Segment, Timeline
 from pyannote.metrics.diarization import DiarizationErrorRate
 
-from hearthlog.analyzer.discover.home_voices import find_voices
-from hearthlog.analyzer.discover.speech import HomeSpeech, read_speech, speech_voices
+from hearthlog.analyzer.discover.speech import HomeSpeech, find_voices, read_speech, speech_voices
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.installed import DEFAULT
@@ -89,9 +88,9 @@ def _truth(turns: Sequence[Turn]) -> Annotation:
 
 
 def _annotation(speech: HomeSpeech, of: Int64, start: int) -> Annotation:
-    told, turns = Annotation(), speech.turns
-    times = (turns.starts - start) / NANOSECONDS, (turns.ends - start) / NANOSECONDS
-    for track, (first, last, voice) in enumerate(zip(*times, of[turns.voice], strict=True)):
+    told = Annotation()
+    times = (speech.starts - start) / NANOSECONDS, (speech.ends - start) / NANOSECONDS
+    for track, (first, last, voice) in enumerate(zip(*times, of[speech.voice], strict=True)):
         told[Segment(float(first), float(last)), track] = str(voice)
     return told
 
@@ -106,7 +105,7 @@ def _of_speech(samples: Float32, turns: Sequence[Turn]) -> Annotation:
         is_speech |= (turn.start <= middle) & (middle < turn.end)
     values = DEFAULT.extractor()(frames)[is_speech]
     told = Annotation()
-    spans = speech_voices(stamps[is_speech], values, DEFAULT.feature_names)
+    *spans, _ = speech_voices(stamps[is_speech], values, DEFAULT.feature_names)
     for track, (first, last, voice) in enumerate(zip(*spans, strict=True)):
         told[Segment(first / NANOSECONDS, last / NANOSECONDS), track] = str(voice)
     return told
