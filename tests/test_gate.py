@@ -418,10 +418,10 @@ def test_a_home_that_is_mostly_quiet_is_heard_where_it_is_not():
     starts = START + np.arange(14 * 24) * hour + 600 * SECOND
     sounding = Spans(starts, starts + 60 * SECOND)
     chosen = choose(parts, sounding)
-    lengths = np.array([part.end - part.start for part, _ in chosen])
-    weights = np.array([weight for _, weight in chosen])
+    lengths = np.array([part.end - part.start for part in chosen])
+    weights = np.array([part.weight for part in chosen])
     heard = [common(Spans(np.array([part.start]), np.array([part.end])), sounding).length
-             for part, _ in chosen]  # fmt: skip
+             for part in chosen]  # fmt: skip
     assert lengths.sum() < 1.4 * hour
     assert sum(heard) > 1500 * SECOND
     assert (lengths * weights).sum() == pytest.approx(14 * 24 * hour)

@@ -28,17 +28,16 @@ from hearthlog.analyzer.gate.recent_time import (
     LogSpan,
     RecentLog,
     ReferenceSound,
-    WeightedPart,
     left_alone,
     recorded_minutes,
     reference,
     spans_of,
 )
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
-from hearthlog.analyzer.logs.spans import Spans, joined, lengths, rows_at
+from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.classifiers.model import Model
-from hearthlog.schemas.arrays import Bool, Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, is_layer
@@ -150,7 +149,7 @@ def gather_evidence(
             for (log, own), new in zip(known, unlearned, strict=True)
         ]
         places += _places(rest, _LEARNED_SECONDS)
-    parts = [*chosen, *(WeightedPart(part, 1.0) for part, _ in places)]
+    parts = [*chosen, *(part for part, _ in places)]
     labelled = list(label_parts(models, parts, losses, progress))
     frames = joined_frames(labelled[: len(chosen)])
     outcomes = [
@@ -181,8 +180,7 @@ def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> P
     known = reference_sounds(logs, losses)
     places = _places([(log, [sound for sound in own if sound.random]) for log, own in known])
     models = TwoModels(before, after)
-    parts = [WeightedPart(part, 1.0) for part, _ in places]
-    labelled = label_parts(models, parts, losses, ignore_progress)
+    labelled = label_parts(models, [part for part, _ in places], losses, ignore_progress)
     return _right(
         one
         for (_, sounds), own in zip(places, labelled, strict=True)
@@ -261,13 +259,13 @@ def _outcomes(
 def _right(outcomes: Iterable[_Outcome]) -> PairedAccuracy:
     """Count the sounds that each model labels correctly."""
     pairs = [(one.before == one.label, one.after == one.label) for one in outcomes]
-    return PairedAccuracy(
-        len(pairs),
-        sum(a for a, _ in pairs),
-        sum(b for _, b in pairs),
-        sum(b > a for a, b in pairs),
-        sum(a > b for a, b in pairs),
-    )
+    return _counted(*np.array(pairs, bool).reshape(-1, 2).T)
+
+
+def _counted(before: Bool, after: Bool) -> PairedAccuracy:
+    """Count the sounds, given which of them each model labels correctly."""
+    columns = before, after, after & ~before, before & ~after
+    return PairedAccuracy(len(before), *(int(column.sum()) for column in columns))
 
 
 _ENDS = (0.025, 0.975)
@@ -367,43 +365,21 @@ def _records(folders: Sequence[Path], losses: list[str]) -> Iterable[tuple[Path,
 
 
 def _right_on_trial(
-    sounds: Sequence[ReferenceSound], before: Labelling, after: Labelling
+    sounds: Iterable[ReferenceSound], before: Labelling, after: Labelling
 ) -> PairedAccuracy:
     """Count the sounds that a model labels correctly for most of the time that it labelled."""
-    first, second = (_agrees(sounds, labels) for labels in (before, after))
-    both = _labelled(sounds, before) & _labelled(sounds, after)
-    first, second = first[both], second[both]
-    return PairedAccuracy(
-        int(both.sum()),
-        int(first.sum()),
-        int(second.sum()),
-        int((second & ~first).sum()),
-        int((first & ~second).sum()),
-    )
+    decided = [sound for sound in sounds if class_name(sound.label) != UNKNOWN]
+    shares = [[_mostly(sound, labels) for labels in (before, after)] for sound in decided]
+    labelled, right = np.array(shares, bool).reshape(-1, 2, 2).transpose(2, 0, 1)
+    return _counted(*right[labelled.all(axis=1)].T)
 
 
-def _agrees(sounds: Sequence[ReferenceSound], labels: Labelling) -> Bool:
-    agrees = np.zeros(len(sounds), bool)
-    names = np.array([class_name(sound.label) for sound in sounds], object)
-    for name in set(names):
-        own = labels.labels == name
-        rows = np.flatnonzero(names == name).tolist()
-        agrees[rows] = _mostly([sounds[row] for row in rows], labels.starts[own], labels.ends[own])
-    return agrees
-
-
-def _labelled(sounds: Sequence[ReferenceSound], labels: Labelling) -> Bool:
-    names = [class_name(sound.label) != UNKNOWN for sound in sounds]
-    return _mostly(sounds, labels.starts, labels.ends) & np.array(names, bool)
-
-
-def _mostly(sounds: Sequence[ReferenceSound], starts: Int64, ends: Int64) -> Bool:
-    """Return whether spans cover more than half of each sound."""
-    spans = joined(starts, ends)
-    covered = [
-        int(lengths(spans, np.array([sound.start, sound.end]))[0]) if len(spans.starts) else 0
-        for sound in sounds
-    ]
-    whole = [sound.end - sound.start for sound in sounds]
-    mostly: Bool = 2 * np.array(covered, np.int64) > np.array(whole, np.int64)
-    return mostly
+def _mostly(sound: ReferenceSound, labels: Labelling) -> tuple[bool, bool]:
+    """Return whether labels, and labels of its class, cover more than half of a sound."""
+    first = np.searchsorted(labels.ends, sound.start, side="right")
+    rows = slice(first, np.searchsorted(labels.starts, sound.end))
+    starts, ends = labels.starts[rows], labels.ends[rows]
+    covered = np.minimum(ends, sound.end) - np.maximum(starts, sound.start)
+    own = labels.labels[rows] == class_name(sound.label)
+    half = (sound.end - sound.start) / 2
+    return bool(covered.sum() > half), bool(covered[own].sum() > half)

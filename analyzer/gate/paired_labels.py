@@ -12,7 +12,6 @@ from hearthlog.analyzer.gate.recent_time import (
     LogSpan,
     RecentLog,
     ReferenceSound,
-    WeightedPart,
     choose,
     learned_time,
     minutes_a_day,
@@ -87,21 +86,21 @@ class TwoModels:
         self._model = before
         self._classifiers = Classifier(before), Classifier(after)
 
-    def label(self, part: LogSpan, weight: float = 1.0) -> PairedFrames:
+    def label(self, part: LogSpan) -> PairedFrames:
         """Label a part of a log with both models, each as a recorder would.
 
         Raise `LogError` if the log cannot be read, or has no features of the set of the models.
         """
         infos, _ = infos_for_model(part.log, self._model, part.log)
         wanted = [info for info in infos if part.microphone in {None, info.microphone}]
-        return joined_frames([self._label(info, part, weight) for info in wanted])
+        return joined_frames([self._label(info, part) for info in wanted])
 
-    def _label(self, info: RecorderInfo, part: LogSpan, weight: float) -> PairedFrames:
+    def _label(self, info: RecorderInfo, part: LogSpan) -> PairedFrames:
         first, second = label_span(info, self._classifiers, part.start, part.end)
         stamps, a, b = np.intersect1d(first.stamps, second.stamps, return_indices=True)
         before, after = first.classes[a], self._numbers[second.classes[b]]
-        confidence = first.probabilities[a, before]
-        return PairedFrames(stamps, before, after, confidence, np.full(len(stamps), weight))
+        weights = np.full(len(stamps), part.weight)
+        return PairedFrames(stamps, before, after, first.probabilities[a, before], weights)
 
 
 A_DAY = " a day"
@@ -227,13 +226,13 @@ def learned_by(before: Model, after: Model, known: KnownSounds) -> Spans:
     return joined(starts, ends)
 
 
-def unlearned_sample(logs: Sequence[RecentLog], learned: Spans) -> list[WeightedPart]:
+def unlearned_sample(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
     """Choose parts of the time outside the training set of any model."""
     return choose(unlearned_time(logs, learned), sounding_time(logs))
 
 
 def label_parts(
-    models: TwoModels, parts: Sequence[WeightedPart], losses: list[str], progress: Progress
+    models: TwoModels, parts: Sequence[LogSpan], losses: list[str], progress: Progress
 ) -> Iterator[PairedFrames]:
     """Label one part after the other; an unreadable part has no frames.
 
@@ -242,9 +241,9 @@ def label_parts(
     progress : callable
         Receives the completed share of the parts, 0 to 1.
     """
-    for i, (part, weight) in enumerate(parts):
+    for i, part in enumerate(parts):
         try:
-            frames = models.label(part, weight)
+            frames = models.label(part)
         except LogError as error:
             losses.append(str(error))
             frames = NO_FRAMES
@@ -308,10 +307,7 @@ def find_changed_time(
     losses: list[str] = []
     learned = learned_by(before, after, reference_sounds(logs, losses))
     models = TwoModels(before, after)
-    parts = [
-        one._replace(part=one.part._replace(microphone=microphone))
-        for one in unlearned_sample(logs, learned)
-    ]
+    parts = [part._replace(microphone=microphone) for part in unlearned_sample(logs, learned)]
     frames = joined_frames(list(label_parts(models, parts, losses, progress)))
     changes = changes_of_sample(models.classes, frames, logs)
     return ChangedTime(_differing(frames, len(models.classes)), changes, losses)

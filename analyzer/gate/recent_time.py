@@ -42,19 +42,13 @@ class RecentLog(NamedTuple):
 
 
 class LogSpan(NamedTuple):
-    """A span of a log, in nanoseconds of UTC."""
+    """A span of a log, in nanoseconds of UTC, which may represent more time of the same kind."""
 
     log: Path
     start: int
     end: int
     microphone: str | None = None  # None for all of them
-
-
-class WeightedPart(NamedTuple):
-    """A part that represents more time of the same kind."""
-
-    part: LogSpan
-    weight: float  # represented time per time of the part
+    weight: float = 1.0  # represented time per time of the span
 
 
 def recent_logs(folders: Iterable[Path]) -> list[RecentLog]:
@@ -114,7 +108,7 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
     return parts
 
 
-def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list[WeightedPart]:
+def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list[LogSpan]:
     """Choose parts of the time for the check: at most 45 minutes with sound, and 32 without."""
     near = joined(sounding.starts - _AROUND, sounding.ends + _AROUND, _AROUND)
     loud: list[LogSpan] = []
@@ -156,10 +150,10 @@ def sample(parts: Sequence[LogSpan], count: int, longest: int, seed: int = _SEED
     return chosen
 
 
-def _weighted(parts: Sequence[LogSpan], count: int, longest: int, seed: int) -> list[WeightedPart]:
+def _weighted(parts: Sequence[LogSpan], count: int, longest: int, seed: int) -> list[LogSpan]:
     chosen = sample(parts, count, longest, seed)
     whole, sampled = (sum(part.end - part.start for part in some) for some in (parts, chosen))
-    return [WeightedPart(part, whole / sampled) for part in chosen]
+    return [part._replace(weight=whole / sampled) for part in chosen]
 
 
 def recorded_minutes(logs: Sequence[RecentLog]) -> float:

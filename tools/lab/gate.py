@@ -108,7 +108,7 @@ def _grade(champion: Model, model: Model, logs: Sequence[RecentLog], truth: Labe
     later = [log for log in logs if log.start >= first]
     two = TwoModels(champion, model)
     parts = choose(unlearned_time(later, NONE), sounding_time(later), _SEED_OF_GRADES)
-    frames = joined_frames([two.label(*weighted) for weighted in parts])
+    frames = joined_frames([two.label(part) for part in parts])
     rows = rows_at(Spans(truth.starts, truth.ends), frames.stamps)
     names = list(dict.fromkeys([*champion.classes, UNKNOWN]))
     numbers = {name: i for i, name in enumerate(names)}
