@@ -3,7 +3,7 @@
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
@@ -22,11 +22,10 @@ from hearthlog.analyzer.bridge.home import (
     source_scenario,
 )
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
-from hearthlog.analyzer.bridge.http_server import TEXT, HttpHandler, HttpServer
 from hearthlog.analyzer.bridge.output import TOTALS, News, Total, Totals
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.state import BridgeError, figures_token
-from hearthlog.analyzer.network import HOST, is_asked_in_digits
+from hearthlog.analyzer.network import HOST, HttpHandler, HttpServer, is_asked_in_digits
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import create_file, replaced_file
@@ -157,30 +156,23 @@ class _Handler(HttpHandler):
     def get(self) -> None:
         """Send the metrics."""
         server = cast(_Server, self.server)
-        hosts = self.headers.get_all("Host", [])
-        is_here = len(hosts) == 1 and is_asked_in_digits(HOST, hosts[0])
-        if not is_here or "Origin" in self.headers:
-            self._refuse(HTTPStatus.FORBIDDEN, "ask for an address in digits, and from no page")
-            return
         shown = self.headers.get("Authorization", "").encode("utf-8", "replace")
-        if not compare_digest(shown, server.expected):
-            self._refuse(
+        if not is_asked_in_digits(HOST, self.host) or "Origin" in self.headers:
+            self.send_text(HTTPStatus.FORBIDDEN, "ask for an address in digits, and from no page")
+        elif not compare_digest(shown, server.expected):
+            self.send_text(
                 HTTPStatus.UNAUTHORIZED,
                 "show the token of token_file in [bridge.prometheus]: `authorization: "
                 "credentials_file` of Prometheus does",
                 {"WWW-Authenticate": "Bearer"},
             )
         elif self.path.partition("?")[0] != "/metrics":
-            self._refuse(HTTPStatus.NOT_FOUND, "there is /metrics")
-        elif not server.admit(self.connection):
-            self.send_error(HTTPStatus.SERVICE_UNAVAILABLE)
-        elif (text := server.current()) is None:
-            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, "what is known is old")
-        else:
-            self.send(HTTPStatus.OK, text, _TEXT)
-
-    def _refuse(self, code: int, text: str, more: Mapping[str, str] | None = None) -> None:
-        self.send(code, f"{text}\n".encode(), TEXT, more)
+            self.send_text(HTTPStatus.NOT_FOUND, "there is /metrics")
+        elif self.has_place():
+            if (text := server.current()) is None:
+                self.send_text(HTTPStatus.SERVICE_UNAVAILABLE, "what is known is old")
+            else:
+                self.send(HTTPStatus.OK, text, _TEXT)
 
 
 class _Figures(Collector):

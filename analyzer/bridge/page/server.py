@@ -16,9 +16,14 @@ from threading import Condition
 from time import monotonic
 from typing import NamedTuple, cast
 
-from hearthlog.analyzer.bridge.http_server import SECONDS, TEXT, HttpHandler, HttpServer
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.network import host_name, is_asked_in_digits
+from hearthlog.analyzer.network import (
+    SECONDS,
+    HttpHandler,
+    HttpServer,
+    host_name,
+    is_asked_in_digits,
+)
 from hearthlog.schemas.errors import HearthlogError
 
 _YEAR = 365 * 24 * 3600
@@ -78,6 +83,7 @@ class PageAdmission:
     def refusal(
         self,
         target: str,
+        host: str,
         fields: Mapping[str, Sequence[str]],
         *,
         changes: bool,
@@ -90,8 +96,7 @@ class PageAdmission:
         str
             Reason of a refusal and its remedy; empty if the request is admitted.
         """
-        hosts, origins = fields["Host"], fields["Origin"]
-        host = hosts[0].lower() if len(hosts) == 1 else ""
+        origins = fields["Origin"]
         if not self._is_named(host):
             return _by_name(host_name(f"//{host}"))
         if len(origins) > 1 or (changes and not origins):
@@ -211,7 +216,6 @@ class Board:
 _MOST_STREAMS = 16
 _MARK_SECONDS = 120.0  # to read the logs of the event from a slow disk
 _BEAT_SECONDS, _LOOK_SECONDS = 5.0, 1.0
-_BODY_LIMIT = 4 << 10  # bytes
 _FILES = {
     "/": ("page.html", "text/html; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
@@ -290,7 +294,7 @@ class PageServer(HttpServer):
 class _Handler(HttpHandler):
     """Handler of one request."""
 
-    body_limit = _BODY_LIMIT
+    body_limit = 4 << 10
 
     @property
     def _server(self) -> PageServer:
@@ -323,7 +327,7 @@ class _Handler(HttpHandler):
         if self._path not in _ASKED:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
-        asked = self._body(_ASKED[self._path])
+        asked = self._label(_ASKED[self._path])
         if isinstance(asked, HTTPStatus):
             self.send_error(asked)
             return
@@ -336,17 +340,14 @@ class _Handler(HttpHandler):
         self.send(code, json.dumps(answer).encode(), _JSON)
 
     def _is_admitted(self, *, changes: bool) -> bool:
-        fields = {name: self.headers.get_all(name, []) for name in ("Host", "Origin", "Cookie")}
+        fields = {name: self.headers.get_all(name, []) for name in ("Origin", "Cookie")}
         self._path, has_pass = self._without_pass()
-        admission = self._server.admission
-        refusal = admission.refusal(self.path, fields, changes=changes, has_pass=has_pass)
+        refusal = self._server.admission.refusal(
+            self.path, self.host, fields, changes=changes, has_pass=has_pass
+        )
         if refusal:
-            self.send(HTTPStatus.FORBIDDEN, f"{refusal}\n".encode(), TEXT)
-        elif not self._server.admit(self.connection):
-            self.send_error(HTTPStatus.SERVICE_UNAVAILABLE)
-        else:
-            return True
-        return False
+            self.send_text(HTTPStatus.FORBIDDEN, refusal)
+        return not refusal and self.has_place()
 
     def _without_pass(self) -> tuple[str, bool]:
         """Return the path without its leading pass (used in frames), and whether there was one."""
@@ -365,17 +366,15 @@ class _Handler(HttpHandler):
         cookie = {"Set-Cookie": admission.cookie()}
         self.send(HTTPStatus.OK, _ENTRANCE.replace("TO", to).encode(), _FILES["/"][1], cookie)
 
-    def _body(self, what: str) -> tuple[str, str] | HTTPStatus:
+    def _label(self, what: str) -> tuple[str, str] | HTTPStatus:
         """Read the id and label from the body; return a status code on an invalid body."""
-        length = self.headers.get("Content-Length", "")
         if self.headers.get_content_type() != _JSON:
             return HTTPStatus.UNSUPPORTED_MEDIA_TYPE
-        if not (length.isascii() and length.isdecimal()):
-            return HTTPStatus.LENGTH_REQUIRED
-        if len(length) > 9 or int(length) > _BODY_LIMIT:
-            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+        content = self.body()
+        if isinstance(content, HTTPStatus):
+            return content
         try:
-            asked = json.loads(self.rfile.read(int(length)))
+            asked = json.loads(content)
             labelled, label = asked[what], asked["label"]
         except (ValueError, KeyError, TypeError, RecursionError):
             return HTTPStatus.BAD_REQUEST

@@ -3,19 +3,16 @@
 import json
 import queue
 import secrets
-import sys
-import threading
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any, cast
 
-from hearthlog.analyzer.network import HOST, free_port
+from hearthlog.analyzer.network import HOST, HttpHandler, HttpServer, free_port
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 
@@ -101,6 +98,7 @@ def _text(content: bytes, field: int) -> str:
 
 
 _POLL_SECONDS = 20.0
+_SECONDS = 120.0  # for a request, with the time in which a browser takes the viewer
 _ANSWER_SECONDS = 15.0
 _LIMIT = 16 << 20  # maximum bytes of an answer
 _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
@@ -164,66 +162,60 @@ class Relay:
             waiting.set_result(content)
 
 
-class _Server(ThreadingHTTPServer):
+class _Server(HttpServer):
     """Serves the page, below a secret path."""
 
-    daemon_threads = True
-
     def __init__(self, port: int, relay: Relay, viewer_files: str, data: str) -> None:
-        super().__init__((HOST, port), _Handler)
+        super().__init__(HOST, port, _Handler)
         self.relay = relay
         self.secret = secrets.token_urlsafe(16)
         self.viewer_files = viewer_files
         self.data = data
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore broken connections of closed pages; print other errors."""
-        if not isinstance(sys.exception(), ConnectionError):
-            super().handle_error(request, client_address)
 
     @property
     def url(self) -> str:
         return f"http://{HOST}:{self.server_port}/{self.secret}/"
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Handler(HttpHandler):
     """Handler of the page's requests."""
 
-    protocol_version = "HTTP/1.1"
+    timeout = _SECONDS
+    body_limit = _LIMIT
 
     @property
     def _page(self) -> _Server:
         return cast(_Server, self.server)
 
-    def log_message(self, *_: object) -> None:
-        """Disable request logging."""
-
-    def do_GET(self) -> None:
+    def get(self) -> None:
         """Send the page, the files of the viewer, the next request or the next text."""
         name = self._name()
         if name == "":
             page = files("hearthlog.analyzer.review.viewer").joinpath("page.html").read_bytes()
-            self._send(
-                page, "text/html; charset=utf-8", {"Content-Security-Policy": self._policy()}
-            )
+            policy = {"Content-Security-Policy": self._policy()}
+            self.send(HTTPStatus.OK, page, "text/html; charset=utf-8", policy)
         elif name == "description":
             description = {"data": self._page.data, "keys": list(self._page.relay.keys)}
-            self._send(json.dumps(description).encode(), "application/json")
+            self.send(HTTPStatus.OK, json.dumps(description).encode(), "application/json")
         elif name == "next":
-            self._send_next()
+            number, request = self._page.relay.next()
+            kind = "application/octet-stream"
+            self.send(HTTPStatus.OK, request, kind, {"Number": str(number)})
         elif name == "text":
             self._send_text()
         elif name in _VIEWER_FILES:
-            self._send_viewer_file(name)
+            kind = "text/javascript" if name.endswith(".js") else "application/wasm"
+            with urllib.request.urlopen(f"{self._page.viewer_files}/{name}") as file:  # noqa: S310
+                self.send(HTTPStatus.OK, file.read(), kind)
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
-    def do_POST(self) -> None:
+    def post(self) -> None:
         """Receive an answer, or a key."""
         name = self._name()
-        content = self._content()
+        content = self.body()
         relay = self._page.relay
-        if name is None or content is None:
+        if name is None or isinstance(content, HTTPStatus):
             self.send_error(HTTPStatus.NOT_FOUND)
             return
         verb, _, rest = name.partition("/")
@@ -231,7 +223,7 @@ class _Handler(BaseHTTPRequestHandler):
             relay.answer(int(rest[:9]), content if verb == "answer" else None)
         elif verb == "key":
             relay.press(content[:16].decode(errors="replace"))
-        self._send(b"", "text/plain")
+        self.send(HTTPStatus.OK, b"", "text/plain")
 
     def _policy(self) -> str:
         """Limit the page to this machine; otherwise the viewer would send usage statistics."""
@@ -246,44 +238,16 @@ class _Handler(BaseHTTPRequestHandler):
         secret, _, name = self.path.removeprefix("/").partition("/")
         hosts = {f"{host}:{self._page.server_port}" for host in (HOST, "localhost")}
         is_ours = secrets.compare_digest(secret.encode(), self._page.secret.encode())
-        return name if is_ours and self.headers.get("Host") in hosts else None
-
-    def _content(self) -> bytes | None:
-        length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or len(length) > 9 or int(length) > _LIMIT:
-            self.close_connection = True
+        if not is_ours or self.host not in hosts or not self._page.admit(self.connection):
             return None
-        return self.rfile.read(int(length))
-
-    def _send_next(self) -> None:
-        number, request = self._page.relay.next()
-        self._send(request, "application/octet-stream", {"Number": str(number)})
+        self._page.give_time(self.connection, _SECONDS)
+        return name
 
     def _send_text(self) -> None:
-        try:
+        text = ""
+        with suppress(queue.Empty):
             text = self._page.relay.texts.get(timeout=_POLL_SECONDS)
-        except queue.Empty:
-            self._send(b"", "text/plain; charset=utf-8")
-        else:
-            self._send(text.encode(), "text/plain; charset=utf-8")
-
-    def _send_viewer_file(self, name: str) -> None:
-        kind = "text/javascript" if name.endswith(".js") else "application/wasm"
-        with urllib.request.urlopen(f"{self._page.viewer_files}/{name}") as file:  # noqa: S310
-            self._send(file.read(), kind)
-
-    def _send(self, content: bytes, kind: str, more: dict[str, str] | None = None) -> None:
-        self.send_response(HTTPStatus.OK)
-        headers = {
-            "Content-Type": kind,
-            "Content-Length": str(len(content)),
-            "Cache-Control": "no-store",
-            **(more or {}),
-        }
-        for key, value in headers.items():
-            self.send_header(key, value)
-        self.end_headers()
-        self.wfile.write(content)
+        self.send(HTTPStatus.OK, text.encode(), "text/plain; charset=utf-8")
 
 
 class _PageViewer(Viewer):
@@ -293,7 +257,7 @@ class _PageViewer(Viewer):
         super().__init__(process, server.url)
         self._relay = server.relay
         self._server = server
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        server.start()
 
     def state(self) -> ViewerState:
         state = self._ask(_STATE)
@@ -311,8 +275,7 @@ class _PageViewer(Viewer):
         self._relay.texts.put(text)
 
     def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+        self._server.end()
         super().close()
 
     def _blueprint(self) -> Blueprint:
