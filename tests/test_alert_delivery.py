@@ -285,9 +285,9 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
         own = AlertsOutput([], settings, home, tmp_path, said.append)
         own._outbox.put([Notification("it", now, "first", is_known=True, due=now)])
         wait_for(lambda: len(good) == 1)
-        before = own._lines.names
+        before = own._lines
         addresses(tmp_path, "# anna", f"{right}/?verify=no", typo)  # while it runs
-        wait_for(lambda: own._lines.names != before)
+        wait_for(lambda: own._lines != before)
         own.close()
         addresses(tmp_path, f"{right}/?verify=yes", typo, "# and while it does not")
         own = AlertsOutput([], settings, home, tmp_path, said.append)

@@ -8,7 +8,7 @@ import pytest
 from livehome import MINUTE, LiveHome, following
 from pydantic import TypeAdapter
 
-from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgress, RuleProgressStore
+from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressStore
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule, RuleState
 from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.settings import DeliverySettings
@@ -55,7 +55,7 @@ def test_a_silence_that_goes_on_when_it_is_judged_was_heard(part, tmp_path):
     state, told, said = tmp_path / "state", [], []
     (state / "alerts").mkdir(parents=True)
     until = now - 20 * MINUTE
-    progress = {"quiet": RuleProgress(until, RuleState(since=until))}
+    progress = {"quiet": RuleState(since=until, until=until)}
     RuleProgressStore(state / "alerts" / "rules.json", pytest.fail).save([rule], progress)
     home = LiveHome(tmp_path / "logs")
     write_nights(home.folder, home.classes, silent_since)

@@ -218,10 +218,9 @@ def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
     said = []
     path = tmp_path / "rules.json"
     memory = RuleProgressStore(path, said.append)
-    progress = memory.load([COUGHS])
-    progress["coughs"].until, progress["coughs"].state = 7, RuleState(5, has_rung=True)
+    progress = {"coughs": RuleState(5, has_rung=True, until=7)}
     memory.save([COUGHS], progress)
-    assert memory.load([COUGHS])["coughs"].state == RuleState(5, has_rung=True)
+    assert memory.load([COUGHS]) == progress
     changed = COUGHS.model_copy(update={"count": 3})
     assert memory.load([changed])["coughs"].until == 0
     assert said == []
@@ -233,9 +232,7 @@ def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
 def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
     said = []
     memory = RuleProgressStore(tmp_path / "rules.json", said.append)
-    progress = memory.load([COUGHS])
-    progress["coughs"].until = 9 * HOUR * SECOND
-    memory.save([COUGHS], progress)
+    memory.save([COUGHS], {"coughs": RuleState(until=9 * HOUR * SECOND)})
     outbox = Outbox(tmp_path / "box", ["x"], said.append)
     watch = RuleWatch([COUGHS], UTC, outbox, memory, said.append, HOUR * SECOND)
     assert watch.start < HOUR * SECOND

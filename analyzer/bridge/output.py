@@ -6,17 +6,15 @@ from datetime import tzinfo
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from hearthlog.analyzer.bridge.events import SoundEvent
 from hearthlog.analyzer.bridge.home import Today
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.state import BridgeError, StateFile
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.errors import HearthlogError
-from hearthlog.schemas.files import read_limited
+from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.new_files import replaced_file
 
 RECENT = 60 * NANOSECONDS  # after its end an event is no longer reported
 
@@ -54,7 +52,6 @@ class Output(Protocol):
 
 
 TOTALS = "totals.json"  # in the state folder
-_LIMIT = 1 << 20  # bytes
 
 
 class Total(NamedTuple):
@@ -66,11 +63,14 @@ class Total(NamedTuple):
     seconds: float
 
 
-class _Kept(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _Kept(BaseModel, extra="forbid"):
     time: int = Field(ge=0)
     totals: list[Total]
+
+
+def _totals_file(path: Path) -> StateFile[_Kept]:
+    damaged = "is damaged; delete it, and counts begin anew"
+    return StateFile(path, _Kept, lambda _: None, damaged)
 
 
 class Totals:
@@ -90,10 +90,13 @@ class Totals:
     """
 
     def __init__(self, path: Path, time: int) -> None:
-        self._path = path
-        self.time, self._kept = time, list[Total]()
-        if (kept := _read(path)) is not None:
-            self.time, self._kept = kept.time, kept.totals
+        self._file = _totals_file(path)
+        self._kept = self._file.read() or _Kept(time=time, totals=[])
+
+    @property
+    def time(self) -> int:
+        """Time before which events are in the file, in nanoseconds of UTC."""
+        return self._kept.time
 
     def count(self, state: HomeState, end: int | None = None) -> list[Total]:
         """Return the totals, sorted by microphone and class; 0 for classes without events.
@@ -103,7 +106,7 @@ class Totals:
         end : int, optional
             Count events that begin before this time, in nanoseconds of UTC; all by default.
         """
-        sums = {total[:2]: total for total in self._kept}
+        sums = {total[:2]: total for total in self._kept.totals}
         for microphone in state.every():
             known = (label for label in microphone.classes if label != SILENCE)
             for label in dict.fromkeys([*known, *microphone.labels()]):
@@ -128,26 +131,15 @@ class Totals:
             return
         kept = _Kept(time=time, totals=self.count(state, time))
         try:
-            with replaced_file(self._path) as temporary:
-                temporary.write_text(kept.model_dump_json(), encoding="utf-8")
-        except (OSError, HearthlogError) as error:
-            raise BridgeError(f"{self._path}: cannot be written ({error})") from error
-        self.time, self._kept = kept.time, kept.totals
+            self._file.write(kept)
+        except LogError as error:
+            raise BridgeError(f"{self._file.path}: cannot be written ({error})") from error
+        self._kept = kept
 
 
 def kept_until(path: Path, default: int) -> int:
     """Return the end of the totals in a file, in nanoseconds of UTC; `default` without a file."""
     with suppress(HearthlogError):
-        kept = _read(path)
+        kept = _totals_file(path).read()
         return default if kept is None else kept.time
     return default
-
-
-def _read(path: Path) -> _Kept | None:
-    if not path.exists():
-        return None
-    data = read_limited(path, "file of totals", _LIMIT, BridgeError)
-    try:
-        return _Kept.model_validate_json(data)
-    except ValidationError as error:
-        raise BridgeError(f"{path}: is damaged; delete it, and counts begin anew") from error

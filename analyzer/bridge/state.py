@@ -3,7 +3,11 @@
 import os
 import re
 import secrets
+from collections.abc import Callable
 from pathlib import Path
+from typing import Generic, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.files import read_limited
@@ -39,6 +43,75 @@ def state_folder(configured: Path | None, logs: Path) -> Path:
             f"{folder}: cannot be made ({error.strerror}); name another one: bridge.state"
         ) from error
     return folder
+
+
+Content = TypeVar("Content")
+_LARGEST = 4 << 20  # bytes of a file
+
+
+class StateFile(Generic[Content]):
+    """A JSON file of the state folder, checked when it is read and replaced atomically.
+
+    Parameters
+    ----------
+    kind : type
+        Type of the content, for pydantic.
+    damaged, unsaved : str
+        Consequence of a file that cannot be read, or written, for `say`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        kind: type[Content],
+        say: Callable[[str], None],
+        damaged: str,
+        unsaved: str = "",
+    ) -> None:
+        self.path = path
+        self._kind = TypeAdapter(kind)
+        self._say = say
+        self._damaged, self._unsaved = damaged, unsaved
+
+    def read(self) -> Content | None:
+        """Return the content; None if there is no file.
+
+        Raise `BridgeError` if the file is damaged.
+        """
+        if not self.path.exists():
+            return None
+        try:
+            return self._kind.validate_json(
+                read_limited(self.path, "file of the bridge", _LARGEST, BridgeError)
+            )
+        except ValidationError as error:
+            raise BridgeError(f"{self.path}: {self._damaged}") from error
+
+    def load(self) -> Content | None:
+        """Return the content; None if there is no file, or it is reported to be damaged."""
+        try:
+            return self.read()
+        except HearthlogError:
+            self.report_damage()
+            return None
+
+    def report_damage(self) -> None:
+        """Report that the file is damaged."""
+        self._say(f"{self.path}: {self._damaged}")
+
+    def save(self, content: Content) -> bool:
+        """Write the content, on disk on return; return False if the failure is reported."""
+        try:
+            self.write(content)
+        except LogError as error:
+            self._say(f"{error}; {self._unsaved}")
+            return False
+        return True
+
+    def write(self, content: Content) -> None:
+        """Write the content, on disk on return; raise `LogError` on a failure."""
+        with replaced_file(self.path) as temporary, create_file(temporary) as stream:
+            stream.write(self._kind.dump_json(content))
 
 
 _CREDENTIALS = "CREDENTIALS_DIRECTORY"  # of systemd

@@ -3,12 +3,10 @@
 import codecs
 import hashlib
 import importlib
-import json
 import logging
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import tzinfo
 from difflib import SequenceMatcher
 from pathlib import Path
@@ -16,29 +14,36 @@ from threading import Event as Flag
 from threading import Lock, Thread, get_ident
 from typing import Any, NamedTuple, Protocol
 
+from pydantic import BaseModel
+
 from hearthlog.analyzer.bridge.alerts.rules import Notification
-from hearthlog.analyzer.bridge.state import BridgeError, secret_path
+from hearthlog.analyzer.bridge.state import BridgeError, StateFile, secret_path
 from hearthlog.analyzer.extras import remedy
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.files import exposed_secret, read_limited
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.new_files import private_folder, replaced_file
+from hearthlog.schemas.new_files import private_folder
 
 MOST = 1000
 UNREAD = "?"  # stands for the target of an unreadable line, in place of a target name
 _UNREAD_LONGEST = 24 * 3600 * NANOSECONDS  # how long notifications wait for a fix of such a line
 _SUFFIX = ".json"
-_LONGEST = 1 << 16  # bytes of a notification
-_DAMAGED = (ValueError, TypeError, KeyError, RecursionError, HearthlogError)
 
 
-@dataclass
-class Waiting:
+class Waiting(BaseModel):
     """A queued notification, and the names of targets that have received it."""
 
-    notification: Notification
-    told: set[str] = field(default_factory=set)
+    rule: str
+    time: int
+    text: str
+    is_known: bool
+    due: int
+    told: set[str] = set()
+
+    @property
+    def notification(self) -> Notification:
+        """The notification."""
+        return Notification(self.rule, self.time, self.text, self.is_known, self.due)
 
 
 class Outbox:
@@ -66,7 +71,7 @@ class Outbox:
         self._waiting: dict[str, Waiting] = {}
         private_folder(folder)
         for path in sorted(folder.glob(f"*{_SUFFIX}")):
-            self._load(path)
+            self._load(path.name.removesuffix(_SUFFIX))
         self._early = frozenset(self._waiting)  # these may be evaluated again after a restart
 
     def __len__(self) -> int:
@@ -99,7 +104,7 @@ class Outbox:
 
     def _is_done(self, waiting: Waiting, now: int) -> bool:
         missing = self._targets - waiting.told
-        is_old = now - waiting.notification.time > _UNREAD_LONGEST
+        is_old = now - waiting.time > _UNREAD_LONGEST
         return not missing or (is_old and missing == {UNREAD})
 
     def put(self, notifications: Iterable[Notification]) -> None:
@@ -108,7 +113,7 @@ class Outbox:
             self._remove_done(time.time_ns())
             for notification in notifications:
                 if notification.id not in self._waiting and notification.id not in self._early:
-                    self._waiting[notification.id] = waiting = Waiting(notification)
+                    self._waiting[notification.id] = waiting = Waiting(**notification._asdict())
                     self._write(waiting)
             self._drop_oldest()
 
@@ -138,15 +143,13 @@ class Outbox:
     def forget_after(self, time: int) -> None:
         """Drop notifications later than a time: they were created while the clock was ahead."""
         with self._lock:
-            for name in [n for n, each in self._waiting.items() if each.notification.time > time]:
+            for name in [n for n, each in self._waiting.items() if each.time > time]:
                 self._remove(name)
 
     def _drop_oldest(self) -> None:
         number = len(self._waiting) - self._most
         if number > 0:
-            for name in sorted(
-                self._waiting, key=lambda each: self._waiting[each].notification.time
-            )[:number]:
+            for name in sorted(self._waiting, key=lambda each: self._waiting[each].time)[:number]:
                 self._remove(name)
             self._say(
                 f"{self._folder}: {self._most} alerts wait to be told, and the oldest are dropped; "
@@ -155,47 +158,35 @@ class Outbox:
 
     def _remove(self, name: str) -> None:
         del self._waiting[name]
+        path = self._file(name).path
         try:
-            self._path(name).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
         except OSError as error:
-            self._say(f"{self._path(name)}: cannot be removed ({error.strerror}); do so by hand")
+            self._say(f"{path}: cannot be removed ({error.strerror}); do so by hand")
 
     def _write(self, waiting: Waiting) -> None:
-        content = {**waiting.notification._asdict(), "told": sorted(waiting.told)}
-        path = self._path(waiting.notification.id)
-        try:
-            with replaced_file(path) as temporary:
-                temporary.write_text(json.dumps(content), "utf-8")
-        except LogError as error:
-            self._say(f"{error}; until it can, alerts are only kept in memory")
+        self._file(waiting.notification.id).save(waiting)
 
-    def _path(self, name: str) -> Path:
-        return self._folder / f"{name}{_SUFFIX}"
+    def _file(self, name: str) -> StateFile[Waiting]:
+        return StateFile(
+            self._folder / f"{name}{_SUFFIX}",
+            Waiting,
+            self._say,
+            "no alert that was kept here; remove it",
+            "until it can, alerts are only kept in memory",
+        )
 
-    def _load(self, path: Path) -> None:
-        try:
-            waiting = _waiting(json.loads(read_limited(path, "alert", _LONGEST, LogError)))
-            if waiting.notification.id != path.name.removesuffix(_SUFFIX):
-                raise ValueError
-        except _DAMAGED:
-            self._say(f"{path}: no alert that was kept here; remove it")
+    def _load(self, name: str) -> None:
+        file = self._file(name)
+        waiting = file.load()
+        if waiting is None:
             return
-        if waiting.told >= self._targets:
-            path.unlink(missing_ok=True)
+        if waiting.notification.id != name:
+            file.report_damage()
+        elif waiting.told >= self._targets:
+            file.path.unlink(missing_ok=True)
         else:
-            self._waiting[waiting.notification.id] = waiting
-
-
-def _waiting(content: Any) -> Waiting:
-    notification = Notification(**{name: content[name] for name in Notification._fields})
-    whole = isinstance(notification.time, int) and isinstance(notification.due, int)
-    if (
-        not whole
-        or not isinstance(notification.rule, str)
-        or not isinstance(notification.text, str)
-    ):
-        raise ValueError
-    return Waiting(notification, {str(name) for name in content["told"]})
+            self._waiting[name] = waiting
 
 
 _LIMIT = 1 << 16  # bytes of the file

@@ -503,7 +503,7 @@ def notifications(  # noqa: PLR0913, PLR0917
             found.append(_notification(rule, heard, condition, time, zone))
             last, rung = time, True
         has_rung = rung and condition.end >= end
-    return found, RuleState(last, has_rung, state.since)
+    return found, RuleState(last, has_rung, state.since, end)
 
 
 def _conditions(  # noqa: PLR0913, PLR0917

@@ -1,12 +1,11 @@
 """Alerts output: live evaluation of rules, with progress kept across restarts."""
 
-import json
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import replace
 from datetime import tzinfo
 from functools import cache
 from pathlib import Path
@@ -45,96 +44,32 @@ from hearthlog.analyzer.bridge.alerts.rules import (
 from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings
-from hearthlog.analyzer.bridge.state import BridgeError, secret_path
+from hearthlog.analyzer.bridge.state import BridgeError, StateFile, secret_path
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.files import read_limited
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import log_name
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.new_files import replaced_file
-
-_LIMIT = 1 << 20  # bytes
-_DAMAGED = (ValueError, TypeError, KeyError, AttributeError, RecursionError, HearthlogError)
-
-
-@dataclass
-class RuleProgress:
-    """Evaluation progress of a rule.
-
-    Attributes
-    ----------
-    until : int
-        Log time, in nanoseconds of UTC; 0 for a new rule.
-    """
-
-    until: int = 0
-    state: RuleState = field(default_factory=RuleState)
 
 
 class RuleProgressStore:
     """Persistent evaluation progress of each rule; a changed rule starts over."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        self._path = path
-        self._say = say
+        damaged = "cannot be read; all rules begin anew"
+        unsaved = "alerts may come twice after the next start"
+        self._file = StateFile(path, dict[str, RuleState], say, damaged, unsaved)
 
-    def load(self, rules: Sequence[AlertRule]) -> dict[str, RuleProgress]:
-        """Return the progress of rules by name."""
-        known = {}
-        try:
-            if self._path.exists():
-                content = json.loads(read_limited(self._path, "memory", _LIMIT, LogError))
-                known = {name: _progress(each) for name, each in content.items()}
-        except _DAMAGED:
-            self._say(f"{self._path}: cannot be read; all rules begin anew")
-        return {rule.name: known.get(rule.fingerprint, RuleProgress()) for rule in rules}
+    def load(self, rules: Sequence[AlertRule]) -> dict[str, RuleState]:
+        """Return the states of rules by name."""
+        known = self._file.load() or {}
+        return {rule.name: known.get(rule.fingerprint, RuleState()) for rule in rules}
 
-    def save(self, rules: Sequence[AlertRule], progress: dict[str, RuleProgress]) -> None:
-        """Save the progress of rules; it is on disk on return."""
-        content = {
-            rule.fingerprint: {"until": own.until, **own.state._asdict()}
-            for rule in rules
-            for own in [progress[rule.name]]
-        }
-        try:
-            with replaced_file(self._path) as temporary:
-                temporary.write_text(json.dumps(content), "utf-8")
-        except LogError as error:
-            self._say(f"{error}; alerts may come twice after the next start")
-
-
-class KnownLines:
-    """Persistent target names of the lines in the file of addresses."""
-
-    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        self._path = path
-        self._say = say
-        self.names: list[str] = []
-        try:
-            if path.exists():
-                content = json.loads(read_limited(path, "memory", _LIMIT, LogError))
-                self.names = [str(name) for name in content]
-        except _DAMAGED:
-            say(f"{path}: cannot be read; whoever is on an edited line may be told twice")
-
-    def keep(self, names: Sequence[str]) -> None:
-        """Save the current lines."""
-        if names == self.names:
-            return
-        self.names = list(names)
-        try:
-            with replaced_file(self._path) as temporary:
-                temporary.write_text(json.dumps(self.names), "utf-8")
-        except LogError as error:
-            self._say(f"{error}; whoever is on an edited line may be told twice")
-
-
-def _progress(content: dict[str, int]) -> RuleProgress:
-    state = RuleState(int(content["last"]), bool(content["has_rung"]), int(content["since"]))
-    return RuleProgress(int(content["until"]), state)
+    def save(self, rules: Sequence[AlertRule], states: Mapping[str, RuleState]) -> None:
+        """Save the states of rules; they are on disk on return."""
+        self._file.save({rule.fingerprint: states[rule.name] for rule in rules})
 
 
 _OLDEST = DAY  # notifications older than this are not delivered
@@ -214,13 +149,13 @@ class RuleWatch:
                 continue
             if isinstance(rule, DailyRule):
                 if not judged_days(rule, own.until, until, self._zone):
-                    own.until = until
+                    self._progress[rule.name] = replace(own, until=until)
                     continue
                 what = weeks(until - history(rule), until)
             else:
                 what = heard_once()
-            rang, state = notifications(rule, what, own.until, until, self._zone, own.state)
-            self._progress[rule.name] = RuleProgress(until, state)
+            rang, state = notifications(rule, what, own.until, until, self._zone, own)
+            self._progress[rule.name] = state
             found += rang
         self._outbox.put(found)
         if found or now - self._saved >= _SAVE_EVERY:
@@ -233,11 +168,11 @@ class RuleWatch:
         self._saved = now
 
 
-def _as_of(own: RuleProgress, now: int) -> RuleProgress:
+def _as_of(own: RuleState, now: int) -> RuleState:
     if own.until > now + AHEAD or not own.until:
-        return RuleProgress(now, RuleState(since=now))
+        return RuleState(since=now, until=now)
     if own.until < now - _OLDEST:
-        return RuleProgress(now - _OLDEST, own.state._replace(has_rung=False))
+        return replace(own, until=now - _OLDEST, has_rung=False)
     return own
 
 
@@ -292,7 +227,11 @@ class AlertsOutput:
             self._outbox = Outbox(folder / "outbox", [BROKER, UNREAD], say)
         except OSError as error:
             raise BridgeError(f"{folder}: cannot be used ({error.strerror})") from error
-        self._lines = KnownLines(folder / "lines.json", say)
+        twice = "whoever is on an edited line may be told twice"
+        self._lines_file = StateFile(
+            folder / "lines.json", list[str], say, f"cannot be read; {twice}", twice
+        )
+        self._lines = self._lines_file.load() or []  # target names of the file of addresses
         memory = RuleProgressStore(folder / "rules.json", say)
         now = self._latest = time.time_ns()
         self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
@@ -370,8 +309,10 @@ class AlertsOutput:
             self._say(f"alerts: {self._file}: every line of it can be read now")
         self._has_problems = bool(problems)
         if names:
-            self._outbox.replace_targets(replaced_names(self._lines.names, names))
-            self._lines.keep(names)
+            self._outbox.replace_targets(replaced_names(self._lines, names))
+            if names != self._lines:
+                self._lines = names
+                self._lines_file.save(names)
         told = [target.name for target in targets] + [UNREAD] * bool(problems)
         told += [BROKER] * (self._on_notification is not None)
         self._outbox.set_targets(told, time.time_ns())

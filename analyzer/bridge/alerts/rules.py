@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -308,23 +309,26 @@ class Notification(NamedTuple):
         return f"{self.time}-{hashlib.sha256(self.rule.encode()).hexdigest()[:12]}"
 
 
-class RuleState(NamedTuple):
-    """State of a rule between two evaluations.
+@dataclass(frozen=True)
+class RuleState:
+    """State of a rule between two evaluations; times in nanoseconds of UTC.
 
     Attributes
     ----------
     last : int
-        Time of the last notification, in nanoseconds of UTC.
+        Time of the last notification.
     has_rung : bool
         Whether the condition at the end of the evaluation has given its notification.
     since : int
-        When the rule came into force, in nanoseconds of UTC: whether there was a recorder before is
-        unknown.
+        When the rule came into force: whether there was a recorder before is unknown.
+    until : int
+        End of the evaluation; 0 for a new rule.
     """
 
     last: int = _NEVER
     has_rung: bool = False
     since: int = _NEVER
+    until: int = 0
 
 
 class Condition(NamedTuple):

@@ -10,17 +10,11 @@ from threading import Lock
 from typing import NamedTuple, Protocol
 from urllib.parse import quote, unquote
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel
 
 from hearthlog.analyzer.bridge.events import SoundEvent
-from hearthlog.schemas.errors import HearthlogError, LogError
-from hearthlog.schemas.files import read_limited
-from hearthlog.schemas.new_files import (
-    create_file,
-    open_lock,
-    private_folder,
-    replaced_file,
-)
+from hearthlog.analyzer.bridge.state import StateFile
+from hearthlog.schemas.new_files import open_lock, private_folder
 
 _CLASS_PART = "/class/"
 _KEPT = "".join(chr(code) for code in range(33, 127) if chr(code) not in "%+#/$")
@@ -113,12 +107,10 @@ def identifier(text: str) -> str:
 
 
 _PREFIX, _SUFFIX = "mqtt-", ".json"  # around the name of the recorder
-_LIMIT = 4 << 20  # bytes
+_UNSAVED = "topics that go are not cleared after the next start"
 
 
-class _Content(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _Content(BaseModel, extra="forbid"):
     broker: str = ""
     topics: dict[str, Place] = {}
     muted: list[str] = []
@@ -141,7 +133,7 @@ class RetainedTopics:
         say: Callable[[str], None],
     ) -> None:
         self.path = folder / f"{_PREFIX}{node}{_SUFFIX}"
-        self._say = say
+        self._report = say
         self._lock = Lock()
         self._is_changed = False
         self._descriptor = self._take_lock(folder)
@@ -155,14 +147,14 @@ class RetainedTopics:
                     self._take_over(path)
         sources = [*self._former, *([self.path] if has_own else [])]
         self.is_new = self._descriptor is None or not sources
-        contents = [] if self.is_new else [self._load(source) for source in sources]
+        contents = [] if self.is_new else [self._file(source).load() for source in sources]
         self._is_changed = bool(self._former)
         self._broker = broker
         self.topics: dict[str, Place] = {}
         # Kept if the broker's address changes: it may be the same broker; a new one has no topics.
         self._muted: set[str] = set()
         self._last_events: dict[str, str] = {}
-        for each in contents:
+        for each in filter(None, contents):
             self.topics |= each.topics
             self._muted.update(each.muted)
             self._last_events |= each.last_events
@@ -238,12 +230,8 @@ class RetainedTopics:
                 last_events=self._last_events,
             )
             self._is_changed = self.is_new = False
-            try:
-                with replaced_file(self.path) as temporary, create_file(temporary) as stream:
-                    stream.write(content.model_dump_json().encode())
+            if self._file(self.path).save(content):
                 self._remove_former()
-            except (LogError, OSError) as error:
-                self._say(f"mqtt: {error}; topics that go are not cleared after the next start")
 
     def close(self) -> None:
         """Save changes, and release the lock for other bridges."""
@@ -253,6 +241,9 @@ class RetainedTopics:
                 os.close(descriptor)
         self._former.clear()
         self._descriptor = None
+
+    def _say(self, text: str) -> None:
+        self._report(f"mqtt: {text}")
 
     def _take_over(self, path: Path) -> None:
         """Lock the record of a former name, unless another bridge uses it."""
@@ -269,7 +260,11 @@ class RetainedTopics:
         """Delete the adopted records, and only then release their locks."""
         while self._former:
             path = next(iter(self._former))
-            path.unlink(missing_ok=True)
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                self._say(f"{error}; {_UNSAVED}")
+                return
             os.close(self._former.pop(path))
 
     def _take_lock(self, folder: Path) -> int | None:
@@ -277,26 +272,22 @@ class RetainedTopics:
             private_folder(folder)
             descriptor = open_lock(_lock_path(self.path))
         except OSError as error:
-            self._say(f"mqtt: {folder}: cannot be used ({error.strerror}); nothing is remembered")
+            self._say(f"{folder}: cannot be used ({error.strerror}); nothing is remembered")
             return None
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(descriptor)
             self._say(
-                f"mqtt: {folder}: is used by another bridge; nothing is remembered: give each one "
+                f"{folder}: is used by another bridge; nothing is remembered: give each one "
                 "a `state` of its own in [bridge]"
             )
             return None
         return descriptor
 
-    def _load(self, path: Path) -> _Content:
-        try:
-            data = read_limited(path, "memory of what was published", _LIMIT, LogError)
-            return _Content.model_validate_json(data)
-        except (HearthlogError, ValidationError):
-            self._say(f"mqtt: {path}: cannot be read, and begins anew; all classes are told of")
-            return _Content()
+    def _file(self, path: Path) -> StateFile[_Content]:
+        damaged = "cannot be read, and begins anew; all classes are told of"
+        return StateFile(path, _Content, self._say, damaged, _UNSAVED)
 
 
 def _lock_path(path: Path) -> Path:
