@@ -9,6 +9,8 @@ from hearthlog._version import __version__
 from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, Place, Topics, identifier
 from hearthlog.models.classes import SILENCE, in_words
 
+Component = dict[str, Any]  # of a discovery payload, as Home Assistant defines it
+
 _BY = "Home Assistant"
 _PAUSE_MINUTES = 60
 _OF_SOUND = {"level", "recorder", "problem"}  # of the microphone, not of a model
@@ -70,35 +72,28 @@ def command_discovery(
         Former classes, whose switches are removed.
     """
     own = home_id(topics.node)
-    command = {"command_topic": topics.of_home("command")}
-    components: dict[str, dict[str, Any]] = {
-        "pause": {
-            "p": "button",
-            "name": "Pause for an hour",
-            "payload_press": _command(pause_minutes=_PAUSE_MINUTES),
-            "icon": "mdi:microphone-off",
-            **command,
-        },
-        "resume": {
-            "p": "button",
-            "name": "Listen again",
-            "payload_press": _command(resume=True),
-            "icon": "mdi:microphone",
-            **command,
-        },
+    command = topics.of_home("command")
+
+    def button(name: str, icon: str, **fields: Any) -> Component:
+        press = _command(**fields)
+        return _entity("button", name, payload_press=press, icon=icon, command_topic=command)
+
+    components = {
+        "pause": button("Pause for an hour", "mdi:microphone-off", pause_minutes=_PAUSE_MINUTES),
+        "resume": button("Listen again", "mdi:microphone", resume=True),
     }
     for name, words in _words([name for name in classes if name != SILENCE]).items():
-        components[f"told_{identifier(name)}"] = {
-            "p": "switch",
-            "name": f"Tell of {words}",
-            "entity_category": "config",
-            "state_topic": topics.of_told(name),
-            "state_on": "ON",
-            "state_off": "OFF",
-            "payload_on": _command(told=True, label=name),
-            "payload_off": _command(told=False, label=name),
-            **command,
-        }
+        components[f"told_{identifier(name)}"] = _entity(
+            "switch",
+            f"Tell of {words}",
+            entity_category="config",
+            state_topic=topics.of_told(name),
+            state_on="ON",
+            state_off="OFF",
+            payload_on=_command(told=True, label=name),
+            payload_off=_command(told=False, label=name),
+            command_topic=command,
+        )
     for key, component in components.items():
         component["unique_id"] = f"{own}-{key}"
     components |= {f"told_{identifier(name)}": {"p": "switch"} for name in gone}
@@ -150,75 +145,63 @@ def _command(**fields: Any) -> str:
     return json.dumps({**fields, "by": _BY})
 
 
-def _of_microphone(
-    topics: Topics, microphone: str, sounds: Sequence[str]
-) -> dict[str, dict[str, Any]]:
+def _entity(platform: str, name: str, **fields: Any) -> Component:
+    return {"p": platform, "name": name, **fields}
+
+
+def _of_microphone(topics: Topics, microphone: str, sounds: Sequence[str]) -> dict[str, Component]:
     def at(kind: str) -> str:
         return topics.of_microphone(microphone, kind)
 
-    always = {"availability": [{"topic": topics.of_home("bridge")}]}
+    def diagnostic(name: str, device_class: str, topic: str, **fields: Any) -> Component:
+        fields = {
+            "device_class": device_class,
+            "entity_category": "diagnostic",
+            "state_topic": topic,
+            **fields,
+            "availability": [{"topic": topics.of_home("bridge")}],
+        }
+        return _entity("binary_sensor", name, **fields)
+
+    online = {"payload_on": "online", "payload_off": "offline"}
     return {
-        "heard": {
-            "p": "sensor",
-            "name": "Heard",
-            # No `options`: if a new model lacks the displayed class, Home Assistant would fail and
-            # accept no further discovery. No confidence: every change would be stored.
-            "state_topic": at("heard"),
-            "value_template": "{{ value_json.label }}",
-            "icon": "mdi:ear-hearing",
-        },
-        "sound": {
-            "p": "binary_sensor",
-            "name": "Any sound",
-            "device_class": "sound",
-            "state_topic": at("sound"),
-        },
-        "level": {
-            "p": "sensor",
-            "name": "Level",
-            "unit_of_measurement": "dBFS",
-            "state_class": "measurement",
-            "state_topic": at("level"),
-            "suggested_display_precision": 0,
-            "icon": "mdi:volume-high",
-        },
-        "event": {
-            "p": "event",
-            "name": "Event",
-            "event_types": list(sounds),
-            "state_topic": at("event"),
-            "icon": "mdi:waveform",
-        },
-        "listening": {
-            "p": "binary_sensor",
-            "name": "Listening",
-            "device_class": "connectivity",
-            "entity_category": "diagnostic",
-            "state_topic": at("listening"),
-            "payload_on": "online",
-            "payload_off": "offline",
-            **always,
-        },
-        "recorder": {
-            "p": "binary_sensor",
-            "name": "Recorder",
-            "device_class": "connectivity",
-            "entity_category": "diagnostic",
-            "state_topic": topics.of_home("recorder"),
-            "payload_on": "online",
-            "payload_off": "offline",
-            **always,
-        },
-        "problem": {
-            "p": "binary_sensor",
-            "name": "Problem",
-            "device_class": "problem",
-            "entity_category": "diagnostic",
-            "state_topic": at("problem"),
-            "value_template": "{{ value_json.state }}",
-            "json_attributes_topic": at("problem"),
-            **always,
-        },
+        # No `options`: if a new model lacks the displayed class, Home Assistant would fail and
+        # accept no further discovery. No confidence: every change would be stored.
+        "heard": _entity(
+            "sensor",
+            "Heard",
+            state_topic=at("heard"),
+            value_template="{{ value_json.label }}",
+            icon="mdi:ear-hearing",
+        ),
+        "sound": _entity(
+            "binary_sensor", "Any sound", device_class="sound", state_topic=at("sound")
+        ),
+        "level": _entity(
+            "sensor",
+            "Level",
+            unit_of_measurement="dBFS",
+            state_class="measurement",
+            state_topic=at("level"),
+            suggested_display_precision=0,
+            icon="mdi:volume-high",
+        ),
+        "event": _entity(
+            "event",
+            "Event",
+            event_types=list(sounds),
+            state_topic=at("event"),
+            icon="mdi:waveform",
+        ),
+        "listening": diagnostic("Listening", "connectivity", at("listening"), **online),
+        "recorder": diagnostic("Recorder", "connectivity", topics.of_home("recorder"), **online),
+        "problem": diagnostic(
+            "Problem",
+            "problem",
+            at("problem"),
+            value_template="{{ value_json.state }}",
+            json_attributes_topic=at("problem"),
+        ),
     }
 
 
@@ -229,37 +212,21 @@ def _words(names: Sequence[str]) -> dict[str, str]:
     return {name: said if times[said] == 1 else f"{said} ({name})" for name, said in words.items()}
 
 
-def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[str, dict[str, Any]]:
-    key = identifier(name)
-
+def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[str, Component]:
     def at(kind: str) -> str:
         return topics.of_class(microphone, name, kind)
 
-    def count(kind: str, what: str) -> dict[str, Any]:
-        return {
-            "p": "sensor",
-            "name": f"{words} {what}",
-            "state_class": "total_increasing",
-            "state_topic": at(kind),
-            "icon": "mdi:counter",
-        }
+    def count(kind: str, what: str) -> Component:
+        fields = {"state_class": "total_increasing", "state_topic": at(kind), "icon": "mdi:counter"}
+        return _entity("sensor", f"{words} {what}", **fields)
 
-    return {
-        f"on_{key}": {
-            "p": "binary_sensor",
-            "name": words,
-            "device_class": "sound",
-            "state_topic": at("on"),
-        },
-        f"count_today_{key}": count("count_today", "today"),
-        f"count_night_{key}": count("count_night", "last night"),
-        f"last_heard_{key}": {
-            "p": "sensor",
-            "name": f"{words} last heard",
-            "device_class": "timestamp",
-            "state_topic": at("last_heard"),
-        },
-        f"trigger_{key}": {
+    last = {"device_class": "timestamp", "state_topic": at("last_heard")}
+    components = {
+        "on": _entity("binary_sensor", words, device_class="sound", state_topic=at("on")),
+        "count_today": count("count_today", "today"),
+        "count_night": count("count_night", "last night"),
+        "last_heard": _entity("sensor", f"{words} last heard", **last),
+        "trigger": {
             "p": "device_automation",
             "automation_type": "trigger",
             "topic": topics.of_microphone(microphone, "event"),
@@ -269,6 +236,7 @@ def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[st
             "payload": _untemplated(name),
         },
     }
+    return {f"{kind}_{identifier(name)}": each for kind, each in components.items()}
 
 
 def _untemplated(text: str) -> str:
