@@ -68,14 +68,15 @@ def source_name(microphone: str, scenario: str) -> str:
     return f"{microphone}{_BETWEEN}{scenario}"
 
 
+def source_parts(source: str) -> tuple[str, str]:
+    """Return microphone and scenario of a labelling source; no scenario for the home's model."""
+    microphone, _, scenario = source.partition(_BETWEEN)
+    return microphone, scenario
+
+
 def source_microphone(source: str) -> str:
     """Return the microphone of a labelling source."""
-    return source.partition(_BETWEEN)[0]
-
-
-def source_scenario(source: str) -> str:
-    """Return the scenario of a labelling source; empty for the model of the home."""
-    return source.partition(_BETWEEN)[2]
+    return source_parts(source)[0]
 
 
 def is_of_scenario(source: str) -> bool:

@@ -3,8 +3,9 @@
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from secrets import compare_digest
@@ -18,10 +19,8 @@ from prometheus_client.registry import Collector
 from hearthlog.analyzer.bridge.home import (
     RecorderAddress,
     is_of_scenario,
-    source_microphone,
-    source_scenario,
+    source_parts,
 )
-from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.bridge.output import TOTALS, News, Total, Totals
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.state import BridgeError, figures_token
@@ -34,8 +33,6 @@ _EVERY_SECONDS, _STALE_SECONDS = 10.0, 60.0
 _LATER = 12 * 3600 * NANOSECONDS  # longest delay from the start of an event to its message
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 _READERS = {"owner": 0, "group": 0o040, "all": 0o044}
-_LABELS = ("node", "microphone", "label")
-_LABELS_OF_SCENARIOS = ("node", "microphone", "scenario", "label")
 
 
 class PrometheusOutput:
@@ -186,68 +183,52 @@ class _Figures(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield each metric, by microphone and class."""
         node, state = self._home.node, self._news.state
-        of_home = [total for total in self._totals if not is_of_scenario(total.microphone)]
-        yield from _counters("", _LABELS, [((node, *one[:2]), one) for one in of_home])
-        of_scenarios = [
-            ((node, source_microphone(name), source_scenario(name), one.label), one)
-            for one in self._totals
-            if is_of_scenario(name := one.microphone)
-        ]
-        if of_scenarios:
-            yield from _counters("scenario_", _LABELS_OF_SCENARIOS, of_scenarios)
-        yield _gauge("recording", "Whether the recorder writes.", [((node,), state.is_recording())])
-        yield from self._of_microphones()
-        yield _gauge(
+        for of, labels in ("", ("microphone",)), ("scenario_", ("microphone", "scenario")):
+            own = {
+                (node, *source_parts(one.microphone)[: len(labels)], one.label): one
+                for one in self._totals
+                if is_of_scenario(one.microphone) == bool(of)
+            }
+            if own or not of:
+                counter = partial(_metric, CounterMetricFamily, labels=("node", *labels, "label"))
+                events = {names: one.events for names, one in own.items()}
+                yield counter(f"{of}events", "Events of a class, from the log.", events)
+                seconds = {names: one.seconds for names, one in own.items()}
+                yield counter(f"{of}event_seconds", "Seconds that a class was heard.", seconds)
+        of_home = partial(_metric, GaugeMetricFamily, labels=("node",))
+        of_microphone = partial(_metric, GaugeMetricFamily, labels=("node", "microphone"))
+        present = {(node, each.name): each for each in state.present()}
+        listening = {names: each.is_listening() for names, each in present.items()}
+        levels = {n: each.level_dbfs if listening[n] else math.nan for n, each in present.items()}
+        newest = {names: each.heard.time / NANOSECONDS for names, each in present.items()}
+        problems = {(node, subject): health.level for subject, health in state.health.items()}
+        yield of_home("recording", "Whether the recorder writes.", {(node,): state.is_recording()})
+        yield of_microphone("listening", "Whether labels come.", listening)
+        yield of_microphone("level_dbfs", "Mean level of ten seconds.", levels)
+        yield of_microphone(
+            "last_label_timestamp_seconds", "When the newest label was known.", newest
+        )
+        yield _metric(
+            GaugeMetricFamily,
             "problem",
             "Level of what the recorder says of a thing: 0 is well, 1 a warning, 2 an error.",
-            [((node, subject), health.level) for subject, health in state.health.items()],
-            "subject",
+            problems,
+            labels=("node", "subject"),
         )
         with suppress(OSError):  # the disk is missing
             free = shutil.disk_usage(self._home.folder).free
-            yield _gauge("free_bytes", "Of the disk of the logs.", [((node,), free)])
-
-    def _of_microphones(self) -> Iterator[Metric]:
-        node = self._home.node
-        microphones = self._news.state.present()
-
-        def each(value: Callable[[Any], float]) -> list[tuple[tuple[str, ...], float]]:
-            return [((node, microphone.name), value(microphone)) for microphone in microphones]
-
-        def level(microphone: LiveMicrophone) -> float:
-            return microphone.level_dbfs if microphone.is_listening() else math.nan
-
-        yield _gauge(
-            "listening", "Whether labels come.", each(lambda m: m.is_listening()), "microphone"
-        )
-        yield _gauge("level_dbfs", "Mean level of ten seconds.", each(level), "microphone")
-        yield _gauge(
-            "last_label_timestamp_seconds",
-            "When the newest label was known.",
-            each(lambda m: m.heard.time / NANOSECONDS),
-            "microphone",
-        )
+            yield of_home("free_bytes", "Of the disk of the logs.", {(node,): free})
 
 
-def _counters(
-    of: str, labels: Sequence[str], totals: Iterable[tuple[Sequence[str], Total]]
-) -> Iterator[Metric]:
-    events = CounterMetricFamily(
-        f"hearthlog_{of}events", "Events of a class, from the log.", labels=labels
-    )
-    seconds = CounterMetricFamily(
-        f"hearthlog_{of}event_seconds", "Seconds that a class was heard.", labels=labels
-    )
-    for names, total in totals:
-        events.add_metric(names, total.events)
-        seconds.add_metric(names, total.seconds)
-    yield from (events, seconds)
-
-
-def _gauge(
-    name: str, text: str, values: Iterable[tuple[tuple[str, ...], float]], *labels: str
+def _metric(
+    kind: type[CounterMetricFamily | GaugeMetricFamily],
+    name: str,
+    text: str,
+    values: Mapping[Any, float],
+    *,
+    labels: tuple[str, ...],
 ) -> Metric:
-    family = GaugeMetricFamily(f"hearthlog_{name}", text, labels=("node", *labels))
-    for names, value in values:
+    family = kind(f"hearthlog_{name}", text, labels=labels)
+    for names, value in values.items():
         family.add_metric(names, float(value))
     return family

@@ -21,7 +21,7 @@ from hearthlog.analyzer.bridge.home import (
     reason,
     room,
     source_microphone,
-    source_scenario,
+    source_parts,
     sureness,
     times,
     told,
@@ -259,7 +259,7 @@ def scenario_lines(news: News) -> list[Any]:
         today = _today(own, midnight)
         if own.is_listening() or today:
             where = [room(source_microphone(name))] if len(state.microphones) > 1 else []
-            what = " · ".join([room(source_scenario(name)), *where])
+            what = " · ".join([room(source_parts(name)[1]), *where])
             lines.append({"what": what, "about": f"Now {_now(own)}. Today {today or 'nothing'}."})
     return lines
 
