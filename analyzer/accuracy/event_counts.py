@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import Spans, joined, lengths
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined, lengths
 from hearthlog.models.classes import COUGHING, CRYING, LAUGHING, SILENCE, YELLING
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
@@ -15,7 +15,6 @@ from hearthlog.schemas.frames import NANOSECONDS
 MINUTE = 60 * NANOSECONDS
 SET_APART = (COUGHING, CRYING, LAUGHING, YELLING)  # which also occur on a television
 AROUND = 10  # minutes before and after, in which a television would still be on
-_PAUSE = 10 * NANOSECONDS
 _ALONE = (SILENCE, COUGHING, CRYING, YELLING)  # long crying is no television
 _SHARE = 0.1  # of the time
 _CHANGES = 2  # in a minute
@@ -24,7 +23,7 @@ _CHANGES = 2  # in a minute
 def events_of(labels: Labelling, name: str) -> Spans:
     """Return the events of a class: its spans, merged across pauses of at most ten seconds."""
     own = labels.labels == name
-    return joined(labels.starts[own], labels.ends[own], _PAUSE)
+    return joined(labels.starts[own], labels.ends[own], EVENT_PAUSE)
 
 
 def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:

@@ -7,12 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS
-
-PAUSE_SECONDS = 10  # longest pause between the segments of one event, as in the report
-
 
 _MOST_AGAIN = 50  # segments that a recorder may write twice after its disk was full
 
@@ -106,7 +104,7 @@ def _start(event: SoundEvent) -> int:
 
 
 def _goes_on(event: SoundEvent, start: int) -> bool:
-    return event.start <= start <= event.end + PAUSE_SECONDS * NANOSECONDS
+    return event.start <= start <= event.end + EVENT_PAUSE
 
 
 ANY_SOUND = ""  # in place of a class: everything except silence

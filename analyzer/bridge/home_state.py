@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.bridge.events import PAUSE_SECONDS, ActiveClasses, EventRecord, SoundEvent
+from hearthlog.analyzer.bridge.events import ActiveClasses, EventRecord, SoundEvent
 from hearthlog.analyzer.bridge.home import RecorderAddress, Today, is_of_scenario, labelling_source
-from hearthlog.analyzer.logs.spans import joined
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -34,7 +34,7 @@ FIELDS = {
     message_types.GAP: ("header.stamp", "duration"),
 }
 _AWAY_SECONDS = 15.0  # without messages
-_DECIDED = (PAUSE_SECONDS + 5) * NANOSECONDS  # after the end of an event, no segment extends it
+_DECIDED = EVENT_PAUSE + 5 * NANOSECONDS  # after the end of an event, no segment extends it
 _MOST_CLASSES = 256
 MOST = 0.75  # least coverage of a night for a count of 0, as in the report
 

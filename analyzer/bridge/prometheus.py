@@ -24,13 +24,13 @@ from hearthlog.analyzer.bridge.home import (
 from hearthlog.analyzer.bridge.output import TOTALS, News, Total, Totals
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.state import BridgeError, figures_token
+from hearthlog.analyzer.logs.spans import SEGMENT_DELAY
 from hearthlog.analyzer.network import HOST, HttpHandler, HttpServer, is_asked_in_digits
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import create_file, replaced_file
 
 _EVERY_SECONDS, _STALE_SECONDS = 10.0, 60.0
-_LATER = 12 * 3600 * NANOSECONDS  # longest delay from the start of an event to its message
 _TEXT = "text/plain; version=0.0.4; charset=utf-8"
 _READERS = {"owner": 0, "group": 0o040, "all": 0o044}
 
@@ -83,7 +83,7 @@ class PrometheusOutput:
             return
         self._due = time.monotonic() + _EVERY_SECONDS
         self._open_port()
-        self.totals.keep(news.state, min(news.today.midnight, news.today.night) - _LATER)
+        self.totals.keep(news.state, min(news.today.midnight, news.today.night) - SEGMENT_DELAY)
         registry = CollectorRegistry()
         registry.register(_Figures(news, self._home, self.totals.count(news.state)))
         text = generate_latest(registry)

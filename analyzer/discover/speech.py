@@ -34,7 +34,7 @@ from hearthlog.analyzer.discover.voices import (
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.selection import array_names, checked_array_names
-from hearthlog.analyzer.logs.spans import Spans, joined, rows_at
+from hearthlog.analyzer.logs.spans import NEVER, Spans, joined, rows_at
 from hearthlog.analyzer.marks.enrol import Enrolled, cut_path, enrol_log
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.speakers import APART, is_voice
@@ -200,7 +200,6 @@ def _is_louder(own: SpeechFrames, counts: Int64, other: SpeechFrames, *, or_as_l
 
 
 _FIELDS = {"header.stamp", "values", "duration", "label", "probabilities"}
-_NEVER = 1 << 62
 _PAUSE = 30 * NANOSECONDS  # between conversations
 _MOST_FRAMES = 6_000  # per conversation, or enrolled voice: five minutes
 LEAST_SECONDS = 20.0  # of speech needed to search for voices
@@ -262,7 +261,7 @@ def read_speech(
         Receives the share of the logs read, 0 to 1.
     """
     reader = _Reader(start, end)
-    entries = home.between(start or 0, end or _NEVER)
+    entries = home.between(start or 0, end or NEVER)
     read_each(entries, reader.read, reader.losses, progress)
     return reader.speech(home.losses)
 

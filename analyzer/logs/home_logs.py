@@ -18,6 +18,7 @@ from hearthlog.analyzer.logs.recorder_info import (
     microphones_of,
     models_of,
 )
+from hearthlog.analyzer.logs.spans import NEVER
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, RELABEL_LAYER, log_name, time_span
@@ -25,7 +26,6 @@ from hearthlog.schemas.logs.metadata import recorded_scenarios
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 
-_NEVER = 1 << 62
 _TAIL = 60 * NANOSECONDS  # a complete day may lack this much at its end
 
 
@@ -218,7 +218,7 @@ def _entry(path: Path) -> HomeLog | None:
         return None
     try:
         moment = datetime.strptime(time.partition("_")[0], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
-        return HomeLog(path, node, layer, int(moment.timestamp()) * NANOSECONDS, _NEVER)
+        return HomeLog(path, node, layer, int(moment.timestamp()) * NANOSECONDS, NEVER)
     except ValueError:
         span = time_span(path)
         return None if span is None else HomeLog(path, "", layer, span[0], span[1] + 1)
@@ -232,9 +232,9 @@ def _closed(entries: Iterable[HomeLog]) -> Iterator[HomeLog]:
     for same in by_kind.values():
         same.sort(key=lambda entry: entry.start)
         starts = sorted({entry.start for entry in same})
-        following = dict(zip(starts, [*starts[1:], _NEVER], strict=True))
+        following = dict(zip(starts, [*starts[1:], NEVER], strict=True))
         for entry in same:
-            yield entry if entry.end < _NEVER else entry._replace(end=following[entry.start])
+            yield entry if entry.end < NEVER else entry._replace(end=following[entry.start])
 
 
 _MOST = 4  # maximum number of changes in a text

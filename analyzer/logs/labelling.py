@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import find_with_layers
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.spans import joined, one, pieces, remains
+from hearthlog.analyzer.logs.spans import NEVER, joined, one, pieces, remains
 from hearthlog.models.classes import CLASS_NAME, class_name, translation
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -140,7 +140,6 @@ def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
 
 
 LABEL_FIELDS = {"header.stamp", "novelty", "probabilities"}
-_EVER = 1 << 62  # nanoseconds
 
 
 class LabelledFile(NamedTuple):
@@ -352,7 +351,7 @@ class Labellings:
         if not parts:
             return None
         whole = labelling_of(join(parts))
-        span = one(-_EVER if start is None else start, _EVER if end is None else end)
+        span = one(-NEVER if start is None else start, NEVER if end is None else end)
         spans, rows, _ = pieces(whole, span)
         return Labelling(*spans, whole.labels[rows]) if len(rows) else None
 

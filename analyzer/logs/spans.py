@@ -7,6 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.frames import NANOSECONDS
+
+NEVER = 1 << 62  # later than every time, in nanoseconds
+EVENT_PAUSE = 10 * NANOSECONDS  # longest pause between the spans of one event
+# A segment is logged when it ends: a long silence hours after it began.
+SEGMENT_DELAY = 12 * 3600 * NANOSECONDS
 
 Rows = NDArray[np.intp]
 

@@ -20,7 +20,7 @@ from hearthlog.analyzer.logs.labelling import (
 )
 from hearthlog.analyzer.logs.recorder_info import Trouble, gaps_of, troubles_of
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.spans import Spans, common, joined, one
+from hearthlog.analyzer.logs.spans import SEGMENT_DELAY, Spans, common, joined, one
 from hearthlog.analyzer.marks.label_files import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import CLASS_NAME, OF_EVERY_SCENARIO, OTHER, class_name
@@ -41,7 +41,6 @@ from hearthlog.schemas.messages.topics import (
     relabelling,
 )
 
-_LATE = 12 * 3600 * NANOSECONDS  # segments are logged when they end, so a long silence arrives late
 _FIELDS = {"header.stamp", "duration", "label"}
 _OF_GAPS = {"header.stamp", "duration", "reason"}
 Source = tuple[str, str]  # node, microphone
@@ -103,9 +102,9 @@ def read_home(
     name = labelling if labelling == LIVE else relabelling(labelling)
     topics = {labelling_topic(microphone, name, "segment") for microphone in microphones}
     parts: dict[Source, list[Columns]] = {}
-    labelled = logs.between(since, close[1] + _LATE, layer)
+    labelled = logs.between(since, close[1] + SEGMENT_DELAY, layer)
     for i, entry in enumerate(labelled):
-        for columns in _segments(home, entry, topics, (since, close[1] + _LATE)):
+        for columns in _segments(home, entry, topics, (since, close[1] + SEGMENT_DELAY)):
             parts.setdefault((entry.node, microphone_of(columns.topic)), []).append(columns)
         progress((i + 1) / len(labelled))
     for source in sorted(parts):
@@ -163,7 +162,7 @@ def _read_late_gaps(home: HomeData, logs: HomeLogs, end: int) -> None:
     """Read gaps that end after the reported days, from later logs."""
     later = [entry for entry in logs.between(end) if entry.start >= end]
     for number, entry in enumerate(later):
-        if number and entry.start > end + _LATE:
+        if number and entry.start > end + SEGMENT_DELAY:
             return
         try:
             topics = select([entry.path]).topics_of(message_types.GAP, _OF_GAPS)
@@ -297,7 +296,7 @@ def read_scenario_minutes(
     """
     found: dict[str, list[Counter[str]]] = {}
     start, end = days[0][0], days[-1][1]
-    for entry in logs.between(start, end + _LATE):
+    for entry in logs.between(start, end + SEGMENT_DELAY):
         try:
             selection = select([entry.path])
             topics = [
@@ -305,7 +304,7 @@ def read_scenario_minutes(
                 for topic in selection.topics_of(message_types.SEGMENT, _FIELDS)
                 if (name := parse_topic(topic)) is not None and is_scenario(name.labelling)
             ]
-            columns = read_columns([entry.path], topics, start, end + _LATE, _FIELDS)
+            columns = read_columns([entry.path], topics, start, end + SEGMENT_DELAY, _FIELDS)
         except LogError as error:
             lose(str(error))
             continue

@@ -16,6 +16,7 @@ from hearthlog.analyzer.accuracy.event_counts import (
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import (
+    EVENT_PAUSE,
     NONE,
     Spans,
     common,
@@ -85,7 +86,6 @@ _LEAST_BESIDE = 0.9  # recorded share before the first, or after the last, busy 
 _ONE = timedelta(days=1)
 _RISING = 4  # o'clock: earlier activity belongs to the previous day
 _BUSY, _HALF_HOUR = 5, 30 * MINUTE  # number of sounds that start in a busy half hour
-_PAUSE = 10 * NANOSECONDS
 
 
 class DayFigure(NamedTuple):
@@ -171,7 +171,7 @@ class Profiles:
         self._coverage = joined(labels.starts, labels.ends)
         loud = labels.labels != SILENCE
         self._sound = joined(labels.starts[loud], labels.ends[loud])
-        self._starts = joined(*self._sound, _PAUSE).starts
+        self._starts = joined(*self._sound, EVENT_PAUSE).starts
         beside = _television(labels) if set(names) & set(SET_APART) else NONE
         self._spans, self._events = dict[str, Spans](), dict[str, Spans]()
         for name in names:

@@ -1,8 +1,9 @@
 """Activity of a home: segments, coverage and classes, read from its logs."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from functools import reduce
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from hearthlog.analyzer.bridge.events import ANY_SOUND
 from hearthlog.analyzer.bridge.home import is_of_scenario, labelling_source, source_microphone
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import Described, array_names, select
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined
+from hearthlog.analyzer.logs.spans import NEVER, NONE, SEGMENT_DELAY, Spans, cut, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -44,20 +45,22 @@ class Sounds:
 NO_SOUNDS = Sounds(NONE.starts, NONE.ends, np.empty(0, np.float32), np.empty(0, object))
 
 
-def sounds_of(parts: Iterable[Sounds]) -> Sounds:
+def sounds_of(parts: Sequence[Sounds]) -> Sounds:
     """Merge segments, sorted by start."""
-    parts = list(parts)
-    if not parts:
-        return NO_SOUNDS
+    if len(parts) == 1:
+        return parts[0]
     columns = [
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("starts", "ends", "confidences", "microphones")
+        np.concatenate([getattr(part, field.name) for part in (NO_SOUNDS, *parts)])
+        for field in fields(Sounds)
     ]
     order = np.argsort(columns[0], kind="stable")
     return Sounds(*(column[order] for column in columns))
 
 
-def _between(classes: Iterable[Sounds], start: int, end: int, pause: int) -> list[Sounds]:
+Key = tuple[str, bool]  # a class, and whether the model of a scenario has it
+
+
+def _between(classes: Mapping[Key, Sounds], start: int, end: int, pause: int) -> dict[Key, Sounds]:
     """Return segments of classes in a time span, with the complete events ongoing at its start.
 
     An event has sounds of any class, as in a rule of any sound: such a rule needs its start too.
@@ -67,13 +70,13 @@ def _between(classes: Iterable[Sounds], start: int, end: int, pause: int) -> lis
     pause : int
         Longest pause within an event, in nanoseconds.
     """
-    own = [sounds.rows(sounds.starts < end) for sounds in classes]
-    own = [replace(sounds, ends=np.minimum(sounds.ends, end)) for sounds in own]
-    every = sounds_of(own)
+    own = {key: sounds.rows(sounds.starts < end) for key, sounds in classes.items()}
+    own = {key: replace(sounds, ends=np.minimum(sounds.ends, end)) for key, sounds in own.items()}
+    every = sounds_of([*own.values()])
     events = joined(every.starts, every.ends, pause)
     first = np.searchsorted(events.ends, start)
     begin = events.starts[first] if first < len(events.starts) else end
-    return [sounds.rows(sounds.starts >= begin) for sounds in own]
+    return {key: sounds.rows(sounds.starts >= begin) for key, sounds in own.items()}
 
 
 @dataclass(frozen=True)
@@ -82,10 +85,8 @@ class HomeActivity:
 
     Attributes
     ----------
-    sounds : mapping of str to Sounds
-        Segments by class, of the home's models, without silence.
-    scenario_sounds : mapping of str to Sounds
-        Segments by class, of scenario models.
+    sounds : mapping of (str, bool) to Sounds
+        Segments by class, without silence, and whether they are of a scenario's model.
     coverage : mapping of str to Spans
         Listening time by labelling source.
     classes : mapping of str to frozenset of str
@@ -94,20 +95,20 @@ class HomeActivity:
         When the recorder wrote; writes at most a minute apart form one span.
     """
 
-    sounds: Mapping[str, Sounds]
-    scenario_sounds: Mapping[str, Sounds]
+    sounds: Mapping[Key, Sounds]
     coverage: Mapping[str, Spans]
     classes: Mapping[str, frozenset[str]]
     written: Spans
 
     def of(self, label: str) -> Sounds:
-        """Return the segments of a class, or of all classes for `ANY_SOUND`."""
-        return sounds_of(self.sounds.values()) if label == ANY_SOUND else self._of(label)
-
-    def _of(self, label: str) -> Sounds:
-        own = self.sounds.get(label, NO_SOUNDS)
-        others = self.scenario_sounds.get(label)
-        return own if others is None else sounds_of([own, others])
+        """Return the segments of a class, or of all classes of the home for `ANY_SOUND`."""
+        return sounds_of(
+            [
+                sounds
+                for (name, of_scenario), sounds in self.sounds.items()
+                if (not of_scenario if label == ANY_SOUND else name == label)
+            ]
+        )
 
     def listened(self, label: str, microphone: str) -> Spans:
         """Return the time spans in which a class could have been detected.
@@ -138,13 +139,8 @@ class HomeActivity:
         pause : int
             Longest pause within an event, in nanoseconds.
         """
-        recent = _between(
-            [*self.sounds.values(), *self.scenario_sounds.values()], start, end, pause
-        )
-        count = len(self.sounds)
         return HomeActivity(
-            dict(zip(self.sounds, recent[:count], strict=True)),
-            dict(zip(self.scenario_sounds, recent[count:], strict=True)),
+            _between(self.sounds, start, end, pause),
             {name: cut(spans, start, end) for name, spans in self.coverage.items()},
             self.classes,
             cut(self.written, start, end),
@@ -159,31 +155,34 @@ SEGMENT_FIELDS = "header.stamp", "duration", "label", "confidence"
 _PAUSE = 60 * NANOSECONDS  # longest pause between writes of one span
 
 
-@dataclass
 class _Rows:
     """Growing segments of one class, with a cache of the columns."""
 
-    starts: list[int] = field(default_factory=list)
-    ends: list[int] = field(default_factory=list)
-    confidences: list[float] = field(default_factory=list)
-    microphones: list[str] = field(default_factory=list)
-    known: Sounds | None = None
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, int, float, str]] = []
+        self._known: Sounds | None = NO_SOUNDS
+
+    def add(self, *row: *tuple[int, int, float, str]) -> None:
+        self._rows.append(row)
+        self._known = None
 
     def sounds(self) -> Sounds:
-        if self.known is None:
-            rows = Sounds(
-                np.array(self.starts, np.int64),
-                np.array(self.ends, np.int64),
-                np.array(self.confidences, np.float32),
-                np.array(self.microphones, object),
+        if self._known is None:
+            starts, ends, confidences, microphones = zip(*self._rows, strict=True)
+            order = np.argsort(starts, kind="stable")
+            self._known = Sounds(
+                np.array(starts, np.int64)[order],
+                np.array(ends, np.int64)[order],
+                np.array(confidences, np.float32)[order],
+                np.array(microphones, object)[order],
             )
-            self.known = sounds_of([rows])
-        return self.known
+        return self._known
 
     def keep(self, sounds: Sounds) -> None:
-        columns = sounds.starts, sounds.ends, sounds.confidences, sounds.microphones
-        self.starts, self.ends, self.confidences, self.microphones = (c.tolist() for c in columns)
-        self.known = None
+        if len(sounds.starts) < len(self._rows):
+            columns = sounds.starts, sounds.ends, sounds.confidences, sounds.microphones
+            self._rows = [*zip(*(column.tolist() for column in columns), strict=True)]
+            self._known = sounds
 
 
 class _GrowingSpans:
@@ -222,8 +221,7 @@ class SegmentCollector:
 
     def __init__(self) -> None:
         self.classes: dict[str, set[str]] = {}
-        self._rows: dict[str, _Rows] = {}
-        self._scenario_rows: dict[str, _Rows] = {}
+        self._rows: defaultdict[Key, _Rows] = defaultdict(_Rows)
         self._coverage: dict[str, _GrowingSpans] = {}
         self._written = _GrowingSpans()
 
@@ -242,13 +240,8 @@ class SegmentCollector:
         name = class_name(label)
         if not _is_told(source, name):
             return
-        every = self._scenario_rows if is_of_scenario(source) else self._rows
-        rows = every.setdefault(name, _Rows())
-        rows.starts.append(start)
-        rows.ends.append(end)
-        rows.confidences.append(confidence)
-        rows.microphones.append(source_microphone(source))
-        rows.known = None
+        row = start, end, confidence, source_microphone(source)
+        self._rows[name, is_of_scenario(source)].add(*row)
         if source in self.classes:
             self.classes[source].add(name)
 
@@ -283,8 +276,7 @@ class SegmentCollector:
         others : sequence of (str, int, int, str, float), optional
             Source, start, end, label and confidence of open segments.
         """
-        sounds = {label: rows.sounds() for label, rows in self._rows.items()}
-        of_scenarios = {label: rows.sounds() for label, rows in self._scenario_rows.items()}
+        sounds = {key: rows.sounds() for key, rows in self._rows.items()}
         coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
         written = self._written.spans(_PAUSE)
         for source, start, end, label, confidence in others:
@@ -293,16 +285,11 @@ class SegmentCollector:
             coverage[source] = _with(spans, start, end, FRAME_NANOSECONDS)
             name = class_name(label)
             if _is_told(source, name):
-                more = Sounds(
-                    np.array([start]),
-                    np.array([end]),
-                    np.array([confidence], np.float32),
-                    np.array([source_microphone(source)], object),
-                )
-                every = of_scenarios if is_of_scenario(source) else sounds
-                every[name] = sounds_of([every.get(name, NO_SOUNDS), more])
+                more, key = _Rows(), (name, is_of_scenario(source))
+                more.add(start, end, confidence, source_microphone(source))
+                sounds[key] = sounds_of([sounds.get(key, NO_SOUNDS), more.sounds()])
         classes = {name: frozenset(own) for name, own in self.classes.items()}
-        return HomeActivity(sounds, of_scenarios, coverage, classes, written)
+        return HomeActivity(sounds, coverage, classes, written)
 
     def forget_before(self, time: int, pause: int) -> None:
         """Drop the events that ended before a time.
@@ -312,11 +299,9 @@ class SegmentCollector:
         pause : int
             Longest pause within an event, in nanoseconds.
         """
-        classes = [*self._rows.values(), *self._scenario_rows.values()]
-        recent = _between([rows.sounds() for rows in classes], time, 1 << 62, pause)
-        for rows, sounds in zip(classes, recent, strict=True):
-            if len(sounds.starts) < len(rows.starts):
-                rows.keep(sounds)
+        every = {key: rows.sounds() for key, rows in self._rows.items()}
+        for key, sounds in _between(every, time, NEVER, pause).items():
+            self._rows[key].keep(sounds)
         for own in (*self._coverage.values(), self._written):
             own.forget_before(time)
 
@@ -328,9 +313,6 @@ def _is_told(source: str, name: str) -> bool:
 
 def _with(spans: Spans, start: int, end: int, pause: int) -> Spans:
     return joined(np.append(spans.starts, start), np.append(spans.ends, end), pause)
-
-
-_LATE = 12 * 3600 * NANOSECONDS  # a segment is logged at its end: a long silence hours late
 
 
 def read_activity(  # noqa: PLR0913, PLR0917
@@ -356,10 +338,12 @@ def read_activity(  # noqa: PLR0913, PLR0917
         Open segments that are in no log yet, as for `SegmentCollector.heard`.
     """
     collector = SegmentCollector()
-    entries = [entry.path for entry in logs.between(start, end + _LATE) if entry.node == node]
+    entries = [
+        entry.path for entry in logs.between(start, end + SEGMENT_DELAY) if entry.node == node
+    ]
     for number, path in enumerate(entries, 1):
         try:
-            _add_log(collector, path, start, end + _LATE, lose)
+            _add_log(collector, path, start, end + SEGMENT_DELAY, lose)
         except LogError as error:
             lose(str(error))
         progress(number / len(entries))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from datetime import UTC, date, datetime, timedelta, tzinfo
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -120,21 +121,18 @@ def more_than_conditions(rule: MoreThan, heard: HomeActivity, until: int) -> lis
         End of the recorded activity, in nanoseconds of UTC.
     """
     events = events_of_rule(rule, heard)
-    spans = _too_many(rule, events) if rule.minutes is None else _too_long(rule, events, until)
-    return [
-        Condition(*span) for span in zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
-    ]
-
-
-def more_than_text(rule: MoreThan, heard: HomeActivity, time: int) -> str:
-    """Format the amount in the window that ends at a time."""
     window = duration_words(rule.window)
-    if rule.minutes is not None:
-        return f"{rule.words}: more than {rule.minutes:g} min in the last {window}"
-    counted = events_of_rule(rule, heard).counted
-    number = int(((counted > time - rule.window) & (counted <= time)).sum())
-    times = "once" if number == 1 else f"{number} times"
-    return f"{rule.words}: {times} in the last {window}, more than {rule.count}"
+
+    def text(time: int) -> str:
+        if rule.minutes is not None:
+            return f"{rule.words}: more than {rule.minutes:g} min in the last {window}"
+        number = int(((events.counted > time - rule.window) & (events.counted <= time)).sum())
+        times = "once" if number == 1 else f"{number} times"
+        return f"{rule.words}: {times} in the last {window}, more than {rule.count}"
+
+    spans = _too_many(rule, events) if rule.minutes is None else _too_long(rule, events, until)
+    edges = zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
+    return [Condition(*span, text) for span in edges]
 
 
 def _too_many(rule: MoreThan, events: SoundEvents) -> Spans:
@@ -180,7 +178,7 @@ def _sum_to(spans: Spans, times: Int64) -> Int64:
     return np.cumsum(lengths(spans, np.concatenate([[first], times])))
 
 
-def longer_than_conditions(rule: LongerThan, heard: HomeActivity) -> list[Condition]:
+def longer_than_conditions(rule: LongerThan, heard: HomeActivity, zone: tzinfo) -> list[Condition]:
     """Find when a class lasted too long, until a pause ends the event."""
     events = events_of_rule(rule, heard)
     limits = events.starts + rule.longer_than
@@ -189,18 +187,13 @@ def longer_than_conditions(rule: LongerThan, heard: HomeActivity) -> list[Condit
     spans = np.searchsorted(events.heard.ends, limits[rows], side="right")
     times = np.maximum(events.heard.starts[spans], limits[rows])
     over = events.ends[rows] + rule.pause + 1
-    return [Condition(*span) for span in zip(times.tolist(), over.tolist(), strict=True)]
 
+    def text(time: int) -> str:
+        began = events.starts[np.searchsorted(events.starts, time, side="right") - 1]
+        since = f"{local_time(int(began), zone):%H:%M}"
+        return f"{rule.words} for longer than {duration_words(rule.longer_than)}, since {since}"
 
-def longer_than_start(rule: LongerThan, heard: HomeActivity, time: int) -> int:
-    """Return the start of the event that is ongoing at a time, both in nanoseconds of UTC."""
-    starts = events_of_rule(rule, heard).starts
-    return int(starts[np.searchsorted(starts, time, side="right") - 1])
-
-
-def longer_than_text(rule: LongerThan, since: str) -> str:
-    """Format the text of a sound that lasted too long; `since` is its start as a time of day."""
-    return f"{rule.words} for longer than {duration_words(rule.longer_than)}, since {since}"
+    return [Condition(*span, text) for span in zip(times.tolist(), over.tolist(), strict=True)]
 
 
 def silent_conditions(
@@ -220,16 +213,12 @@ def silent_conditions(
     before = start - 1 - rule.silent_for
     lasts = (max(last, since) for last in [before, *ends.tolist()])
     silences = zip(lasts, [*starts.tolist(), end], strict=True)
+    text = f"Nothing from the recorder for {duration_words(rule.silent_for)}"
     return [
-        Condition(last + rule.silent_for, first)
+        Condition(last + rule.silent_for, first, lambda _: text)
         for last, first in silences
         if first - last > rule.silent_for
     ]
-
-
-def silent_text(rule: RecorderSilent) -> str:
-    """Format the text of a silent recorder."""
-    return f"Nothing from the recorder for {duration_words(rule.silent_for)}"
 
 
 def wall_times(day: date, minute: int, zone: tzinfo) -> tuple[int, int]:
@@ -292,9 +281,6 @@ def end_of_quiet(hours: list[QuietHours], time: int, zone: tzinfo) -> int:
     return until
 
 
-_MINUTE = 60 * NANOSECONDS
-
-
 def none_by_conditions(
     rule: NoneBy, heard: HomeActivity, start: int, end: int, zone: tzinfo
 ) -> list[Condition]:
@@ -314,10 +300,13 @@ def none_by_conditions(
         if ((events.counted < last) & (events.ends > first)).any():
             continue
         share = cut(listened, first, last).length / (last - first)
+        hours = f"from {_clock(rule.since)} to {_clock(rule.by)}"
         is_known = share >= rule.least_share
-        conditions.append(
-            Condition(last, last + 1, _none_text(rule, share, is_known=is_known), is_known)
-        )
+        text = f"{rule.words}: none {hours}"
+        if not is_known:
+            heard_share = f"{int(100 * share)} %"
+            text = f"{rule.words} {hours}: not known, for only {heard_share} of that time was heard"
+        conditions.append(_at_once(last, text, is_known=is_known))
     return conditions
 
 
@@ -327,12 +316,8 @@ def _window(rule: NoneBy, day: date, zone: tzinfo) -> tuple[int, int]:
     return wall_times(began, rule.since, zone)[0], wall_times(day, rule.by, zone)[1]
 
 
-def _none_text(rule: NoneBy, share: float, *, is_known: bool) -> str:
-    hours = f"from {_clock(rule.since)} to {_clock(rule.by)}"
-    if is_known:
-        return f"{rule.words}: none {hours}"
-    heard = f"{int(100 * share)} %"
-    return f"{rule.words} {hours}: not known, for only {heard} of that time was heard"
+def _at_once(time: int, text: str, *, is_known: bool = True) -> Condition:
+    return Condition(time, time + 1, lambda _: text, is_known)
 
 
 def _clock(minute: int) -> str:
@@ -353,15 +338,30 @@ def unlike_conditions(
     days = judged_days(rule, start, end, zone)
     if not days:
         return []
-    figures = _Figures(rule, heard, zone)
+    events = events_of_rule(rule, heard)
+    spans, listened = events.heard_counted(), heard.listened(rule.label, rule.microphone)
+
+    @cache
+    def figure(day: date) -> Count | Duration | None:
+        """Return the figure that is evaluated on a day; None if coverage is too low."""
+        start, end = _part(rule, day, zone)
+        if cut(listened, start, end).length < rule.least_share * (end - start):
+            return None
+        edges = np.searchsorted(events.counted, [start, end])
+        number = int(edges[1] - edges[0])
+        if rule.of == "count":
+            return Count(number)
+        lump = rule.least_seconds / 60 * number
+        return Duration(cut(spans, start, end).length / MINUTE + lump)
+
     conditions = []
     for day, time in days:
-        own = figures.of(day)
+        own = figure(day)
         baseline = usual_range(
-            [figures.of(day - timedelta(days=ago)) for ago in range(1, BASELINE_DAYS + 1)]
+            [figure(day - timedelta(days=ago)) for ago in range(1, BASELINE_DAYS + 1)]
         )
         if own is not None and baseline is not None and _is_unlike(rule, own.middle, baseline):
-            conditions.append(Condition(time, time + 1, _unlike_text(rule, day, own, baseline)))
+            conditions.append(_at_once(time, _unlike_text(rule, day, own, baseline)))
     return conditions
 
 
@@ -369,35 +369,6 @@ def judged_days(rule: DailyRule, start: int, end: int, zone: tzinfo) -> list[tup
     """List the days on which a rule is evaluated in a time span, with times in ns of UTC."""
     times = [(day, wall_times(day, rule.at, zone)[1]) for day in days_around(start, end, zone)]
     return [(day, time) for day, time in times if start <= time < end]
-
-
-class _Figures:
-    """Compared figures by day; None for days with too little coverage."""
-
-    def __init__(self, rule: UnlikeUsual, heard: HomeActivity, zone: tzinfo) -> None:
-        self._rule = rule
-        self._zone = zone
-        self._events = events_of_rule(rule, heard)
-        self._heard = self._events.heard_counted()
-        self._listened = heard.listened(rule.label, rule.microphone)
-        self._known: dict[date, Count | Duration | None] = {}
-
-    def of(self, day: date) -> Count | Duration | None:
-        """Return the figure that is evaluated on a day."""
-        if day not in self._known:
-            self._known[day] = self._figure(*_part(self._rule, day, self._zone))
-        return self._known[day]
-
-    def _figure(self, start: int, end: int) -> Count | Duration | None:
-        listened = cut(self._listened, start, end).length
-        if listened < self._rule.least_share * (end - start):
-            return None
-        counted = self._events.counted
-        events = int(np.searchsorted(counted, end) - np.searchsorted(counted, start))
-        if self._rule.of == "count":
-            return Count(events)
-        lump = self._rule.least_seconds / 60 * events
-        return Duration(cut(self._heard, start, end).length / _MINUTE + lump)
 
 
 def _part(rule: UnlikeUsual, day: date, zone: tzinfo) -> tuple[int, int]:
@@ -441,7 +412,7 @@ def unusual_conditions(
             day = short_day(judged.day)
             why = differences_text(judged)
             text = f"{day} and the night after it, {rarity_text(judged)}: {why}"
-            conditions.append(Condition(time, time + 1, text))
+            conditions.append(_at_once(time, text))
     return conditions
 
 
@@ -449,14 +420,15 @@ def home_sound(heard: HomeActivity) -> HomeSegments:
     """Return the segments and coverage from which routines are fitted."""
     coverage = heard.listened(ANY_SOUND, "")
     parts = [_labelled(SILENCE, coverage.starts, coverage.ends)]
-    parts += [_labelled(name, own.starts, own.ends) for name, own in heard.sounds.items()]
+    sounds = {name: own for (name, of_scenario), own in heard.sounds.items() if not of_scenario}
+    parts += [_labelled(name, own.starts, own.ends) for name, own in sounds.items()]
     starts, ends, labels = (
         np.concatenate([getattr(part, name) for part in parts])
         for name in ("starts", "ends", "labels")
     )
     order = np.argsort(starts, kind="stable")
     of_home = [own for name, own in heard.classes.items() if not is_of_scenario(name)]
-    known = dict.fromkeys(sorted(set(heard.sounds).union(*of_home)))
+    known = sorted(set(sounds).union(*of_home))
     return HomeSegments(
         Labelling(starts[order], ends[order], labels[order]),
         {name: heard.listened(name, "") for name in known},
@@ -500,7 +472,9 @@ def notifications(  # noqa: PLR0913, PLR0917
         rung = goes_on and state.has_rung
         time = max(condition.start, start, last + rule.cooldown)
         if not rung and time < min(condition.end, end):
-            found.append(_notification(rule, heard, condition, time, zone))
+            due = end_of_quiet(rule.hours(), time, zone)
+            text, is_known = condition.text(time), condition.is_known
+            found.append(Notification(rule.name, time, text, is_known, due))
             last, rung = time, True
         has_rung = rung and condition.end >= end
     return found, RuleState(last, has_rung, state.since, end)
@@ -513,7 +487,7 @@ def _conditions(  # noqa: PLR0913, PLR0917
     if isinstance(rule, MoreThan):
         return more_than_conditions(rule, heard, end)
     if isinstance(rule, LongerThan):
-        return longer_than_conditions(rule, heard)
+        return longer_than_conditions(rule, heard, zone)
     if isinstance(rule, RecorderSilent):
         return silent_conditions(rule, heard, start, end, since)
     if isinstance(rule, NoneBy):
@@ -521,23 +495,3 @@ def _conditions(  # noqa: PLR0913, PLR0917
     if isinstance(rule, UnusualDay):
         return unusual_conditions(rule, heard, start, end, zone)
     return unlike_conditions(rule, heard, start, end, zone)
-
-
-def _notification(
-    rule: AlertRule, heard: HomeActivity, condition: Condition, time: int, zone: tzinfo
-) -> Notification:
-    due = end_of_quiet(rule.hours(), time, zone)
-    return Notification(
-        rule.name, time, _text(rule, heard, condition, time, zone), condition.is_known, due
-    )
-
-
-def _text(
-    rule: AlertRule, heard: HomeActivity, condition: Condition, time: int, zone: tzinfo
-) -> str:
-    if isinstance(rule, MoreThan):
-        return more_than_text(rule, heard, time)
-    if isinstance(rule, LongerThan):
-        began = longer_than_start(rule, heard, time)
-        return longer_than_text(rule, f"{local_time(began, zone):%H:%M}")
-    return silent_text(rule) if isinstance(rule, RecorderSilent) else condition.text

@@ -2,12 +2,14 @@
 
 import hashlib
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from hearthlog.analyzer.bridge.events import ANY_SOUND
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NEVER
 from hearthlog.analyzer.routine.day_anomaly import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.recorder.pause_schedule import QuietHours, check_quiet_hours, quiet_hours
@@ -47,7 +49,6 @@ def duration_words(nanoseconds: int) -> str:
 _LONGEST_WINDOW = 7 * DAY
 LONGEST_PAUSE = 10 * MINUTE  # longest pause of an event that a rule may set
 _MARGIN = 5 * MINUTE
-_PAUSE = 10 * SECOND  # default pause between segments of one event, as in the report
 _NIGHT_ENDS = 7 * 60
 _LONGEST_NAME = 60  # characters
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -255,7 +256,7 @@ AlertRules = Annotated[list[AlertRule], AfterValidator(_check_names), Field(max_
 
 def pause_of(rule: SoundRule) -> int:
     """Return the longest pause within an event, in nanoseconds."""
-    return rule.pause if isinstance(rule, LongerThan) else _PAUSE
+    return rule.pause if isinstance(rule, LongerThan) else EVENT_PAUSE
 
 
 def history(rule: AlertRule) -> int:
@@ -279,9 +280,6 @@ def live_history(rule: AlertRule) -> int:
     that day may have no segment in the logs yet.
     """
     return _TWO_DAYS if isinstance(rule, DailyRule) else history(rule)
-
-
-_NEVER = -(1 << 62)
 
 
 class Notification(NamedTuple):
@@ -325,9 +323,9 @@ class RuleState:
         End of the evaluation; 0 for a new rule.
     """
 
-    last: int = _NEVER
+    last: int = -NEVER
     has_rung: bool = False
-    since: int = _NEVER
+    since: int = -NEVER
     until: int = 0
 
 
@@ -338,13 +336,13 @@ class Condition(NamedTuple):
     ----------
     start, end : int
         In nanoseconds of UTC, the end exclusive.
-    text : str
-        Text of the notification; empty if it depends on the time of the notification.
+    text : callable
+        Returns the text of a notification at a time.
     is_known : bool
         False if the recorder heard too little to tell.
     """
 
     start: int
     end: int
-    text: str = ""
+    text: Callable[[int], str]
     is_known: bool = True
