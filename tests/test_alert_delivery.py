@@ -22,15 +22,15 @@ from hearthlog.analyzer.bridge.alerts.delivery import (
     UNREAD,
     Delivery,
     Outbox,
+    find_targets,
     message,
-    read_targets,
 )
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
 from hearthlog.analyzer.bridge.alerts.rules import Notification
 from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.settings import DeliverySettings
-from hearthlog.analyzer.bridge.state import BridgeError, page_token
+from hearthlog.analyzer.bridge.state import page_token
 
 # Apprise asks for it where there is one.
 pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")
@@ -133,7 +133,7 @@ def test_a_folder_that_takes_nothing_is_said_and_the_ring_told_all_the_same(tmp_
 
 def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
     port, said = free_port(), []
-    targets = read_targets(addresses(tmp_path, f"json://127.0.0.1:{port}"), said.append)
+    targets = find_targets(addresses(tmp_path, f"json://127.0.0.1:{port}"), said.append).targets
     outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
     outbox.put([ring(1), ring(2)])
     delivery = Delivery(outbox, targets, "home", UTC, said.append, first_pause=0.01)
@@ -160,7 +160,9 @@ def test_a_target_that_never_answers_holds_up_neither_the_others_nor_the_end(tmp
         mute.bind(("127.0.0.1", 0))
         mute.listen()
         dead = f"json://127.0.0.1:{mute.getsockname()[1]}?cto=1&rto=1"
-        targets = read_targets(addresses(tmp_path, dead, f"json://127.0.0.1:{port}"), said.append)
+        targets = find_targets(
+            addresses(tmp_path, dead, f"json://127.0.0.1:{port}"), said.append
+        ).targets
         outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
         outbox.put([ring(1)])
         delivery = Delivery(outbox, targets, "home", UTC, said.append, first_pause=60.0)
@@ -211,10 +213,9 @@ def test_a_ring_is_told_with_its_time_and_late_as_late():
 
 def test_a_line_that_is_no_address_is_named_by_its_number_and_not_told(tmp_path):
     file = addresses(tmp_path, "json://127.0.0.1", "", "nosuch://user:hush@there")
-    with pytest.raises(BridgeError) as error:
-        read_targets(file, pytest.fail)
-    assert str(error.value).startswith(f"{file}, line 4: no address that Apprise knows")
-    assert "hush" not in str(error.value)
+    (problem,) = find_targets(file, pytest.fail).problems
+    assert problem.startswith(f"{file}, line 4: no address that Apprise knows")
+    assert "hush" not in problem
 
 
 @pytest.mark.parametrize(
@@ -226,7 +227,10 @@ def test_a_file_of_addresses_is_read_as_editors_write_it(tmp_path, encoding, mar
     lines = ["json://127.0.0.1/a", "", "# é", "  json://127.0.0.1/b  ", "json://127.0.0.1/a"]
     file.write_bytes(f"{mark}{end.join(lines)}{end}".encode(encoding))
     file.chmod(0o600)
-    assert [each.place[:6] for each in read_targets(file, pytest.fail)] == ["line 1", "line 4"]
+    assert [each.place[:6] for each in find_targets(file, pytest.fail).targets] == [
+        "line 1",
+        "line 4",
+    ]
 
 
 def test_one_wrong_line_keeps_nobody_else_from_being_told_and_is_told_late_when_it_is_mended(
@@ -358,17 +362,17 @@ def test_without_an_address_the_broker_is_told_all_the_same(tmp_path, content):
 
 
 def test_a_file_without_an_address_and_one_that_is_not_there_are_refused(tmp_path):
-    with pytest.raises(BridgeError, match="no address in it"):
-        read_targets(addresses(tmp_path), pytest.fail)
-    with pytest.raises(BridgeError, match="no such file of addresses"):
-        read_targets(tmp_path / "none", pytest.fail)
+    (empty,) = find_targets(addresses(tmp_path), pytest.fail).problems
+    assert "no address in it" in empty
+    (missing,) = find_targets(tmp_path / "none", pytest.fail).problems
+    assert "no such file of addresses" in missing
 
 
 def test_a_file_of_secrets_that_everybody_may_read_is_said(tmp_path):
     said = []
     file = addresses(tmp_path, "json://127.0.0.1")
     file.chmod(0o644)
-    (target,) = read_targets(file, said.append)
+    (target,) = find_targets(file, said.append).targets
     assert said == [
         f"{file}: holds secrets, and everybody on this machine may read it: chmod 600 {file}"
     ]
@@ -379,10 +383,10 @@ def test_files_of_secrets_are_looked_for_among_the_credentials_of_systemd(tmp_pa
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     addresses(tmp_path, "json://127.0.0.1")
     (tmp_path / "token").write_text("abcdefghijklmnop\n")
-    assert len(read_targets(Path("urls"), pytest.fail)) == 1
+    assert len(find_targets(Path("urls"), pytest.fail).targets) == 1
     assert page_token(Path("token"), tmp_path) == "abcdefghijklmnop"
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", "/nowhere")
-    assert len(read_targets(tmp_path / "urls", pytest.fail)) == 1
+    assert len(find_targets(tmp_path / "urls", pytest.fail).targets) == 1
     assert page_token(tmp_path / "token", tmp_path) == "abcdefghijklmnop"
 
 
@@ -404,7 +408,7 @@ def test_files_of_secrets_are_looked_for_among_the_credentials_of_systemd(tmp_pa
     ],
 )
 def test_a_target_is_named_by_its_line_and_at_most_its_scheme_and_host(address, place, tmp_path):
-    (target,) = read_targets(addresses(tmp_path, address), pytest.fail)
+    (target,) = find_targets(addresses(tmp_path, address), pytest.fail).targets
     assert target.place == f"line 2, {place}"
 
 
@@ -414,7 +418,7 @@ def test_no_part_of_an_address_is_said_when_it_cannot_be_reached_or_refuses(tmp_
         places = [f"127.0.0.1:{each}/hush-topic" for each in (port, free_port())]
         kinds = ("ntfy", "json", "xml", "form", "gotify", "mmost")
         lines = [f"{kind}://hush:hush@{place}" for kind in kinds for place in places]
-        targets = read_targets(addresses(tmp_path, *lines), said.append)
+        targets = find_targets(addresses(tmp_path, *lines), said.append).targets
         outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
         outbox.put([ring(1)])
         delivery = Delivery(outbox, targets, "home", UTC, said.append)
@@ -430,7 +434,7 @@ def test_no_part_of_an_address_is_said_when_it_cannot_be_reached_or_refuses(tmp_
 def test_the_password_of_an_address_is_in_no_line_and_no_file(tmp_path):
     said = []
     file = addresses(tmp_path, f"json://user:hush@127.0.0.1:{free_port()}")
-    targets = read_targets(file, said.append)
+    targets = find_targets(file, said.append).targets
     outbox = Outbox(tmp_path / "box", ["x", *(each.name for each in targets)], said.append)
     outbox.put([ring(1)])
     delivery = Delivery(outbox, targets, "home", UTC, said.append)
@@ -449,9 +453,9 @@ from pathlib import Path
 from hearthlog.analyzer.bridge.alerts.delivery import Delivery
 from hearthlog.analyzer.bridge.alerts.delivery import Outbox
 from hearthlog.analyzer.bridge.alerts.rules import Notification
-from hearthlog.analyzer.bridge.alerts.delivery import read_targets
+from hearthlog.analyzer.bridge.alerts.delivery import find_targets
 folder = Path(sys.argv[1])
-targets = read_targets(folder / "urls", print)
+targets = find_targets(folder / "urls", print).targets
 outbox = Outbox(folder / "box", [each.name for each in targets], print)
 outbox.put(Notification("coughs", n, f"alert {n}", True, 0) for n in map(int, sys.argv[2:]))
 print("kept", flush=True)

@@ -3,7 +3,7 @@
 import errno
 import queue
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import timedelta
 from itertools import pairwise
@@ -114,7 +114,8 @@ class EventCorrections:
 
         Raise `HearthlogError` if a layer is damaged.
         """
-        logs = [log for log in find_logs(self._folder) if self._is_of_node(log)]
+        names = ((log, log_name(log)) for log in find_logs(self._folder))
+        logs = [log for log, name in names if name.node == self._node and not name.layer]
         marked = [log for log in logs[-_MOST_LOGS:] if review_path(log).exists()]
         self._marks = [mark for log in marked for mark in read_marks(log)]
 
@@ -123,10 +124,11 @@ class EventCorrections:
         label = self._own.get(event.id)
         if label is not None:
             return f"You said: {_in_words(label)}"
-        found = list(_over(event, self._marks))
-        if not found:
+        own = [mark for mark in self._marks if mark.microphone == event.microphone]
+        common = [min(mark.end, event.end) - max(mark.start, event.start) for mark in own]
+        if max(common, default=0) <= 0:
             return ""
-        mark = max(found, key=lambda mark: min(mark.end, event.end) - max(mark.start, event.start))
+        mark = own[common.index(max(common))]
         who = "You said" if mark.reviewer == REVIEWER else "Marked"
         return f"{who}: {_in_words(mark.label)}"
 
@@ -146,10 +148,6 @@ class EventCorrections:
                 del self._own[next(iter(self._own))]
         return self.of(event)
 
-    def _is_of_node(self, log: Path) -> bool:
-        name = log_name(log)
-        return name.node == self._node and not name.layer
-
 
 def class_of(text: str) -> str:
     """Convert text to a class name: `Water tap` to `tap_water`.
@@ -168,16 +166,6 @@ def class_of(text: str) -> str:
 
 def _in_words(label: str) -> str:
     return "nothing" if label == SILENCE else class_words(label)
-
-
-def _over(event: SoundEvent, marks: list[Mark]) -> Iterator[Mark]:
-    for mark in marks:
-        if (
-            mark.microphone == event.microphone
-            and mark.start < event.end
-            and mark.end > event.start
-        ):
-            yield mark
 
 
 def _explained(error: BridgeError) -> HearthlogError:

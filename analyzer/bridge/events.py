@@ -3,6 +3,7 @@
 from bisect import bisect_left, bisect_right, insort
 from collections import deque
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
+_START = attrgetter("start")
 _MOST_AGAIN = 50  # segments that a recorder may write twice after its disk was full
 
 
@@ -70,9 +72,9 @@ class EventRecord:
         self._segments.append((start, end))
         seconds = (end - start) / NANOSECONDS
         current = self.current
-        if current is None or not _goes_on(current, start):
+        if current is None or not current.start <= start <= current.end + EVENT_PAUSE:
             new = SoundEvent(self._microphone, self._label, start, end, confidence, seconds)
-            insort(self.events, new, key=_start)  # not the last if the clock was set back
+            insort(self.events, new, key=_START)  # not the last if the clock was set back
             self.current = new
             return True
         self.current = current._replace(
@@ -80,31 +82,23 @@ class EventRecord:
             confidence=max(current.confidence, confidence),
             seconds=current.seconds + seconds,
         )
-        place = bisect_left(self.events, current.start, key=_start)
+        place = bisect_left(self.events, current.start, key=_START)
         self.events[self.events.index(current, place)] = self.current
         return False
 
     def since(self, time: int) -> list[SoundEvent]:
         """Return the events that began at a time or later, in nanoseconds of UTC."""
-        return self.events[bisect_left(self.events, time, key=_start) :]
+        return self.events[bisect_left(self.events, time, key=_START) :]
 
     def forget(self, before: int, after: int) -> None:
         """Drop events that began before `before`, except the last one, or later than `after`."""
-        first = bisect_left(self.events, before, key=_start)
-        end = bisect_right(self.events, after, key=_start)
+        first = bisect_left(self.events, before, key=_START)
+        end = bisect_right(self.events, after, key=_START)
         kept = self.events[min(first, max(end - 1, 0)) : end]
         if len(kept) < len(self.events):
             self.events = kept
             if self.current not in kept:
                 self.current = None
-
-
-def _start(event: SoundEvent) -> int:
-    return event.start
-
-
-def _goes_on(event: SoundEvent, start: int) -> bool:
-    return event.start <= start <= event.end + EVENT_PAUSE
 
 
 ANY_SOUND = ""  # in place of a class: everything except silence

@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Event as Flag
@@ -127,11 +127,10 @@ class LiveMicrophone:
         self._latest = max(
             self._latest, int(np.max(columns["header.stamp"] + columns["duration"], initial=0))
         )
-        names = "header.stamp", "duration", "label", "confidence"
-        for start, duration, label, confidence in zip(
-            *(columns[name].tolist() for name in names), strict=True
-        ):
-            if label in self._unnamed or (label not in self._records and self._is_full()):
+        fields = (columns[name].tolist() for name in FIELDS[message_types.SEGMENT])
+        for start, duration, label, confidence in zip(*fields, strict=True):
+            is_full = len(self._records) >= _MOST_CLASSES
+            if label in self._unnamed or (label not in self._records and is_full):
                 continue
             record = self._records.setdefault(label, EventRecord(self.name, label))
             before = record.current
@@ -198,9 +197,6 @@ class LiveMicrophone:
             record.forget(before, after)
         if self.gaps and self.gaps[0][1] < before:
             self.gaps = [gap for gap in self.gaps if gap[1] >= before]
-
-    def _is_full(self) -> bool:
-        return len(self._records) >= _MOST_CLASSES
 
 
 class HomeState:
@@ -321,6 +317,7 @@ def _class_names(columns: Columns) -> list[str]:
     return []
 
 
+_EVERY = {message_types.SEGMENT, message_types.GAP}  # types whose old messages count, too
 _LATEST = 60 * NANOSECONDS  # older labels and diagnostics have no effect on the state
 _WAIT_SECONDS = 1.0
 _TICK_SECONDS = 0.5
@@ -416,11 +413,23 @@ def _labelling_sources(log: Path) -> set[str] | None:
 
 
 def _decode(batch: list[RawMessages]) -> list[Columns]:
-    columns: list[Columns] = []
-    for raw in batch:
-        if raw.schema is not None and raw.schema.name in FIELDS and len(raw):
-            kind = raw.schema.name
-            if kind not in {message_types.SEGMENT, message_types.GAP}:
-                raw = raw.between(int(np.max(raw.log_times)) - _LATEST, None)  # noqa: PLW2901
-            columns += decode([raw], FIELDS[kind])
-    return columns
+    latest = [
+        raw
+        if raw.schema is None or raw.schema.name in _EVERY or not len(raw)
+        else raw.between(int(np.max(raw.log_times)) - _LATEST, None)
+        for raw in batch
+    ]
+    return decode_fields(latest, FIELDS)
+
+
+def decode_fields(
+    batch: Sequence[RawMessages], fields: Mapping[str, Sequence[str]]
+) -> list[Columns]:
+    """Decode the given fields, by type, of the messages of these types."""
+    known = [raw for raw in batch if raw.schema is not None and raw.schema.name in fields]
+    return [
+        columns
+        for raw in known
+        if raw.schema is not None and len(raw)
+        for columns in decode([raw], fields[raw.schema.name])
+    ]

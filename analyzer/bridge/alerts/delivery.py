@@ -12,7 +12,7 @@ from difflib import SequenceMatcher
 from pathlib import Path
 from threading import Event as Flag
 from threading import Lock, Thread, get_ident
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
@@ -195,29 +195,16 @@ _FORM = "%(thread)d %(message)s"  # other threads deliver at the same time
 _CODE = re.compile(r"\berror=(\d{3})\b")
 
 
-class Target(Protocol):
-    """Recipient of notifications."""
+class Target:
+    """An address of Apprise.
 
-    @property
-    def name(self) -> str:
-        """Identifier that is stable across restarts and reveals no secret."""
-
-    @property
-    def place(self) -> str:
-        """Human-readable name without secrets, for messages."""
-
-    def deliver(self, title: str, text: str) -> str:
-        """Deliver a notification; return the reason of a failure, or an empty text.
-
-        Parameters
-        ----------
-        title, text : str
-            Title and body of the notification.
-        """
-
-
-class AppriseTarget:
-    """An address of Apprise."""
+    Attributes
+    ----------
+    name : str
+        Identifier that is stable across restarts and reveals no secret.
+    place : str
+        Human-readable name without secrets, for messages.
+    """
 
     def __init__(self, plugin: Any, address: str, line: int) -> None:
         self._plugin = plugin
@@ -269,26 +256,14 @@ class Addresses(NamedTuple):
         Whether Apprise, or a package that it needs, is not installed.
     """
 
-    targets: list[AppriseTarget]
+    targets: list[Target]
     problems: list[str]
     names: list[str]
     lacks_package: bool = False
 
 
-def read_targets(file: Path, say: Callable[[str], None]) -> list[AppriseTarget]:
-    """Read a file of addresses, one per line; `#` begins a comment line.
-
-    Raise `BridgeError` if the file cannot be read, has a line that Apprise does not accept, or has
-    no address.
-    """
-    found = find_targets(file, say)
-    if found.problems:
-        raise BridgeError("; ".join(found.problems))
-    return found.targets
-
-
 def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
-    """Read a file of addresses like `read_targets`, collecting problems instead of raising."""
+    """Read a file of addresses, one per line; `#` begins a comment line."""
     file = secret_path(file)
     try:
         importlib.invalidate_caches()  # Apprise may have been installed since the last call
@@ -307,7 +282,7 @@ def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
         plugin_paths=[], storage_mode="memory", secure_logging=True, async_mode=False
     )
     asset.app_id = asset.app_desc = "hearthlog"
-    targets: dict[str, AppriseTarget] = {}
+    targets: dict[str, Target] = {}
     problems = []
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
     lines = [(number, line) for number, line in lines if line and not line.startswith("#")]
@@ -318,7 +293,7 @@ def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
                 f"{file}, line {number}: no address that Apprise knows; docs/alerts.md has examples"
             )
         else:
-            target = AppriseTarget(plugin, address, number)
+            target = Target(plugin, address, number)
             targets.setdefault(target.name, target)
     if not targets and not problems:
         problems = [f"{file}: no address in it; write one a line, as ntfy://ntfy.sh/my-topic"]

@@ -11,10 +11,11 @@ from hearthlog.analyzer.bridge.home import (
     labelling_source,
     source_microphone,
 )
+from hearthlog.analyzer.bridge.home_state import is_of_bridge
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, parse_topic
+from hearthlog.schemas.messages.topics import parse_topic
 
 _UNDECIDED = 5 * NANOSECONDS  # span of the newest labels, in which a segment may still begin
 _SETTLED = 5 * NANOSECONDS  # shortest open segment
@@ -105,12 +106,8 @@ _CUT = 1_000_000_000  # ns: longer open segments are kept when a gap follows
 
 def is_of_alerts(topic: str) -> bool:
     """Whether alerts subscribe to a topic."""
-    if topic == DIAGNOSTICS:
-        return True
     name = parse_topic(topic)
-    if name is None or labelling_source(name) is None:
-        return False
-    return name.kind == "segment" or (name.kind == "gap" and name.labelling == LIVE)
+    return is_of_bridge(topic) and (name is None or name.kind != "label")
 
 
 class LiveActivity:

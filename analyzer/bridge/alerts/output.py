@@ -42,13 +42,13 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     live_history,
 )
 from hearthlog.analyzer.bridge.home import RecorderAddress
+from hearthlog.analyzer.bridge.home_state import decode_fields
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings
 from hearthlog.analyzer.bridge.state import BridgeError, StateFile, secret_path
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import log_name
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.mcap.raw_messages import RawMessages
@@ -358,7 +358,7 @@ class AlertsOutput:
                 self._say(
                     f"alerts: {path}: was the clock ahead? what is of a time to come is left out"
                 )
-            self._heard.push(_decoded(known))
+            self._heard.push(decode_fields(known, FIELDS))
         except LogError as error:
             self._damaged(LogError(f"{path}: {error}"))
 
@@ -372,11 +372,8 @@ class AlertsOutput:
                 self._heard.add_label(name, label, classes)
         self._watch.evaluate(self._heard.heard, self._weeks, self._heard.known_until(now), now)
         if time.monotonic() - self._began >= _WAIT_SECONDS:
-            self._report_unknown_classes()
-
-    def _report_unknown_classes(self) -> None:
-        for rule in self._rules:
-            if text := unknown_class(rule, self._heard.classes):
+            unknown = (unknown_class(rule, self._heard.classes) for rule in self._rules)
+            for text in filter(None, unknown):
                 self._say(f"alerts: {text}")
 
     def _now(self) -> int:
@@ -407,11 +404,3 @@ def _state_of(file: Path) -> tuple[int, ...] | None:
         state = secret_path(file).stat()
         return state.st_mtime_ns, state.st_size, state.st_ino, state.st_mode, state.st_ctime_ns
     return None
-
-
-def _decoded(batch: Sequence[RawMessages]) -> list[Columns]:
-    columns: list[Columns] = []
-    for raw in batch:
-        if raw.schema is not None and raw.schema.name in FIELDS and len(raw):
-            columns += decode([raw], FIELDS[raw.schema.name])
-    return columns

@@ -4,10 +4,12 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from datetime import tzinfo
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from hearthlog.analyzer.bridge.commands import EventCorrections
 from hearthlog.analyzer.bridge.events import ANY_SOUND, HOLD_SECONDS, SoundEvent
@@ -35,6 +37,7 @@ from hearthlog.analyzer.bridge.settings import PageSettings
 from hearthlog.analyzer.bridge.state import BridgeError, cookie_key, keep_address, page_token
 from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
+from hearthlog.analyzer.logs.spans import joined
 from hearthlog.analyzer.network import ip_of
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.recorder.host import writes_to_journal
@@ -138,15 +141,10 @@ _SHOWN = 20
 _DAY = 24 * 3600 * NANOSECONDS
 
 
-class LastEvents(NamedTuple):
-    """The last events by id, and their description for JSON."""
-
-    events: dict[str, SoundEvent]
-    shown: Any
-
-
-def last_events(news: News, said_of: Callable[[SoundEvent], str]) -> LastEvents:
-    """Return the last events.
+def last_events(
+    news: News, said_of: Callable[[SoundEvent], str]
+) -> tuple[dict[str, SoundEvent], Any]:
+    """Return the last events by id, and their description for JSON.
 
     Parameters
     ----------
@@ -169,7 +167,7 @@ def last_events(news: News, said_of: Callable[[SoundEvent], str]) -> LastEvents:
         ],
         "classes": [(label, class_words(label)) for label in names if is_sound(label)],
     }
-    return LastEvents({event.id: event for event in found}, shown)
+    return {event.id: event for event in found}, shown
 
 
 def _described(event: SoundEvent, news: News, said: str, *, is_alone: bool) -> Any:
@@ -190,12 +188,8 @@ _WELL, _WARNING, _WRONG = 0, 1, 2  # as in diagnostics
 _THINGS = {"disk": "Disk", "machine": "Clock and computer"}
 
 
-class HealthLine(NamedTuple):
-    """Health of one subject: a level from 0 (OK) to 2 (error), and a text."""
-
-    what: str
-    level: int
-    text: str
+def _line(what: str, level: int, text: str) -> dict[str, Any]:
+    return {"what": what, "level": level, "text": text}
 
 
 def health_list(news: News, node: str, started: int, recurring: str = "") -> list[Any]:
@@ -210,37 +204,37 @@ def health_list(news: News, node: str, started: int, recurring: str = "") -> lis
     """
     lines = [*_lines(news, node, started)]
     if recurring:
-        lines.append(HealthLine("Sounds that recur", _WARNING, recurring))
-    return [line._asdict() for line in lines]
+        lines.append(_line("Sounds that recur", _WARNING, recurring))
+    return lines
 
 
-def _lines(news: News, node: str, started: int) -> Iterator[HealthLine]:
+def _lines(news: News, node: str, started: int) -> Iterator[Any]:
     state = news.state
     for microphone in state.present():
         yield _of_microphone(microphone, state)
     is_recording = state.is_recording()
-    yield HealthLine(
+    yield _line(
         "Recorder",
         _WELL if is_recording else _WRONG,
         "recording" if is_recording else "nothing has been written for more than 15 seconds",
     )
     for subject, health in sorted(state.health.items()):
         if subject not in state.microphones:
-            yield HealthLine(_thing(subject, node), min(health.level, _WRONG), told(health.text))
-    yield HealthLine(
+            yield _line(_thing(subject, node), min(health.level, _WRONG), told(health.text))
+    yield _line(
         "Bridge", _WELL, f"follows the recorder since {when(started, news.today.now, news.zone)}"
     )
 
 
-def _of_microphone(microphone: LiveMicrophone, state: HomeState) -> HealthLine:
+def _of_microphone(microphone: LiveMicrophone, state: HomeState) -> Any:
     health = state.health.get(microphone.name)
     text, level = ("", _WELL) if health is None else (told(health.text), health.level)
     is_alone = len(state.present()) == 1
     what = "Microphone" if is_alone else f"Microphone, {room(microphone.name)}"
     if not microphone.is_listening():
         why = reason(text)
-        return HealthLine(what, _WRONG, f"not listening: {why}" if why else "not listening")
-    return HealthLine(what, min(level, _WRONG), f"listening: {text}" if level else "listening")
+        return _line(what, _WRONG, f"not listening: {why}" if why else "not listening")
+    return _line(what, min(level, _WRONG), f"listening: {text}" if level else "listening")
 
 
 def _thing(subject: str, node: str) -> str:
@@ -379,18 +373,9 @@ def _unheard(microphone: LiveMicrophone, day: DaySpan, today: Today) -> list[tup
     if not microphone.is_listening():
         spans.append((max(microphone.heard.time, day.start), today.now))
     inside = [(max(a, day.start), min(b, today.now)) for a, b in spans]
-    return _joined([(a, b) for a, b in inside if b - a >= _SILENT])
-
-
-def _joined(spans: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Join spans with less than two minutes between them."""
-    joined: list[tuple[int, int]] = []
-    for start, end in sorted(spans):
-        if joined and start - joined[-1][1] < BIN:
-            joined[-1] = joined[-1][0], max(joined[-1][1], end)
-        else:
-            joined.append((start, end))
-    return joined
+    long = np.array([(a, b) for a, b in inside if b - a >= _SILENT], np.int64).reshape(-1, 2)
+    gaps = joined(long[:, 0], long[:, 1], BIN - 1)  # with two minutes and more between them
+    return [*zip(gaps.starts.tolist(), gaps.ends.tolist(), strict=True)]
 
 
 _EVERY_SECONDS = 1.0
@@ -453,12 +438,11 @@ class HomePage:
         if not self._is_read_back:
             self._is_read_back = True
             threading.Thread(target=self._read_back, daemon=True).start()
-        last = last_events(news, self._corrections.of)
-        self._events = last.events
+        self._events, last = last_events(news, self._corrections.of)
         self._put("now", self._now.describe(news))
         self._put("scenarios", scenario_lines(news))
         self._put("home", {"home": room(self._node), "clock": clock(news.today.now, news.zone)})
-        self._put("events", last.shown)
+        self._put("events", last)
         self._put("recurring", self._recurring.describe(Moment(news.today.now, news.zone)))
         self._put("health", health_list(news, self._node, self._started, self._recurring.problem))
         key = _day_key(news)
