@@ -117,7 +117,7 @@ class Bridge:
         early: deque[SoundEvent] = deque(maxlen=_MOST_EARLY)
         had_caught_up = False
         try:
-            for state, begun in follow_home(self.home, self.since, stop, self._damaged):
+            for state, begun in follow_home(self.home, self.since, stop, self.say):
                 self._live()
                 early += begun
                 if state.caught_up:
@@ -154,9 +154,6 @@ class Bridge:
             step()
         except Exception as error:  # noqa: BLE001  a failing output must not stop the others
             self.say(f"{name}: {type(error).__name__}: {error}")
-
-    def _damaged(self, error: Exception) -> None:
-        self.say(str(error))
 
 
 _REPEAT_SECONDS = 3600.0
@@ -254,8 +251,7 @@ def open_outputs(
 
             return MqttPublisher(mqtt, home, state_folder, say)
 
-        publisher = ReopenedOutput(publish, say)
-        outputs["mqtt"] = publisher
+        outputs["mqtt"] = publisher = ReopenedOutput(publish, say)
     if (figures := settings.prometheus) is not None:
         first = since
 
@@ -336,29 +332,31 @@ _Step = tuple[Path | None, Callable[[], object]]  # the file of a secret, and it
 
 def _secret_steps(settings: BridgeSettings, problems: list[str]) -> Iterator[_Step]:
     """Yield the checks of the files of secrets."""
-    if (mqtt := settings.mqtt) is not None:
-        yield mqtt.password_file, partial(_check_password, mqtt)
-    if (page := settings.page) is not None and page.token_file is not None:
+    mqtt, page, figures = settings.mqtt, settings.page, settings.prometheus
+    if mqtt is not None:
+        yield mqtt.password_file, partial(_check_connection, "read_password", mqtt)
+    if page is not None and page.token_file is not None:
         yield page.token_file, partial(read_token, page.token_file)
-    if (figures := settings.prometheus) is not None and figures.port is not None:
+    if figures is not None and figures.port is not None:
         yield figures.token_file, partial(figures_token, figures.port, figures.token_file)
     if settings.ping is not None and (url := settings.ping.url_file) is not None:
         yield url, lambda: read_ping_address(secret_path(url))
     if (file := settings.delivery.urls_file) is not None:
         from hearthlog.analyzer.bridge.alerts.delivery import find_targets  # noqa: PLC0415
 
-        yield file, lambda: problems.extend(find_targets(file, lambda _: None)[1])
+        yield file, lambda: problems.extend(find_targets(file, lambda _: None).problems)
 
 
 def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
     """Yield the checks of certificates, addresses and folders."""
-    if (mqtt := settings.mqtt) is not None:
+    mqtt, page, figures = settings.mqtt, settings.page, settings.prometheus
+    if mqtt is not None:
         yield None, mqtt.check_files
         if mqtt.tls:
-            yield None, partial(_check_certificates, mqtt)
-    if (page := settings.page) is not None:
+            yield None, partial(_check_connection, "tls_context", mqtt)
+    if page is not None:
         yield None, lambda: listen(bind=page.bind).close()
-    if (figures := settings.prometheus) is not None:
+    if figures is not None:
         yield None, figures.check_readers
         if figures.text_file is not None:
             yield None, partial(_check_text_file, figures.text_file)
@@ -368,29 +366,22 @@ def _other_steps(settings: BridgeSettings) -> Iterator[_Step]:
         yield None, partial(check_writable, settings.state)
 
 
-def _check_password(settings: MqttSettings) -> None:
-    from hearthlog.analyzer.bridge.mqtt.connection import read_password  # noqa: PLC0415
+def _check_connection(check: str, settings: MqttSettings) -> None:
+    from hearthlog.analyzer.bridge.mqtt import connection  # noqa: PLC0415
 
-    read_password(settings)
-
-
-def _check_certificates(settings: MqttSettings) -> None:
-    from hearthlog.analyzer.bridge.mqtt.connection import tls_context  # noqa: PLC0415
-
-    tls_context(settings)
+    getattr(connection, check)(settings)
 
 
 def _check_text_file(file: Path) -> None:
-    problem = ""
     try:
         if stat.S_ISDIR(file.stat().st_mode):
             problem = "is a folder; name a file in it, as hearthlog.prom"
+            raise BridgeError(f"bridge.prometheus: text_file: {file} {problem}")
     except (FileNotFoundError, NotADirectoryError):
         pass  # `check_writable` checks the folder below
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
-    if problem:
-        raise BridgeError(f"bridge.prometheus: text_file: {file} {problem}")
+        raise BridgeError(f"bridge.prometheus: text_file: {file} {problem}") from error
     check_writable(file.absolute().parent)
 
 
@@ -413,11 +404,9 @@ def exposed_files(settings: BridgeSettings, file: Path | None, state: Path | Non
         The state folder of the bridge; None if unknown.
     """
     mqtt, page, figures, ping = settings.mqtt, settings.page, settings.prometheus, settings.ping
+    tables = (ping, "url_file"), (mqtt, "password_file"), (mqtt, "key_file"), (page, "token_file")
     files = [settings.delivery.urls_file]
-    files += [] if figures is None else [figures.token_file]
-    files += [] if ping is None else [ping.url_file]
-    files += [] if mqtt is None else [mqtt.password_file, mqtt.key_file]
-    files += [] if page is None else [page.token_file]
+    files += [getattr(table, key, None) for table, key in ((figures, "token_file"), *tables)]
     paths = [secret_path(each) for each in files if each is not None]
     paths += [] if page is None or state is None else page_secrets(state)
     paths += [file] if file is not None and ping is not None and has_password(ping.url) else []

@@ -335,7 +335,7 @@ def is_of_bridge(topic: str) -> bool:
 
 
 def follow_home(
-    home: RecorderAddress, start: int, stop: Flag, damaged: Callable[[LogError], None]
+    home: RecorderAddress, start: int, stop: Flag, say: Callable[[str], None]
 ) -> Iterator[tuple[HomeState, list[SoundEvent]]]:
     """Follow the logs of a recorder, and update the state of its home.
 
@@ -343,8 +343,8 @@ def follow_home(
     ----------
     start : int
         Log time from which events are read, in nanoseconds of UTC.
-    damaged : callable
-        Called with the error of a log that can be read no further, or a missing folder.
+    say : callable
+        Called with a problem: a log that can be read no further, or a missing folder.
 
     Yields
     ------
@@ -355,13 +355,15 @@ def follow_home(
     """
     state, folder = HomeState(), home.folder
     while not folder.is_dir():
-        damaged(LogError(f"{folder}: no such folder yet; waiting for a recorder"))
+        say(f"{folder}: no such folder yet; waiting for a recorder")
         state.caught_up = True
         yield state, []
         if stop.wait(_WAIT_SECONDS):
             return
     state.caught_up = False
-    messages = follow_messages(folder, is_of_bridge, start, stop, damaged, ticks=True)
+    messages = follow_messages(
+        folder, is_of_bridge, start, stop, lambda error: say(str(error)), ticks=True
+    )
     yielded, current, described = -math.inf, folder, folder
     for path, batch in messages:
         if path == folder:  # a tick: everything written so far has been read
@@ -375,30 +377,30 @@ def follow_home(
             if path != current and not is_layer(path):
                 current = path
                 state.begin_log()
-                _check_version(path, damaged)
+                _check_version(path, say)
             yielded = time.monotonic()
-            yield state, _push(state, path, batch, damaged)
+            yield state, _push(state, path, batch, say)
         if stop.is_set():
             return
 
 
 def _push(
-    state: HomeState, log: Path, batch: list[RawMessages], damaged: Callable[[LogError], None]
+    state: HomeState, log: Path, batch: list[RawMessages], say: Callable[[str], None]
 ) -> list[SoundEvent]:
     """Add a batch of messages from a log; return the events that they begin."""
     try:
         return state.push(_decode(batch))
     except LogError as error:
-        damaged(LogError(f"{log}: {error}"))
+        say(f"{log}: {error}")
         return []
 
 
-def _check_version(log: Path, damaged: Callable[[LogError], None]) -> None:
+def _check_version(log: Path, say: Callable[[str], None]) -> None:
     """Report a log written by a later version, which is read only in part."""
     with suppress(LogError), LogFile(log) as file:  # the file may be renamed at this moment
         for record in provenance_records(file):
             if text := unknown_version(record):
-                damaged(LogError(f"{log}: {text}"))
+                say(f"{log}: {text}")
 
 
 def _labelling_sources(log: Path) -> set[str] | None:

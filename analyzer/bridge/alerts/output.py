@@ -360,7 +360,7 @@ class AlertsOutput:
                 )
             self._heard.push(decode_fields(known, FIELDS))
         except LogError as error:
-            self._damaged(LogError(f"{path}: {error}"))
+            self._damaged(f"{path}: {error}")
 
     def _look(self) -> None:
         if not self._has_news.is_set() and time.monotonic() - self._began < _WAIT_SECONDS:
@@ -394,7 +394,7 @@ class AlertsOutput:
         open_segments = self._heard.open_segments()
         return read_activity(logs, home.node, start, end, lambda _: None, others=open_segments)
 
-    def _damaged(self, error: LogError) -> None:
+    def _damaged(self, error: object) -> None:
         self._say(f"alerts: {error}")
 
 

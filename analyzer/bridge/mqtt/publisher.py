@@ -3,7 +3,7 @@
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -14,7 +14,7 @@ from paho.mqtt.client import MQTTMessage
 
 from hearthlog.analyzer.bridge.events import ANY_SOUND, SoundEvent
 from hearthlog.analyzer.bridge.home import RecorderAddress, iso_time
-from hearthlog.analyzer.bridge.home_state import HomeState, ListeningThreshold, LiveMicrophone
+from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.connection import Connection, place_of
 from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     command_discovery,
@@ -69,6 +69,8 @@ class MqttPublisher:
         self._begun: deque[SoundEvent] = deque(maxlen=_MOST_BEGUN)
         self._ended: deque[SoundEvent] = deque(maxlen=_MOST_BEGUN)
         self._is_born = False
+        self._birth_topic = f"{settings.discovery_topic}/status"
+        self._command_topic = topics.of_home("command")
         subscriptions = [self._birth_topic] if settings.home_assistant else []
         self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
@@ -193,14 +195,6 @@ class MqttPublisher:
             self._connection.send(
                 self._topics.of_home("command/answer"), json.dumps(answer._asdict())
             )
-
-    @property
-    def _command_topic(self) -> str:
-        return self._topics.of_home("command")
-
-    @property
-    def _birth_topic(self) -> str:
-        return f"{self._settings.discovery_topic}/status"
 
     def _take(self, message: MQTTMessage) -> None:
         """Store a received message; runs in the thread of the connection."""
@@ -330,9 +324,17 @@ class MqttPublisher:
             is_told = self._announced.is_told(label)
             if self._settings.commands:
                 self._keep(Place(TOLD, label=label), _ON[is_told])
-            for kind, value in class_values(microphone, label, news, known):
-                shown = value if is_told or kind != "on" else _ON[False]
-                self._keep(Place(kind, microphone.name, label), shown)
+            counts = microphone.counts(label, news.today, known)
+            values = {
+                "on": _ON[microphone.heard.is_heard(label) and is_told],
+                "count_today": str(counts[0]),  # Home Assistant reads `None` as unknown
+                "count_night": str(counts[1]),
+            }
+            last = microphone.last_event(label)
+            if last is not None:  # otherwise the retained value of an earlier bridge is right
+                values["last_heard"] = iso_time(last.end, news.zone)
+            for kind, value in values.items():
+                self._keep(Place(kind, microphone.name, label), value)
 
     def _publish_problem(self, microphone: LiveMicrophone, state: HomeState) -> None:
         others = state.microphones.keys() - {microphone.name}
@@ -343,19 +345,6 @@ class MqttPublisher:
         ]
         value = {"state": _ON[bool(bad)], "text": shortened("; ".join(bad), _LONGEST)}
         self._keep(Place("problem", microphone.name), json.dumps(value))
-
-
-def class_values(
-    microphone: LiveMicrophone, label: str, news: News, known: ListeningThreshold
-) -> Iterator[tuple[str, str]]:
-    """Yield the retained values of a class: the kind of topic, and the value."""
-    yield "on", _ON[microphone.heard.is_heard(label)]
-    counts = microphone.counts(label, news.today, known)
-    for kind, count in zip(("count_today", "count_night"), counts, strict=True):
-        yield kind, str(count)  # Home Assistant reads `None` as unknown
-    last = microphone.last_event(label)
-    if last is not None:  # otherwise the retained value of an earlier bridge is right
-        yield "last_heard", iso_time(last.end, news.zone)
 
 
 def event_fields(event: SoundEvent, news: News) -> dict[str, str | float]:
