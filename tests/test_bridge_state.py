@@ -149,13 +149,13 @@ def test_a_time_is_written_with_the_offset_of_the_home():
 @given(st.text(min_size=1, max_size=20))
 def test_a_class_of_any_name_has_a_topic_of_its_own(label):
     topics = Topics("hearthlog", "home")
-    topic = topics.of_class("mic", label, "on")
+    topic = topics.at("on", "mic", label)
     assert not {"+", "#", "\x00"} & set(topic)
     assert topic.count("/") == 5
     if label.isprintable():
         for place in (Place("told", label=label), Place("on", "mic", label)):
-            assert topics.parse(topics.name(place)) == place
-        assert topic.split("/")[-2] == topics.of_told(label).split("/")[-1]
+            assert topics.parse(topics.at(*place)) == place
+        assert topic.split("/")[-2] == topics.at("told", label=label).split("/")[-1]
 
 
 @given(st.text(max_size=20))

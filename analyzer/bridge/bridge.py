@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from threading import Event as Flag
 from threading import Lock, Thread
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Any
 
 from hearthlog.analyzer.bridge.events import SoundEvent
 from hearthlog.analyzer.bridge.home import RecorderAddress, today
@@ -38,10 +38,6 @@ from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import exposed_secret
 from hearthlog.schemas.frames import NANOSECONDS
-
-if TYPE_CHECKING:
-    from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
-
 
 _ERROR = 2  # level of diagnostics
 _SOON = 10.0  # seconds from the start to the first ping
@@ -186,10 +182,8 @@ _OLDEST = 7 * 24 * 3600 * NANOSECONDS  # longest history read at a start
 _EARLIER = 6 * 3600 * NANOSECONDS  # longest event: read from this much earlier for complete events
 _AGAIN_SECONDS = 60.0
 
-_Output = TypeVar("_Output", bound=Output)
 
-
-class ReopenedOutput(Generic[_Output]):
+class ReopenedOutput:
     """An output that is retried every minute while it cannot be opened.
 
     Attributes
@@ -198,8 +192,8 @@ class ReopenedOutput(Generic[_Output]):
         None while the output cannot be opened.
     """
 
-    def __init__(self, make: Callable[[], _Output], say: Callable[[str], None]) -> None:
-        self.output: _Output | None = None
+    def __init__(self, make: Callable[[], Output], say: Callable[[str], None]) -> None:
+        self.output: Any = None
         self._make = make
         self._say = say
         self._due = 0.0  # by CLOCK_MONOTONIC
@@ -246,7 +240,7 @@ def open_outputs(
     # Imported here: without a broker no MQTT client need be installed.
     if (mqtt := settings.mqtt) is not None:
 
-        def publish() -> "MqttPublisher":
+        def publish() -> Output:
             from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher  # noqa: PLC0415
 
             return MqttPublisher(mqtt, home, state_folder, say)

@@ -204,14 +204,13 @@ class _Command(BaseModel):
     pause_minutes: Annotated[float, Field(gt=0, le=_MOST_MINUTES)] | None = None
     resume: bool = False
 
-    def problem(self) -> str:
-        """Return the error in the command; empty if there is none."""
+    def check(self) -> None:
+        """Check which fields are there, or raise `BridgeError`."""
         of_class = self.correct is not None, self.told is not None
         if sum([*of_class, self.pause_minutes is not None, self.resume]) != 1:
-            return "one of correct, told, pause_minutes and resume has to be there"
+            raise BridgeError("one of correct, told, pause_minutes and resume has to be there")
         if (self.label is not None) != any(of_class):
-            return "label belongs to correct and told"
-        return ""
+            raise BridgeError("label belongs to correct and told")
 
 
 class Commands:
@@ -284,6 +283,5 @@ def _parse(payload: bytes) -> _Command:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "command"
         raise BridgeError(f"{where}: {first['msg']}") from error
-    if problem := command.problem():
-        raise BridgeError(problem)
+    command.check()
     return command

@@ -114,21 +114,18 @@ class PrometheusOutput:
         """Open the configured port; with a text file, a failure is only reported."""
         if self._settings.port is None or self._server is not None:
             return
+        port, file = self._settings.port, self._settings.text_file
         try:
-            self._server = self._listen(self._settings.port)
-        except BridgeError as error:
-            if self._settings.text_file is None:
-                raise
-            self._say(f"{error}; {self._settings.text_file} is written all the same")
-
-    def _listen(self, port: int) -> "_Server":
-        token = figures_token(port, self._settings.token_file)
-        try:
-            return _Server(port, token, self._current)
-        except OSError as error:
-            raise BridgeError(
-                f"bridge.prometheus: cannot listen on port {port} ({error.strerror}); take another"
-            ) from error
+            token = figures_token(port, self._settings.token_file)
+            self._server = _Server(port, token, self._current)
+        except (BridgeError, OSError) as error:
+            text = str(error)
+            if isinstance(error, OSError):
+                text = f"cannot listen on port {port} ({error.strerror}); take another"
+                text = f"bridge.prometheus: {text}"
+            if file is None:
+                raise BridgeError(text) from error
+            self._say(f"{text}; {file} is written all the same")
 
     def _current(self) -> bytes | None:
         """Return the metrics; None if they are stale."""

@@ -45,10 +45,12 @@ def _check_secret_file(value: Any) -> Any:
 SecretFile = Annotated[PlainPath, BeforeValidator(_check_secret_file)]
 
 
-class DeliverySettings(BaseModel):
-    """Where alerts go, besides the broker of MQTT."""
-
+class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DeliverySettings(_Table):
+    """Where alerts go, besides the broker of MQTT."""
 
     urls_file: SecretFile | None = Field(
         default=None,
@@ -122,10 +124,6 @@ def _check_bind(address: str) -> str:
             "127.0.0.1"
         )
     return address
-
-
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class MqttSettings(_Table):

@@ -76,16 +76,6 @@ def unknown_microphone(
     return f"{rule.name}: {lacks}; there is {listed(sorted(microphones))}"
 
 
-def unheard_microphone(rule: AlertRule, microphones: Collection[str]) -> str:
-    """Report that the microphone of a rule has no model; empty if it has one."""
-    if not isinstance(rule, SoundRule) or rule.microphone not in microphones:
-        return ""
-    return (
-        f"{rule.name}: the microphone {rule.microphone!r} has no model, so that no sound of it has "
-        "a class"
-    )
-
-
 _JUDGED_AND_TODAY = 2  # days, in addition to the baseline
 
 
@@ -157,7 +147,12 @@ def unheard_classes(
                 classes[source_name(name, scenario)] = own
     without = [name for name in microphones if models[name] == (NO_MODEL, {})]
     for rule in rules:
-        line = unheard_microphone(rule, without) or unknown_class(rule, classes)
+        line = unknown_class(rule, classes)
+        if isinstance(rule, SoundRule) and rule.microphone in without:
+            line = (
+                f"{rule.name}: the microphone {rule.microphone!r} has no model, so that no sound "
+                "of it has a class"
+            )
         yield from filter(None, [line])
 
 

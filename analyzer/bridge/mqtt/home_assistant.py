@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from hearthlog._version import __version__
-from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, Place, Topics, identifier
+from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, Topics, identifier
 from hearthlog.models.classes import SILENCE, in_words
 
 Component = dict[str, Any]  # of a discovery payload, as Home Assistant defines it
@@ -53,8 +53,8 @@ def discovery(
     return {
         **_device(own, f"Hearthlog {topics.node} {microphone}"),
         "availability": [
-            {"topic": topics.of_home("bridge")},
-            {"topic": topics.of_microphone(microphone, "listening")},
+            {"topic": topics.at("bridge")},
+            {"topic": topics.at("listening", microphone)},
         ],
         "availability_mode": "all",
         "components": components,
@@ -72,7 +72,7 @@ def command_discovery(
         Former classes, whose switches are removed.
     """
     own = home_id(topics.node)
-    command = topics.of_home("command")
+    command = topics.at("command")
 
     def button(name: str, icon: str, **fields: Any) -> Component:
         press = _command(**fields)
@@ -87,7 +87,7 @@ def command_discovery(
             "switch",
             f"Tell of {words}",
             entity_category="config",
-            state_topic=topics.of_told(name),
+            state_topic=topics.at(TOLD, label=name),
             state_on="ON",
             state_off="OFF",
             payload_on=_command(told=True, label=name),
@@ -99,7 +99,7 @@ def command_discovery(
     components |= {f"told_{identifier(name)}": {"p": "switch"} for name in gone}
     return {
         **_device(own, f"Hearthlog {topics.node}"),
-        "availability": [{"topic": topics.of_home("bridge")}],
+        "availability": [{"topic": topics.at("bridge")}],
         "components": components,
     }
 
@@ -121,7 +121,7 @@ def described(topics: Topics, payload: bytes) -> list[Place]:
         return []
     microphone = places[0].microphone if listening and places[0] is not None else ""
     device = device_id(topics.node, microphone) if microphone else home_id(topics.node)
-    if (own, bridge) != (device, topics.of_home("bridge")):
+    if (own, bridge) != (device, topics.at("bridge")):
         return []
     more = [Place("last_event", microphone)] if microphone else []
     found = [each for each in places if each is not None and each.microphone == microphone]
@@ -151,7 +151,7 @@ def _entity(platform: str, name: str, **fields: Any) -> Component:
 
 def _of_microphone(topics: Topics, microphone: str, sounds: Sequence[str]) -> dict[str, Component]:
     def at(kind: str) -> str:
-        return topics.of_microphone(microphone, kind)
+        return topics.at(kind, microphone)
 
     def diagnostic(name: str, device_class: str, topic: str, **fields: Any) -> Component:
         fields = {
@@ -159,7 +159,7 @@ def _of_microphone(topics: Topics, microphone: str, sounds: Sequence[str]) -> di
             "entity_category": "diagnostic",
             "state_topic": topic,
             **fields,
-            "availability": [{"topic": topics.of_home("bridge")}],
+            "availability": [{"topic": topics.at("bridge")}],
         }
         return _entity("binary_sensor", name, **fields)
 
@@ -194,7 +194,7 @@ def _of_microphone(topics: Topics, microphone: str, sounds: Sequence[str]) -> di
             icon="mdi:waveform",
         ),
         "listening": diagnostic("Listening", "connectivity", at("listening"), **online),
-        "recorder": diagnostic("Recorder", "connectivity", topics.of_home("recorder"), **online),
+        "recorder": diagnostic("Recorder", "connectivity", topics.at("recorder"), **online),
         "problem": diagnostic(
             "Problem",
             "problem",
@@ -214,7 +214,7 @@ def _words(names: Sequence[str]) -> dict[str, str]:
 
 def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[str, Component]:
     def at(kind: str) -> str:
-        return topics.of_class(microphone, name, kind)
+        return topics.at(kind, microphone, name)
 
     def count(kind: str, what: str) -> Component:
         fields = {"state_class": "total_increasing", "state_topic": at(kind), "icon": "mdi:counter"}
@@ -229,7 +229,7 @@ def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[st
         "trigger": {
             "p": "device_automation",
             "automation_type": "trigger",
-            "topic": topics.of_microphone(microphone, "event"),
+            "topic": topics.at("event", microphone),
             "value_template": "{{ value_json.event_type }}",
             "type": "heard",
             "subtype": words,

@@ -70,7 +70,7 @@ class MqttPublisher:
         self._ended: deque[SoundEvent] = deque(maxlen=_MOST_BEGUN)
         self._is_born = False
         self._birth_topic = f"{settings.discovery_topic}/status"
-        self._command_topic = topics.of_home("command")
+        self._command_topic = topics.at("command")
         subscriptions = [self._birth_topic] if settings.home_assistant else []
         self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
@@ -89,7 +89,7 @@ class MqttPublisher:
         if settings.commands:
             subscriptions.append(self._command_topic)
             if self._reads_back:
-                subscriptions.append(topics.told_filter)
+                subscriptions.append(topics.at(TOLD) + "+")
         if self._is_new:
             subscriptions.append(self._discovery_topic("+"))
         client_id = settings.client_id or f"hearthlog-{home.node}"
@@ -97,7 +97,7 @@ class MqttPublisher:
             self._connection = Connection(
                 settings,
                 client_id,
-                topics.of_home("bridge"),
+                topics.at("bridge"),
                 say,
                 subscriptions=subscriptions,
                 received=self._take,
@@ -105,7 +105,7 @@ class MqttPublisher:
         except BaseException:
             self._announced.close()
             raise
-        self._announced.add(topics.of_home("bridge"), Place("bridge"))
+        self._announced.add(topics.at("bridge"), Place("bridge"))
         self._commands = self._take_commands() if settings.commands else None
 
     def update(self, news: News) -> None:
@@ -157,7 +157,7 @@ class MqttPublisher:
 
     def _send_events(self, kind: str, events: Sequence[SoundEvent], news: News) -> None:
         for event in (each for each in events if self._announced.is_told(each.label)):
-            topic = self._topics.of_microphone(event.microphone, kind)
+            topic = self._topics.at(kind, event.microphone)
             self._connection.send(topic, json.dumps(event_fields(event, news)))
 
     def alert(self, name: str, text: str, time: int) -> bool:
@@ -170,7 +170,7 @@ class MqttPublisher:
         """
         since = iso_time(time, self._home.zone)
         fields = {"event_type": "alert", "name": name, "text": text, "time": since}
-        return self._connection.deliver(self._topics.of_home("alert"), json.dumps(fields))
+        return self._connection.deliver(self._topics.at("alert"), json.dumps(fields))
 
     def close(self) -> None:
         """Publish `offline`, and stop."""
@@ -192,9 +192,7 @@ class MqttPublisher:
             self._commands.add(self._asked.popleft(), state.find_event)
         while self._answers:
             answer = self._answers.popleft()
-            self._connection.send(
-                self._topics.of_home("command/answer"), json.dumps(answer._asdict())
-            )
+            self._connection.send(self._topics.at("command/answer"), json.dumps(answer._asdict()))
 
     def _take(self, message: MQTTMessage) -> None:
         """Store a received message; runs in the thread of the connection."""
@@ -251,7 +249,7 @@ class MqttPublisher:
         if kind == CONFIG:
             device = device_id(node, microphone) if microphone else home_id(node)
             return self._discovery_topic(device)
-        return self._topics.name(place)
+        return self._topics.at(*place)
 
     def _keep(self, place: Place, value: str) -> None:
         """Publish a retained value, and record its topic."""

@@ -16,7 +16,6 @@ from hearthlog.analyzer.bridge.events import SoundEvent
 from hearthlog.analyzer.bridge.state import StateFile
 from hearthlog.schemas.new_files import open_lock, private_folder
 
-_CLASS_PART = "/class/"
 _KEPT = "".join(chr(code) for code in range(33, 127) if chr(code) not in "%+#/$")
 
 
@@ -42,45 +41,27 @@ class Topics(NamedTuple):
         """Common prefix of the recorder's topics."""
         return f"{self.base}/{self.node}"
 
-    def of_home(self, kind: str) -> str:
-        """Return a topic of the recorder, such as `bridge` or `recorder`."""
-        return f"{self.root}/{kind}"
-
-    def of_microphone(self, microphone: str, kind: str) -> str:
-        """Return a topic of a microphone, such as `listening`, `heard` or `event`."""
-        return f"{self.root}/{microphone}/{kind}"
-
-    def of_class(self, microphone: str, label: str, kind: str) -> str:
-        """Return a topic of a class: `on`, `count_today`, `count_night` or `last_heard`.
+    def at(self, kind: str, microphone: str = "", label: str = "") -> str:
+        """Return the topic of a place of any kind but `config`, which uses discovery topics.
 
         Parameters
         ----------
-        label : str
+        kind : str
+            Of the recorder, such as `bridge`; of a microphone, such as `heard`; or of a class, such
+            as `on`, or `told`, which shows whether its events are published.
+        label : str, optional
             The class; characters that are invalid in topics or not ASCII are percent-encoded, such
             as `%2B`.
         """
-        return f"{self.root}/{microphone}{_CLASS_PART}{_part(label)}/{kind}"
-
-    def of_told(self, label: str) -> str:
-        """Return the topic that shows whether events of a class are published."""
-        return f"{self.root}/told/{_part(label)}"
-
-    @property
-    def told_filter(self) -> str:
-        """Subscription filter for all topics of `of_told`."""
-        return f"{self.root}/told/+"
-
-    def name(self, place: Place) -> str:
-        """Return the topic of a place of any kind but `config`, which uses discovery topics."""
-        kind, microphone, label = place
+        part = quote(label, safe=_KEPT)
         if kind == TOLD:
-            return self.of_told(label)
+            return f"{self.root}/told/{part}"
         if label:
-            return self.of_class(microphone, label, kind)
-        return self.of_microphone(microphone, kind) if microphone else self.of_home(kind)
+            return f"{self.root}/{microphone}/class/{part}/{kind}"
+        return f"{self.root}/{microphone}/{kind}" if microphone else f"{self.root}/{kind}"
 
     def parse(self, topic: str) -> Place | None:
-        """Return the place of a topic, the inverse of `name`; None for other topics."""
+        """Return the place of a topic, the inverse of `at`; None for other topics."""
         parts = topic.removeprefix(f"{self.root}/").split("/")
         match parts:
             case [kind]:
@@ -93,11 +74,7 @@ class Topics(NamedTuple):
                 place = Place(kind, microphone, unquote(label))
             case _:
                 return None
-        return place if self.name(place) == topic else None
-
-
-def _part(label: str) -> str:
-    return quote(label, safe=_KEPT)
+        return place if self.at(*place) == topic else None
 
 
 def identifier(text: str) -> str:

@@ -117,14 +117,8 @@ def _active_since(microphone: LiveMicrophone) -> int:
         end = microphone.heard.time - _GOES_ON
         going = [event.start for event in last if event is not None and event.end >= end]
         return max(going) if len(going) == len(heard) else 0
-    return max((event.end for event in _last_events(microphone)), default=0)
-
-
-def _last_events(microphone: LiveMicrophone) -> Iterator[SoundEvent]:
-    for label in microphone.labels():
-        event = microphone.last_event(label)
-        if event is not None:
-            yield event
+    last = [microphone.last_event(label) for label in microphone.labels()]
+    return max((event.end for event in last if event is not None), default=0)
 
 
 def _level(microphone: LiveMicrophone) -> Any:

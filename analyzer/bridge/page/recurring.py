@@ -69,15 +69,10 @@ def recurring_list(
     }
 
 
-def group_words(group: GroupSummary) -> str:
-    """Return the readable name of a group: `Door bell`, or `Sound 3` if unnamed."""
-    return class_words(group.name) if group.name else f"Sound {group.number}"
-
-
 def _described(key: str, group: GroupSummary, said: str, moment: Moment, *, is_alone: bool) -> Any:
     return {
         "id": key,
-        "words": group_words(group),
+        "words": class_words(group.name) if group.name else f"Sound {group.number}",
         "is_named": bool(group.name),
         "about": _how_often(group),
         "heard": _named_as(group),

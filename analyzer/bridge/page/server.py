@@ -227,7 +227,7 @@ _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
     "base-uri 'none'; form-action 'none'; require-trusted-types-for 'script'; trusted-types 'none'"
 )
-_PROTECTION = {
+_FIELDS = {
     **HttpHandler.fields,
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -239,13 +239,6 @@ _ENTRANCE = (
     '<!doctype html><html lang="en"><meta charset="utf-8"><title>The home</title>'
     '<meta http-equiv="refresh" content="0; url=TO"><p><a href="TO">Open the page</a></p></html>\n'
 )
-
-
-def _protection(frames: Sequence[str]) -> dict[str, str]:
-    """Return the headers of each response, for the origins that may frame the page."""
-    ancestors = " ".join(frames) or "'none'"
-    fields = {**_PROTECTION, "Content-Security-Policy": f"{_POLICY}; frame-ancestors {ancestors}"}
-    return fields if frames else fields | {"X-Frame-Options": "DENY"}
 
 
 class PageServer(HttpServer):
@@ -281,7 +274,11 @@ class PageServer(HttpServer):
             ) from error
         self.admission, self.board, self.actions = admission, board, actions
         self.has_frames = bool(frames)
-        self.fields = _protection(frames)
+        ancestors = " ".join(frames) or "'none'"
+        policy = f"{_POLICY}; frame-ancestors {ancestors}"
+        self.fields = {**_FIELDS, "Content-Security-Policy": policy}
+        if not frames:
+            self.fields["X-Frame-Options"] = "DENY"
         self.streams = threading.BoundedSemaphore(_MOST_STREAMS)
         self.start()
 
