@@ -20,10 +20,14 @@ from pydantic import TypeAdapter
 from spliced import run
 from waiting import wait_for
 
-from hearthlog.analyzer.bridge.alerts.activity import SegmentCollector, read_activity
+from hearthlog.analyzer.bridge.alerts.activity import (
+    LiveActivity,
+    LiveLabel,
+    SegmentCollector,
+    read_activity,
+)
 from hearthlog.analyzer.bridge.alerts.delivery import Outbox
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
-from hearthlog.analyzer.bridge.alerts.live_activity import LiveActivity, LiveLabel
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressStore, RuleWatch
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule, Notification, RuleState
 from hearthlog.analyzer.bridge.home import RecorderAddress

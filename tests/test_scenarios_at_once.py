@@ -23,8 +23,12 @@ from prometheus_client.parser import text_string_to_metric_families
 from spliced import run
 from test_swap import MICROPHONE, block, wait_for
 
-from hearthlog.analyzer.bridge.alerts.activity import read_activity
-from hearthlog.analyzer.bridge.alerts.live_activity import FIELDS, LiveActivity, is_of_alerts
+from hearthlog.analyzer.bridge.alerts.activity import (
+    FIELDS,
+    LiveActivity,
+    is_of_alerts,
+    read_activity,
+)
 from hearthlog.analyzer.bridge.home import RecorderAddress, times, today
 from hearthlog.analyzer.bridge.home_state import HomeState, is_of_bridge
 from hearthlog.analyzer.bridge.mqtt.home_assistant import discovery

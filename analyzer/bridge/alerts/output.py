@@ -12,7 +12,15 @@ from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
-from hearthlog.analyzer.bridge.alerts.activity import HomeActivity, SegmentCollector, read_activity
+from hearthlog.analyzer.bridge.alerts.activity import (
+    FIELDS,
+    HomeActivity,
+    LiveActivity,
+    LiveLabel,
+    SegmentCollector,
+    is_of_alerts,
+    read_activity,
+)
 from hearthlog.analyzer.bridge.alerts.delivery import (
     UNREAD,
     Addresses,
@@ -23,12 +31,6 @@ from hearthlog.analyzer.bridge.alerts.delivery import (
     replaced_names,
 )
 from hearthlog.analyzer.bridge.alerts.evaluation import judged_days, notifications
-from hearthlog.analyzer.bridge.alerts.live_activity import (
-    FIELDS,
-    LiveActivity,
-    LiveLabel,
-    is_of_alerts,
-)
 from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class
 from hearthlog.analyzer.bridge.alerts.rules import (
     DAY,
