@@ -7,7 +7,9 @@ from threading import Event, Thread
 
 import numpy as np
 from homelife import GENERAL
+from pydantic import TypeAdapter
 
+from hearthlog.analyzer.bridge.alerts.rules import AlertRule
 from hearthlog.analyzer.bridge.bridge import Bridge
 from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.frames import NANOSECONDS
@@ -24,6 +26,11 @@ MINUTE = 60 * NANOSECONDS
 def midday_zone():
     """A time zone in which it is about noon, so that what was an hour ago was today."""
     return timezone(timedelta(hours=12 - datetime.now(UTC).hour))
+
+
+def rule(kind, name="it", **keys):
+    """A rule of an alert."""
+    return TypeAdapter(AlertRule).validate_python({"name": name, "rule": kind, **keys})
 
 
 class LiveHome:

@@ -31,6 +31,7 @@ from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.settings import DeliverySettings
 from hearthlog.analyzer.bridge.state import page_token
+from hearthlog.analyzer.network import free_port
 
 # Apprise asks for it where there is one.
 pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")
@@ -75,12 +76,6 @@ def addresses(folder, *lines):
     file.write_text("\n".join(["# secret", *lines]))
     file.chmod(0o600)
     return file
-
-
-def free_port():
-    with socket.socket() as own:
-        own.bind(("127.0.0.1", 0))
-        return own.getsockname()[1]
 
 
 def test_what_was_not_told_to_all_is_there_after_the_next_start(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 from homelife import HOUR, midnight, write_day
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from livehome import rule
 from pydantic import TypeAdapter, ValidationError
 
 from hearthlog.analyzer.bridge.alerts.activity import SegmentCollector, read_activity
@@ -21,7 +22,6 @@ from hearthlog.analyzer.bridge.alerts.evaluation import (
 from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class
 from hearthlog.analyzer.bridge.alerts.rules import (
     LONGEST_PAUSE,
-    AlertRule,
     AlertRules,
     RuleState,
     duration_words,
@@ -37,10 +37,6 @@ VIENNA = ZoneInfo("Europe/Vienna")
 SECOND = 1_000_000_000
 MINUTE, DAY = 60 * SECOND, 86_400 * SECOND
 NOON = midnight(date(2026, 3, 2)) + 12 * HOUR * SECOND
-
-
-def rule(kind, **keys):
-    return TypeAdapter(AlertRule).validate_python({"name": "it", "rule": kind, **keys})
 
 
 def home(*segments, covered=(), classes=None, written=()):

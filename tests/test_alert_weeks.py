@@ -5,11 +5,10 @@ from datetime import UTC, datetime, timedelta, timezone
 
 import numpy as np
 import pytest
-from livehome import MINUTE, LiveHome, following
-from pydantic import TypeAdapter
+from livehome import MINUTE, LiveHome, following, rule
 
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressStore
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule, RuleState
+from hearthlog.analyzer.bridge.alerts.rules import RuleState
 from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.settings import DeliverySettings
 from hearthlog.models.features.auros21 import FEATURE_NAMES
@@ -50,13 +49,12 @@ def test_a_silence_that_goes_on_when_it_is_judged_was_heard(part, tmp_path):
     clock = datetime.now(UTC)
     zone = timezone(timedelta(minutes=8 * 60 + 10 - clock.hour * 60 - clock.minute))
     silent_since = now - (10 if part == "night" else 20) * HOUR - 10 * MINUTE
-    keys = {"name": "quiet", "rule": "unlike_usual", "part": part, "which": "less"}
-    rule = TypeAdapter(AlertRule).validate_python(keys)
+    quiet = rule("unlike_usual", "quiet", part=part, which="less")
     state, told, said = tmp_path / "state", [], []
     (state / "alerts").mkdir(parents=True)
     until = now - 20 * MINUTE
     progress = {"quiet": RuleState(since=until, until=until)}
-    RuleProgressStore(state / "alerts" / "rules.json", pytest.fail).save([rule], progress)
+    RuleProgressStore(state / "alerts" / "rules.json", pytest.fail).save([quiet], progress)
     home = LiveHome(tmp_path / "logs")
     write_nights(home.folder, home.classes, silent_since)
 
@@ -66,7 +64,7 @@ def test_a_silence_that_goes_on_when_it_is_judged_was_heard(part, tmp_path):
 
     try:
         place = RecorderAddress(home.folder, "home", zone)
-        own = AlertsOutput([rule], DeliverySettings(), place, state, said.append, tell)
+        own = AlertsOutput([quiet], DeliverySettings(), place, state, said.append, tell)
         end = time.monotonic() + 120
         with following(place, {"alerts": own}, said):
             while not told and time.monotonic() < end:

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from homelife import HOUR, midnight, write_day
 from livehome import LiveHome as WrittenHome
-from livehome import following
-from pydantic import TypeAdapter
+from livehome import following, rule
 from spliced import run
 from waiting import wait_for
 
@@ -29,7 +28,7 @@ from hearthlog.analyzer.bridge.alerts.activity import (
 from hearthlog.analyzer.bridge.alerts.delivery import Outbox
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressStore, RuleWatch
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule, Notification, RuleState
+from hearthlog.analyzer.bridge.alerts.rules import Notification, RuleState
 from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.settings import DeliverySettings
@@ -55,8 +54,11 @@ DAY = date(2026, 3, 2)
 AHEAD = 400 * 24 * HOUR * SECOND
 
 
-def rule(kind, name="it", **keys):
-    return TypeAdapter(AlertRule).validate_python({"name": name, "rule": kind, **keys})
+def watching(folder, rules, now, say=pytest.fail):
+    """What evaluates rules, and its notifications and its progress on the disk."""
+    outbox = Outbox(folder / "box", ["x"], say)
+    memory = RuleProgressStore(folder / "rules.json", say)
+    return RuleWatch(rules, UTC, outbox, memory, say, now), outbox, memory
 
 
 COUGHS = rule("more_than", "coughs", count=2, window="1h", **{"class": "coughing"})
@@ -89,9 +91,7 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
     gaps = read_columns(find_logs(tmp_path), ["/mic/gap"])["/mic/gap"]
     labels = labels_of(columns)
     rules = [COUGHS, WATER, QUIET, DEAF, SPEECH, EACH]
-    outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
-    memory = RuleProgressStore(tmp_path / "rules.json", pytest.fail)
-    watch = RuleWatch(rules, UTC, outbox, memory, pytest.fail, begin + MINUTE)
+    watch, outbox, _ = watching(tmp_path, rules, begin + MINUTE)
     live, now, found, until = LiveActivity(begin, 30 * SECOND), begin + MINUTE, [], 0
     edge = begin
     while now < begin + 5.5 * HOUR * SECOND:
@@ -179,10 +179,8 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
 
 def test_a_new_rule_does_not_ring_for_the_silence_before_it(tmp_path):
     silent = rule("recorder_silent", "silent", silent_for="10m")
-    memory = RuleProgressStore(tmp_path / "rules.json", pytest.fail)
-    outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
     begin = midnight(DAY)
-    watch = RuleWatch([silent], UTC, outbox, memory, pytest.fail, begin)
+    watch, _, _ = watching(tmp_path, [silent], begin)
     nothing = SegmentCollector().heard()
 
     def ring_times(minutes):
@@ -200,10 +198,8 @@ def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):
         events = [(9 * HOUR, 3000.0 if number == 10 else 300.0, "speech", 0.9)]
         write_day(tmp_path / "logs", DAY.replace(day=number), events, classes=CLASSES, file_hours=6)
     one = rule("unlike_usual", of="minutes", **{"class": "speech"})
-    outbox = Outbox(tmp_path / "box", ["x"], pytest.fail)
-    memory = RuleProgressStore(tmp_path / "rules.json", pytest.fail)
     now = midnight(DAY.replace(day=10)) + 12 * HOUR * SECOND
-    watch = RuleWatch([one], UTC, outbox, memory, pytest.fail, now)
+    watch, _, _ = watching(tmp_path, [one], now)
     asked = []
 
     def weeks(start, end):
@@ -237,18 +233,15 @@ def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
     said = []
     memory = RuleProgressStore(tmp_path / "rules.json", said.append)
     memory.save([COUGHS], {"coughs": RuleState(until=9 * HOUR * SECOND)})
-    outbox = Outbox(tmp_path / "box", ["x"], said.append)
-    watch = RuleWatch([COUGHS], UTC, outbox, memory, said.append, HOUR * SECOND)
+    watch, _, _ = watching(tmp_path, [COUGHS], HOUR * SECOND, said.append)
     assert watch.start < HOUR * SECOND
     assert said == ["alerts: the clock was ahead, and was set back; the rules begin anew"]
 
 
 def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_to_come(tmp_path):
     said, now = [], midnight(DAY) + 4 * HOUR * SECOND
-    outbox = Outbox(tmp_path / "box", ["x"], said.append)
     silent = rule("recorder_silent", "silent", silent_for="10m", cooldown="1m")
-    memory = RuleProgressStore(tmp_path / "rules.json", said.append)
-    watch = RuleWatch([silent, QUIET, COUGHS], UTC, outbox, memory, said.append, now)
+    watch, outbox, memory = watching(tmp_path, [silent, QUIET, COUGHS], now, said.append)
     nothing = SegmentCollector().heard()
 
     def evaluate(until):

@@ -361,26 +361,30 @@ def test_a_browser_that_reads_nothing_does_not_hold_up_the_others(served):
 # Ports and tokens
 
 
-def test_nothing_listens_unless_the_page_is_configured(tmp_path):
-    home = RecorderAddress(tmp_path, "home", UTC)
-    outputs, _ = open_outputs(BridgeSettings(), home, tmp_path, print)
+@pytest.fixture
+def place(tmp_path):
+    return RecorderAddress(tmp_path, "home", UTC)
+
+
+def test_nothing_listens_unless_the_page_is_configured(place, tmp_path):
+    outputs, _ = open_outputs(BridgeSettings(), place, tmp_path, print)
     assert outputs == {}
 
 
-def test_the_page_listens_on_loopback_by_default(tmp_path):
-    home, said, port = RecorderAddress(tmp_path, "home", UTC), [], free_port()
+def test_the_page_listens_on_loopback_by_default(place, tmp_path):
+    said, port = [], free_port()
     settings = BridgeSettings(page=PageSettings(port=port))
-    outputs, _ = open_outputs(settings, home, tmp_path, said.append)
+    outputs, _ = open_outputs(settings, place, tmp_path, said.append)
     assert address_of(port) == "127.0.0.1"
     outputs["page"].close()
     assert address_of(port) is None
     assert len(said) == 1
 
 
-def test_an_address_of_the_network_comes_with_a_warning(tmp_path):
+def test_an_address_of_the_network_comes_with_a_warning(place, tmp_path):
     said = []
     settings = PageSettings(port=free_port(), bind="0.0.0.0")
-    HomePage(settings, RecorderAddress(tmp_path, "home", UTC), tmp_path, said.append).close()
+    HomePage(settings, place, tmp_path, said.append).close()
     assert "in the clear" in said[1]
 
 
@@ -395,13 +399,12 @@ def test_a_port_that_is_taken_is_named(served, tmp_path):
         HomePage(PageSettings(port=served.port), served.home, tmp_path, print)
 
 
-def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path, monkeypatch):
+def test_a_token_is_made_once_and_only_its_owner_reads_it(place, tmp_path, monkeypatch):
     journal = os.fstat(2)
     monkeypatch.setenv("JOURNAL_STREAM", f"{journal.st_dev}:{journal.st_ino}")
     said = []
     for _ in range(2):
-        home = RecorderAddress(tmp_path, "home", UTC)
-        HomePage(PageSettings(port=free_port()), home, tmp_path / "state", said.append).close()
+        HomePage(PageSettings(port=free_port()), place, tmp_path / "state", said.append).close()
     secrets = {path.name: path for path in (tmp_path / "state").iterdir()}
     assert {*secrets} == {"page-token", "page-cookies", "page-address"}
     assert {path.stat().st_mode & 0o777 for path in secrets.values()} == {0o600}
@@ -411,34 +414,27 @@ def test_a_token_is_made_once_and_only_its_owner_reads_it(tmp_path, monkeypatch)
     assert all(str(secrets["page-address"]) in line for line in said)
 
 
-def test_who_starts_the_bridge_is_shown_the_whole_address(tmp_path):
+def test_who_starts_the_bridge_is_shown_the_whole_address(place, tmp_path):
     said = []
-    HomePage(
-        PageSettings(port=free_port()),
-        RecorderAddress(tmp_path, "home", UTC),
-        tmp_path,
-        said.append,
-    ).close()
+    HomePage(PageSettings(port=free_port()), place, tmp_path, said.append).close()
     assert said[0].endswith(f"/?token={(tmp_path / 'page-token').read_text().strip()}")
 
 
 @pytest.mark.parametrize(
     "text", ["", "short", "a b c d e f g h i j", "x" * 16 + "\nsecond", "é" * 20]
 )
-def test_a_file_that_has_no_token_is_refused(tmp_path, text):
+def test_a_file_that_has_no_token_is_refused(place, tmp_path, text):
     file = tmp_path / "token"
     file.write_text(text)
     with pytest.raises(BridgeError, match="has no token"):
-        HomePage(
-            PageSettings(token_file=file), RecorderAddress(tmp_path, "home", UTC), tmp_path, print
-        )
+        HomePage(PageSettings(token_file=file), place, tmp_path, print)
 
 
-def test_a_token_of_ones_own_opens_the_page(tmp_path):
+def test_a_token_of_ones_own_opens_the_page(place, tmp_path):
     file, said, port = tmp_path / "token", [], free_port()
     file.write_text("Correct.Horse_Battery~1\n")
     settings = PageSettings(port=port, token_file=file)
-    page = HomePage(settings, RecorderAddress(tmp_path, "home", UTC), tmp_path, said.append)
+    page = HomePage(settings, place, tmp_path, said.append)
     connection = HTTPConnection("127.0.0.1", port, timeout=30)
     connection.request("GET", "/?token=Correct.Horse_Battery~1")
     assert connection.getresponse().status == 200

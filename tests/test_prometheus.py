@@ -36,6 +36,10 @@ def home(tmp_path):
 TOKEN = "a-token-of-the-figures"
 
 
+def place_of(home):
+    return RecorderAddress(home.folder, "home", UTC)
+
+
 @contextmanager
 def bridged(home, folder, **settings):
     """A bridge in a thread that gives figures, with a token."""
@@ -43,7 +47,7 @@ def bridged(home, folder, **settings):
     token = folder / "token"
     token.write_text(f"{TOKEN}\n")
     settings = {"token_file": token, "readable_by": "all", **settings}
-    place = RecorderAddress(home.folder, "home", UTC)
+    place = place_of(home)
     output = PrometheusOutput(PrometheusSettings(**settings), place, folder, since, said.append)
     with following(place, {"prometheus": output}, said):
         yield
@@ -183,7 +187,7 @@ def test_a_port_that_is_taken_is_named(home, tmp_path):
 def test_a_port_without_a_token_stays_closed(home, tmp_path):
     port = free_port()
     settings = PrometheusSettings(port=port)
-    place = RecorderAddress(home.folder, "home", UTC)
+    place = place_of(home)
     with pytest.raises(BridgeError, match=f"port {port} stays closed.*name a `token_file`"):
         PrometheusOutput(settings, place, tmp_path, 0, pytest.fail)
     with pytest.raises(ConnectionRefusedError):
@@ -195,7 +199,7 @@ def test_a_port_that_stays_closed_takes_no_text_file_with_it(home, tmp_path, mon
     monkeypatch.setattr(prometheus, "_EVERY_SECONDS", 0.0)
     home.hears("silence")
     token, text, said = tmp_path / "token", tmp_path / "home.prom", []
-    place, port = RecorderAddress(home.folder, "home", UTC), free_port()
+    place, port = place_of(home), free_port()
     if lacking == "no token":
         token.touch()
     settings = PrometheusSettings(
@@ -223,9 +227,7 @@ def test_a_text_file_that_node_exporter_does_not_read_is_said_to_be_none(home, t
     said = []
     path = tmp_path / "hearthlog.txt"
     settings = PrometheusSettings(text_file=path, readable_by="owner")
-    PrometheusOutput(
-        settings, RecorderAddress(home.folder, "home", UTC), tmp_path, 0, said.append
-    ).close()
+    PrometheusOutput(settings, place_of(home), tmp_path, 0, said.append).close()
     (line,) = said
     assert line.startswith(f"bridge.prometheus: text_file: {path} does not end in .prom")
     assert line.endswith(f'write "{tmp_path}/hearthlog.prom"')
@@ -234,13 +236,8 @@ def test_a_text_file_that_node_exporter_does_not_read_is_said_to_be_none(home, t
 def test_a_text_file_that_everybody_may_read_is_said_to_be(home, tmp_path):
     said = []
     path = tmp_path / "hearthlog.prom"
-    PrometheusOutput(
-        PrometheusSettings(text_file=path),
-        RecorderAddress(home.folder, "home", UTC),
-        tmp_path,
-        0,
-        said.append,
-    ).close()
+    settings = PrometheusSettings(text_file=path)
+    PrometheusOutput(settings, place_of(home), tmp_path, 0, said.append).close()
     (line,) = said
     assert line.startswith(
         f"bridge.prometheus: every account of this machine may read {path}; write readable_by"

@@ -11,11 +11,12 @@ from homelife import GENERAL, HOUR, at, midnight, write_day
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from pydantic import TypeAdapter, ValidationError
+from livehome import rule
+from pydantic import ValidationError
 
 from hearthlog.analyzer.bridge.alerts.activity import read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
-from hearthlog.analyzer.bridge.alerts.rules import AlertRule, history
+from hearthlog.analyzer.bridge.alerts.rules import history
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import joined, one, without
@@ -304,11 +305,6 @@ def test_regular_hours_do_not_overlap_and_have_what_they_say():
 # In logs
 
 
-def rule(**keys):
-    about = {"name": "day", "rule": "unusual_day", **keys}
-    return TypeAdapter(AlertRule).validate_python(about)
-
-
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     """Nineteen days of which the last has no lunch, and a bad night after it."""
@@ -329,7 +325,7 @@ def test_an_alert_tells_of_an_unusual_day_in_the_morning_after_it(logs):
     shelf, start = find_home_logs([logs]), midnight(MONDAY)
     heard = read_activity(shelf, "home", start, 1 << 62, pytest.fail)
     end = start + 20 * 24 * HOUR * NANOSECONDS
-    (ring,), _ = notifications(rule(once_in=100), heard, start, end, UTC)
+    (ring,), _ = notifications(rule("unusual_day", "day", once_in=100), heard, start, end, UTC)
     assert ring.time == start + (19 * 24 + 8) * HOUR * NANOSECONDS
     assert ring.text.startswith("Fri 20 Feb and the night after it, ")
     assert "bouts of coughing in the night 3" in ring.text
@@ -344,11 +340,11 @@ def test_a_report_says_what_was_unlike_usual_days_and_how_rare_that_is(logs, tmp
 
 
 def test_a_rule_reads_five_weeks_and_waits_for_the_end_of_the_night():
-    assert history(rule()) > 33 * 24 * HOUR * NANOSECONDS
+    assert history(rule("unusual_day", "day")) > 33 * 24 * HOUR * NANOSECONDS
     with pytest.raises(ValidationError, match="a night ends at 07:00"):
-        rule(at="06:00")
+        rule("unusual_day", "day", at="06:00")
     with pytest.raises(ValidationError, match="once_in"):
-        rule(once_in=3)
+        rule("unusual_day", "day", once_in=3)
 
 
 def test_a_simulated_home_misses_its_water():
