@@ -9,7 +9,6 @@ from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from secrets import compare_digest
-from threading import Lock
 from typing import Any, cast
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -63,8 +62,7 @@ class PrometheusOutput:
         self._home = home
         self._say = say
         self.totals = Totals(state_folder / TOTALS, since)
-        self._text, self._made = b"", -math.inf  # the second by CLOCK_MONOTONIC
-        self._lock = Lock()
+        self._made = b"", -math.inf  # the metrics, and their time by CLOCK_MONOTONIC
         self._due = 0.0  # by CLOCK_MONOTONIC
         if settings.text_file is not None and settings.readable_by is None:
             say(
@@ -87,8 +85,7 @@ class PrometheusOutput:
         registry = CollectorRegistry()
         registry.register(_Figures(news, self._home, self.totals.count(news.state)))
         text = generate_latest(registry)
-        with self._lock:
-            self._text, self._made = text, time.monotonic()
+        self._made = text, time.monotonic()
         if self._settings.text_file is not None:
             self._write(self._settings.text_file, text)
 
@@ -129,9 +126,8 @@ class PrometheusOutput:
 
     def _current(self) -> bytes | None:
         """Return the metrics; None if they are stale."""
-        with self._lock:
-            is_stale = time.monotonic() - self._made > _STALE_SECONDS
-            return None if is_stale else self._text
+        text, made = self._made
+        return text if time.monotonic() - made <= _STALE_SECONDS else None
 
 
 class _Server(HttpServer):

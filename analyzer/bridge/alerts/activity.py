@@ -16,7 +16,7 @@ from hearthlog.analyzer.bridge.events import ANY_SOUND
 from hearthlog.analyzer.bridge.home import is_of_scenario, labelling_source, source_microphone
 from hearthlog.analyzer.bridge.home_state import is_of_bridge
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.selection import Described, array_names, select
+from hearthlog.analyzer.logs.selection import array_names, select
 from hearthlog.analyzer.logs.spans import NEVER, NONE, SEGMENT_DELAY, Spans, cut, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.schemas.arrays import Bool, Float32, Int64
@@ -371,15 +371,11 @@ def _add_log(
         if name is not None and source is not None:
             sources[topic] = source
             labels = labelling_topic(name.microphone, name.labelling, "label")
-            _add_classes(collector, source, selection.channels.get(labels, ()))
+            for channel, _ in selection.channels.get(labels, ()):
+                collector.add_classes(source, array_names(channel.metadata, "probabilities"))
     segments = read_columns([path], list(sources), start, end, SEGMENT_FIELDS)
     for topic, columns in segments.items():
         collector.add_segments(sources[topic], columns)
-
-
-def _add_classes(collector: SegmentCollector, source: str, channels: Sequence[Described]) -> None:
-    for channel, _ in channels:
-        collector.add_classes(source, array_names(channel.metadata, "probabilities"))
 
 
 def nodes_of(logs: HomeLogs) -> list[str]:

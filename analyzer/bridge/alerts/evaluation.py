@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.bridge.alerts.activity import HomeActivity
+from hearthlog.analyzer.bridge.alerts.activity import HomeActivity, Sounds
 from hearthlog.analyzer.bridge.alerts.rules import (
     MINUTE,
     AlertRule,
@@ -418,14 +418,12 @@ def unusual_conditions(
 
 def home_sound(heard: HomeActivity) -> HomeSegments:
     """Return the segments and coverage from which routines are fitted."""
-    coverage = heard.listened(ANY_SOUND, "")
-    parts = [_labelled(SILENCE, coverage.starts, coverage.ends)]
     sounds = {name: own for (name, of_scenario), own in heard.sounds.items() if not of_scenario}
-    parts += [_labelled(name, own.starts, own.ends) for name, own in sounds.items()]
-    starts, ends, labels = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("starts", "ends", "labels")
-    )
+    names = np.array([SILENCE, *sounds], object)
+    parts: list[Spans | Sounds] = [heard.listened(ANY_SOUND, ""), *sounds.values()]
+    starts = np.concatenate([own.starts for own in parts])
+    ends = np.concatenate([own.ends for own in parts])
+    labels = np.repeat(names, [len(own.starts) for own in parts])
     order = np.argsort(starts, kind="stable")
     of_home = [own for name, own in heard.classes.items() if not is_of_scenario(name)]
     known = sorted(set(sounds).union(*of_home))
@@ -433,10 +431,6 @@ def home_sound(heard: HomeActivity) -> HomeSegments:
         Labelling(starts[order], ends[order], labels[order]),
         {name: heard.listened(name, "") for name in known},
     )
-
-
-def _labelled(name: str, starts: Int64, ends: Int64) -> Labelling:
-    return Labelling(starts, ends, np.full(len(starts), name, object))
 
 
 NEW = RuleState()

@@ -81,13 +81,7 @@ AHEAD = 5 * SECOND  # jump from which the clock counts as set back
 
 
 class RuleWatch:
-    """Evaluates rules, queues their notifications, and saves the progress.
-
-    Attributes
-    ----------
-    start : int
-        Start of the activity that the rules need, in nanoseconds of UTC.
-    """
+    """Evaluates rules, queues their notifications, and saves the progress."""
 
     def __init__(  # noqa: PLR0913, PLR0917
         self,
@@ -106,7 +100,6 @@ class RuleWatch:
         self._progress = memory.load(rules)
         self._saved = now
         self.set_right(now)
-        self.start = self.needed_from(now)
 
     def set_right(self, now: int) -> None:
         """Restart rules whose progress is in the future, or more than a day old."""
@@ -237,7 +230,7 @@ class AlertsOutput:
         memory = RuleProgressStore(folder / "rules.json", say)
         now = self._latest = time.time_ns()
         self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
-        self._heard = LiveActivity(self._watch.start, _PATIENCE)
+        self._heard = LiveActivity(now, _PATIENCE)
         self._began = time.monotonic()
         self._has_news = Flag()  # set by the first update
         self._labels: deque[tuple[str, LiveLabel, Sequence[str]]] = deque(maxlen=_LABELS)
