@@ -17,7 +17,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from time import monotonic
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, TypeVar, cast
 from urllib.parse import urlsplit
 
 from hearthlog.analyzer.errors import DataError
@@ -25,6 +25,7 @@ from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import read_limited
 
 HOST = "127.0.0.1"
+_Connected = TypeVar("_Connected")
 
 
 def listen(port: int | None = None, bind: str = HOST) -> socket.socket:
@@ -90,6 +91,17 @@ def is_asked_in_digits(bind: str, host: str) -> bool:
         return False
     same = address == listening or listening.is_unspecified
     return same or (listening.is_loopback and address.is_loopback)
+
+
+def has_token(target: str, token: str) -> bool:
+    """Whether the target of a request is `/` with a token."""
+    return secrets.compare_digest(target.encode(), f"/?token={token}".encode())
+
+
+def busiest_address(asking: Mapping[_Connected, str]) -> list[_Connected]:
+    """Return the connections of the address with the most of them, in the given order."""
+    ((most, _),) = Counter(asking.values()).most_common(1)
+    return [each for each, host in asking.items() if host == most]
 
 
 def host_name(url: str) -> str:
@@ -213,8 +225,7 @@ class HttpServer(ThreadingHTTPServer):
         asking = {each: a.host for each, a in self._connections.items() if not a.is_admitted}
         if len(asking) < MOST_ASKING:
             return
-        ((most, _),) = Counter(asking.values()).most_common(1)
-        those = [each for each, host in asking.items() if host == most]
+        those = busiest_address(asking)
         with suppress(OSError, ValueError):  # a connection was closed meanwhile
             waiting = select.select(those, [], [], 0)[0]  # their data is about to be read
             those = [each for each in those if each not in waiting] or those

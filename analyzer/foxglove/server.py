@@ -5,11 +5,9 @@ import logging
 import re
 import socket
 from asyncio import StreamReader, StreamWriter, Task
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from secrets import compare_digest
 from threading import Thread
 from typing import Self
 
@@ -25,7 +23,14 @@ from foxglove.websocket import (
 )
 
 from hearthlog.analyzer.foxglove.publisher import Playback, Publisher
-from hearthlog.analyzer.network import hidden_address, host_name, ip_of, is_asked_in_digits
+from hearthlog.analyzer.network import (
+    busiest_address,
+    has_token,
+    hidden_address,
+    host_name,
+    ip_of,
+    is_asked_in_digits,
+)
 from hearthlog.schemas.errors import HearthlogError
 
 # Foxglove in a browser, and the desktop applications, whose pages are files.
@@ -87,7 +92,7 @@ class Admission:
             raise RefusedError(
                 f"refused: a page of {shown}; if it is yours, let it look by --origin"
             )
-        if not compare_digest(target.encode(), f"/?token={self.token}".encode()):
+        if not has_token(target, self.token):
             raise RefusedError("refused: the token is missing or wrong; copy the whole address")
         handed_on = [
             f"{name}: {fields[name.lower()]}" for name in _HANDED_ON if name.lower() in fields
@@ -177,8 +182,7 @@ class Gate:
                 await asyncio.sleep(1)
                 continue
             if len(self._asking) >= _MOST_ASKING:
-                ((most, _),) = Counter(self._asking.values()).most_common(1)
-                oldest = next(task for task, host in self._asking.items() if host == most)
+                oldest = busiest_address(self._asking)[0]
                 del self._asking[oldest]
                 oldest.cancel()
             task = self._loop.create_task(self._take(connection))

@@ -262,8 +262,10 @@ class Addresses(NamedTuple):
     lacks_package: bool = False
 
 
-def find_targets(file: Path, say: Callable[[str], None]) -> Addresses:
-    """Read a file of addresses, one per line; `#` begins a comment line."""
+def find_targets(file: Path | None, say: Callable[[str], None]) -> Addresses:
+    """Read a file of addresses, one per line, if there is one; `#` begins a comment line."""
+    if file is None:
+        return Addresses([], [], [])
     file = secret_path(file)
     try:
         importlib.invalidate_caches()  # Apprise may have been installed since the last call

@@ -23,7 +23,6 @@ from hearthlog.analyzer.bridge.alerts.activity import (
 )
 from hearthlog.analyzer.bridge.alerts.delivery import (
     UNREAD,
-    Addresses,
     Delivery,
     Outbox,
     find_targets,
@@ -294,9 +293,7 @@ class AlertsOutput:
         state = None if self._file is None else _state_of(self._file)
         if state == self._read_file:
             return
-        targets, problems, names, lacks_package = (
-            Addresses([], [], []) if self._file is None else find_targets(self._file, self._say)
-        )
+        targets, problems, names, lacks_package = find_targets(self._file, self._say)
         self._read_file = object() if lacks_package else state
         for problem in problems:
             self._say(f"alerts: {problem}; the others are told, and who is meant when it is mended")

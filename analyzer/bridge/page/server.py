@@ -21,6 +21,7 @@ from hearthlog.analyzer.network import (
     SECONDS,
     HttpHandler,
     HttpServer,
+    has_token,
     host_name,
     is_asked_in_digits,
 )
@@ -76,10 +77,6 @@ class PageAdmission:
         is_ours = compare_digest(text.encode(), self._pass(int(until)).encode())
         return is_ours and time.time() < int(until)
 
-    def has_token(self, target: str) -> bool:
-        """Whether the target of a request is the page with the token."""
-        return compare_digest(target.encode(), f"/?token={self.token}".encode())
-
     def refusal(
         self,
         target: str,
@@ -108,7 +105,7 @@ class PageAdmission:
                 'names = ["home.example"] in [bridge.page].'
             )
         cookies = self._cookies(fields["Cookie"])
-        if has_pass or self.has_token(target) or any(map(self.is_pass, cookies)):
+        if has_pass or has_token(target, self.token) or any(map(self.is_pass, cookies)):
             return ""
         reason = ""
         if target.startswith("/?token="):
@@ -306,7 +303,7 @@ class _Handler(HttpHandler):
         """Send the page, one of its files, or the stream of changes."""
         if not self._is_admitted(changes=False):
             return
-        if self._server.admission.has_token(self.path):
+        if has_token(self.path, self._server.admission.token):
             self._send_entrance()
         elif self._path == "/events":
             self._stream()
