@@ -4,7 +4,6 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from functools import reduce
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ from hearthlog.analyzer.bridge.home import is_of_scenario, labelling_source, sou
 from hearthlog.analyzer.bridge.home_state import is_of_bridge
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import array_names, select
-from hearthlog.analyzer.logs.spans import NEVER, NONE, SEGMENT_DELAY, Spans, cut, joined
+from hearthlog.analyzer.logs.spans import NEVER, NONE, SEGMENT_DELAY, Spans, cut, joined, one
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -126,7 +125,7 @@ class HomeActivity:
             for name, spans in self.coverage.items()
             if microphone in {"", source_microphone(name)} and self._knows(name, label)
         ]
-        return reduce(_either, knowing, NONE)
+        return _union(*knowing)
 
     def _knows(self, source: str, label: str) -> bool:
         known = self.classes.get(source)
@@ -150,8 +149,9 @@ class HomeActivity:
         )
 
 
-def _either(a: Spans, b: Spans) -> Spans:
-    return joined(np.concatenate([a.starts, b.starts]), np.concatenate([a.ends, b.ends]))
+def _union(*parts: Spans, pause: int = 0) -> Spans:
+    starts, ends = (np.concatenate(edges) for edges in zip(NONE, *parts, strict=True))
+    return joined(starts, ends, pause)
 
 
 SEGMENT_FIELDS = "header.stamp", "duration", "label", "confidence"
@@ -283,9 +283,9 @@ class SegmentCollector:
         coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
         written = self._written.spans(_PAUSE)
         for source, start, end, label, confidence in others:
-            written = _with(written, start, end, _PAUSE)
-            spans = coverage.get(source, NONE)
-            coverage[source] = _with(spans, start, end, FRAME_NANOSECONDS)
+            span, spans = one(start, end), coverage.get(source, NONE)
+            written = _union(written, span, pause=_PAUSE)
+            coverage[source] = _union(spans, span, pause=FRAME_NANOSECONDS)
             name = class_name(label)
             if _is_told(source, name):
                 more, key = _Rows(), (name, is_of_scenario(source))
@@ -312,10 +312,6 @@ class SegmentCollector:
 def _is_told(source: str, name: str) -> bool:
     """Whether a rule may apply to a class."""
     return name not in (OF_EVERY_SCENARIO if is_of_scenario(source) else {SILENCE})
-
-
-def _with(spans: Spans, start: int, end: int, pause: int) -> Spans:
-    return joined(np.append(spans.starts, start), np.append(spans.ends, end), pause)
 
 
 def read_activity(  # noqa: PLR0913, PLR0917
