@@ -225,13 +225,9 @@ class RetainedTopics:
     def _take_over(self, path: Path) -> None:
         """Lock the record of a former name, unless another bridge uses it."""
         with suppress(OSError):
-            descriptor = open_lock(_lock_path(path))
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                os.close(descriptor)
-                return
-            self._former[path] = descriptor
+            descriptor = _locked(path)
+            if descriptor is not None:
+                self._former[path] = descriptor
 
     def _remove_former(self) -> None:
         """Delete the adopted records, and only then release their locks."""
@@ -247,19 +243,15 @@ class RetainedTopics:
     def _take_lock(self, folder: Path) -> int | None:
         try:
             private_folder(folder)
-            descriptor = open_lock(_lock_path(self.path))
+            descriptor = _locked(self.path)
         except OSError as error:
             self._say(f"{folder}: cannot be used ({error.strerror}); nothing is remembered")
             return None
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(descriptor)
+        if descriptor is None:
             self._say(
                 f"{folder}: is used by another bridge; nothing is remembered: give each one "
                 "a `state` of its own in [bridge]"
             )
-            return None
         return descriptor
 
     def _file(self, path: Path) -> StateFile[_Content]:
@@ -267,5 +259,12 @@ class RetainedTopics:
         return StateFile(path, _Content, self._say, damaged, _UNSAVED)
 
 
-def _lock_path(path: Path) -> Path:
-    return path.with_name(f".{path.stem}.lock")
+def _locked(path: Path) -> int | None:
+    """Lock the record of a name; None if another bridge has the lock."""
+    descriptor = open_lock(path.with_name(f".{path.stem}.lock"))
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor

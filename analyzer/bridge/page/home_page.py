@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from datetime import tzinfo
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,7 +39,6 @@ from hearthlog.analyzer.bridge.state import BridgeError, cookie_key, keep_addres
 from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import joined
-from hearthlog.analyzer.network import ip_of
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError, listed
@@ -384,12 +384,7 @@ class HomePage:
     def __init__(
         self, settings: PageSettings, home: RecorderAddress, state: Path, say: Callable[[str], None]
     ) -> None:
-        bind = ip_of(settings.bind)
-        if bind is None:
-            raise BridgeError(
-                f"bind = {settings.bind!r} in [bridge.page] is no address: write one of this "
-                "machine in digits, such as 127.0.0.1"
-            )
+        bind = ip_address(settings.bind)
         self._node, self._say = home.node, say
         self._started = time.time_ns()
         self._made = -_EVERY_SECONDS
