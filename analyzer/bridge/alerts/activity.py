@@ -16,7 +16,7 @@ from hearthlog.analyzer.bridge.home import is_of_scenario, labelling_source, sou
 from hearthlog.analyzer.bridge.home_state import is_of_bridge
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import array_names, select
-from hearthlog.analyzer.logs.spans import NEVER, NONE, SEGMENT_DELAY, Spans, cut, joined, one
+from hearthlog.analyzer.logs.spans import NEVER, NONE, SEGMENT_DELAY, Rows, Spans, cut, joined, one
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -37,8 +37,8 @@ class Sounds:
     confidences: Float32
     microphones: NDArray[np.object_]
 
-    def rows(self, rows: Bool) -> "Sounds":
-        """Return the segments that a boolean mask selects."""
+    def rows(self, rows: Bool | Rows) -> "Sounds":
+        """Return the segments that a boolean mask or row numbers select."""
         return Sounds(
             self.starts[rows], self.ends[rows], self.confidences[rows], self.microphones[rows]
         )
@@ -171,14 +171,10 @@ class _Rows:
 
     def sounds(self) -> Sounds:
         if self._known is None:
-            starts, ends, confidences, microphones = zip(*self._rows, strict=True)
-            order = np.argsort(starts, kind="stable")
-            self._known = Sounds(
-                np.array(starts, np.int64)[order],
-                np.array(ends, np.int64)[order],
-                np.array(confidences, np.float32)[order],
-                np.array(microphones, object)[order],
-            )
+            kinds = np.int64, np.int64, np.float32, object
+            columns = zip(*self._rows, strict=True)
+            every = Sounds(*(np.array(c, kind) for c, kind in zip(columns, kinds, strict=True)))
+            self._known = every.rows(np.argsort(every.starts, kind="stable"))
         return self._known
 
     def keep(self, sounds: Sounds) -> None:
