@@ -312,8 +312,8 @@ class _Reader:
         """
         start, end = self._span
         starts = segments["header.stamp"]
-        inside = starts + segments["duration"] > (-_NEVER if start is None else start)
-        inside &= starts < (_NEVER if end is None else end)
+        inside = starts + segments["duration"] > (-NEVER if start is None else start)
+        inside &= starts < (NEVER if end is None else end)
         return segments.take(np.flatnonzero(inside))
 
     def _add(
