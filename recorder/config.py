@@ -193,7 +193,7 @@ class Settings(BaseModel):
         max_length=16,
         description="One table for each.",
     )
-    max_bag_duration: int = Field(default=3600, ge=1, le=86_400, description="Seconds a file.")
+    max_bag_duration: int = Field(default=3600, ge=1, le=86_400, description="Seconds per log.")
     max_bag_size: Size = Field(
         default=0, examples=["50M"], description="Bytes a file, such as 50M; 0: any."
     )

@@ -186,7 +186,7 @@ def test_counts_are_those_of_a_truth_that_is_counted_second_by_second(tmp_path):
 def test_a_span_that_nobody_can_tell_was_neither_right_nor_wrong(tmp_path):
     logs = write_day(tmp_path, DAY, [(at("10:00:05"), 50, "coughing", 0.9)])
     check(logs, at("10:00"), [(5, 55, "unknown")], chosen=QUEUE)
-    assert "asked for" not in "".join(Accuracy(find_home_logs([tmp_path])).lines())
+    assert "review queue" not in "".join(Accuracy(find_home_logs([tmp_path])).lines())
     check(logs, at("11:00"), [(5, 15, "speech")], chosen=QUEUE)
     assert "of 1 span that" in "".join(Accuracy(find_home_logs([tmp_path])).lines())
 
@@ -422,7 +422,7 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     page = tmp_path / "before.html"
     make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), page)
     assert "How often, as labelled" in page.read_text()
-    assert "nine times in ten" not in page.read_text()
+    assert "90 % intervals" not in page.read_text()
     for hour in range(8, 14):
         check(logs, at(f"{hour:02}:00"), [(5, 7, "objects_activity")] if hour % 2 else [])
     check(logs, at("15:00"), [(4, 60, "music")], chosen=QUEUE)
@@ -445,7 +445,7 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     lines = list(accuracy.lines())
     assert "at most ten seconds between them count once" in lines[1]
     assert lines[0].startswith("checked here, 6 minutes drawn at random: coughing right in 3 of 6")
-    assert "of 2 spans that were asked for or chosen, 1 had the right label" in lines[2]
+    assert "of 2 spans of the review queue or chosen, 1 had the right label" in lines[2]
     assert accuracy.as_json()["classes"]["coughing"]["labelled"] == 6
     done = run(capfd, "info", log_at(logs, at("08:00")))
     assert "not checked here" not in done.stdout, "no model labelled this log"

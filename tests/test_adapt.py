@@ -459,4 +459,4 @@ def test_an_enrolled_sound_is_learned_from(hearthlog, model_file, tmp_path):
     output = tmp_path / "home.safetensors"
     done = hearthlog("train", "--base", model_file, "--home", home, "-o", output)
     assert done.returncode == 0, done.stderr
-    assert "also learned from the home" in done.stdout
+    assert "also trained on the home" in done.stdout

@@ -592,9 +592,9 @@ def test_a_replay_with_a_damaged_log_uses_the_others_and_ends_with_status_3(
 @pytest.mark.parametrize(
     ("content", "options", "status", "says"),
     [
-        ("", [], 2, "has no rule; docs/alerts.md says how"),
+        ("", [], 2, "has no rule; docs/alerts.md shows how"),
         (f'node = "flat"\n{CONFIG}', [], 1, "no logs of the recorder 'flat' (node in the"),
-        (CONFIG, ["--end", "2026-01-01"], 2, "--start and --end leave nothing"),
+        (CONFIG, ["--end", "2026-01-01"], 2, "--start and --end select nothing"),
         (CONFIG + "loud = 1\n", [], 2, "unknown key"),
         (CONFIG, ["--timezone", "Europe/Atlantis"], 1, "is no time zone"),
     ],

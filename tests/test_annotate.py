@@ -116,7 +116,7 @@ def test_import_export_import_gives_the_same_layers_byte_for_byte(logs, hearthlo
     assert {mark.reviewer for mark in marks} == {"Ann O'Neil, RN"}
     assert hearthlog("annotate", "export", logs, "-o", again).stdout == f"{again}\n"
     result = hearthlog("annotate", "import", logs, again, "--reviewer", "Bob")
-    assert result == (0, "", f"hearthlog: {len(marks)} marks stood there already\n")
+    assert result == (0, "", f"hearthlog: {len(marks)} marks existed already\n")
     assert layers(logs) == first
     for path in logs.rglob("*.review.mcap"):
         path.unlink()
@@ -134,7 +134,9 @@ def test_a_label_file_that_does_not_say_who_labelled_is_yours(log, hearthlog, tm
     before = time.time_ns()
     done = hearthlog("annotate", "import", log, labels)
     assert done.returncode == 0
-    assert "next: a model of this home, from these (leave it recording, for ten" in done.stderr
+    assert (
+        "next: a model of this home, from these (keep recording: the check needs ten" in done.stderr
+    )
     assert f"hearthlog train --home {log}\n" in done.stderr
     mine, hers = read_marks(log)
     assert mine.reviewer == getpass.getuser()
@@ -153,7 +155,7 @@ def test_what_a_file_cannot_say_of_a_mark_is_not_lost_and_what_it_changes_is_tak
     labels.write_text("1.000000\t2.000000\tcoughing\n3.0\t4.0\tspeech\n")
     result = hearthlog("annotate", "import", log, labels, "--reviewer", "Bob")
     assert result.stdout.splitlines()[1:] == ["speech  1 mark, 1.00 s"]
-    assert result.stderr.startswith("hearthlog: 1 mark stood there already\n")
+    assert result.stderr.startswith("hearthlog: 1 mark existed already\n")
     same, changed = read_marks(log)
     assert same == mark(zero, 1.0000004, 2)._replace(**said)
     assert (changed.label, changed.reviewer) == ("speech", "Bob")

@@ -326,7 +326,7 @@ def test_what_was_said_at_one_time_is_compared_by_what_was_reviewed(logs, capfd)
     assert sum(one[0] for one in first["minutes_a_day"].values()) == pytest.approx(
         sum(one[1] for one in first["minutes_a_day"].values())
     )
-    assert "cannot be told" in first["verdict"]
+    assert "neither can be called better" in first["verdict"]
     review_as_the_candidate_says(logs)
     again = json.loads(run(capfd, "models", "compare", "--live", "--logs", logs, "--json").stdout)
     known = again["random"]

@@ -496,7 +496,7 @@ def test_a_catalogue_that_cannot_be_used_is_not_used_and_made_anew(fleet, capfd,
     assert "another version" in why or kind not in OF_OTHERS
     assert select([fleet]) == before
     done = run(capfd, "catalog", fleet)
-    assert done.stderr == f"hearthlog: {why}; it is made anew\n"
+    assert done.stderr == f"hearthlog: {why}; it is rebuilt\n"
     assert rows(read_catalog(fleet)) == whole
 
 
@@ -541,7 +541,7 @@ def test_a_catalogue_of_an_earlier_version_is_reported_once_and_made_anew(fleet,
     before = select([fleet])
     done = run(capfd, "catalog", fleet)
     assert done.stderr == (
-        f"hearthlog: {older}: is of an earlier version of hearthlog; it is made anew\n"
+        f"hearthlog: {older}: is of an earlier version of hearthlog; it is rebuilt\n"
     )
     assert (older.exists(), index.exists(), kept.exists()) == (False, False, True)
     assert run(capfd, "catalog", fleet).stderr == ""

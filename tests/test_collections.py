@@ -388,7 +388,9 @@ def test_what_is_left_out_is_counted_by_its_reason(written, tmp_path):
     assert "\nlicences: CC BY-NC 3.0 7\nother_negative is: dog_bark 3\n" in done.stdout
     assert "\nleft out: 2, may be one of ours\n" in done.stdout
     assert "\nleft out: 1, in the background of other sounds\n" in done.stdout
-    of_ours = "those that may be one of ours are: children_playing 1, air_conditioner 1\n"
+    of_ours = (
+        "clips that may belong to a class of ours are: children_playing 1, air_conditioner 1\n"
+    )
     assert of_ours in done.stdout
     done = command("manifest", "desed", written["desed"], "-o", tmp_path / "d.csv")
     assert "\nleft out: 2, several sounds at once\n" in done.stdout

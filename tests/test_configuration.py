@@ -91,7 +91,7 @@ def test_what_is_printed_can_be_configured_again(hearthlog, file, tmp_path):
 
 def test_a_configuration_is_checked_before_a_restart(hearthlog, file, tmp_path):
     result = hearthlog("config", "check", file)
-    assert (result.returncode, result.stdout) == (0, f"{file}: can be used\n")
+    assert (result.returncode, result.stdout) == (0, f"{file}: valid\n")
     assert list(tmp_path.iterdir()) == [file], "and nothing was made"
 
 
@@ -306,7 +306,7 @@ def test_secrets_that_everybody_may_read_are_named_each(hearthlog, tmp_path):
     for path in exposed:
         path.chmod(0o666)
     result = hearthlog("config", "check", file)
-    assert (result.returncode, result.stdout) == (3, f"{file}: can be used\n")
+    assert (result.returncode, result.stdout) == (3, f"{file}: valid\n")
     assert sorted(result.stderr.splitlines()) == sorted(
         f"hearthlog: {path}: holds secrets, and everybody on this machine may read it: "
         f"chmod 600 {path}"

@@ -252,7 +252,7 @@ def test_the_only_relabelling_needs_no_name_and_a_wrong_name_lists_what_there_is
     )
     write_layer(find_logs(logs)[0], find_logs(logs)[0], "general_2")
     assert hearthlog("diff", logs, "live", "relabel").returncode == 1
-    assert "they never disagree" in hearthlog("diff", logs, "live", "general-2").stdout
+    assert "there are no disagreements" in hearthlog("diff", logs, "live", "general-2").stdout
 
 
 def test_a_review_is_compared_where_somebody_reviewed(logs, hearthlog):
@@ -525,7 +525,7 @@ def test_without_probabilities_a_queue_needs_a_second_labelling(logs, hearthlog)
     )
     found = hearthlog("diff", logs, "bare", "two", "--queue", "--spans", 3, "--json")
     assert found.returncode == 0
-    assert "how sure the model was is no part of the score" in found.stderr
+    assert "the score leaves uncertainty out" in found.stderr
     assert {span["reason"] for span in json.loads(found.stdout)["spans"]} == {"disagreement"}
 
 
@@ -699,7 +699,7 @@ def test_logs_in_a_store_are_compared(logs, hearthlog, in_memory):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["live"], "name two labellings, or ask for --queue"),
+        (["live"], "name a second labelling, or use --queue"),
         (["live", "live"], "live and live are the same"),
         (["live", "two", "--list", "list.txt"], "a list of spans is named *.csv"),
     ],

@@ -194,7 +194,7 @@ def test_what_somebody_has_looked_at_is_not_marked(home, hearthlog):
     span = ReviewedSpan("mic", read_time(example["start"]), read_time(example["end"]), "Berta")
     write_marks(Path(example["log"]), [], reviewed=[span])
     done = run(hearthlog, home, "--name", f"{largest['number']}=dish")
-    assert "; 1 are marked or looked at by somebody already" in done.stderr
+    assert "; 1 are marked or looked at by a reviewer already" in done.stderr
 
 
 _WITHOUT = """
@@ -372,8 +372,8 @@ def test_only_what_the_model_does_not_know_is_grouped_if_that_is_asked_for(two_d
 @pytest.mark.parametrize(
     ("options", "status", "says"),
     [
-        (["--name", "1=silence"], 2, "say the number of a group and a class"),
-        (["--name", f"{'9' * 5000}=door"], 2, "say the number of a group and a class"),
+        (["--name", "1=silence"], 2, "give the number of a group and a class"),
+        (["--name", f"{'9' * 5000}=door"], 2, "give the number of a group and a class"),
         (["--of", "loud"], 2, "it is one of all, unsure, unknown"),
         (["--end", "2026-03-01T08:00:20"], 1, "and it takes 16"),
         (["--end", "2026-01-01"], 1, "no log has features and labels"),

@@ -363,7 +363,7 @@ def test_a_file_that_hears_otherwise_is_told_when_it_is_fetched(yamnet, monkeypa
     probe = Probe(0.01, 60.0, ["beep of tone: -3.00, where 2.00 is known"])
     monkeypatch.setattr(embedder_probe, "probe_network", lambda *_: probe)
     (line,) = _tried(YAMNET, yamnet)
-    assert "hears otherwise than models were made with (beep of tone: -3.00" in line
+    assert "differs from the network that models were trained with (beep of tone: -3.00" in line
 
 
 @pytest.mark.parametrize("signal", [4, 11])

@@ -614,7 +614,7 @@ def test_a_folder_of_logs_is_a_bag_as_it_lies(recorded, hearthlog, tmp_path):
     cut.write_bytes(whole[0].read_bytes()[:-1000])
     result = hearthlog("export", logs, "--format", "rosbag2", "--in-place")
     assert (result.returncode, result.stdout) == (3, f"{logs / 'metadata.yaml'}\n")
-    assert result.stderr == f"hearthlog: not in the bag, for it is unfinished: {cut}\n"
+    assert result.stderr == f"hearthlog: not in the bag, because it is unfinished: {cut}\n"
     (day,) = {log.parent for log in whole}
     cut.unlink()
     assert not hearthlog("export", day, "--format", "rosbag2", "--in-place").returncode

@@ -247,7 +247,7 @@ def test_the_verb_says_whose_it_is_and_where_it_lies(known, server):
     assert "fetching 0.3 MB from 127.0.0.1" in done.stderr
     assert done.exit_code == 3, "it is the known file, but no network"
     server.moods = ["404"]
-    assert "it is there already" in run("yamnet").stderr
+    assert "it is already installed" in run("yamnet").stderr
     assert str(path) in run().stdout
 
 
@@ -280,7 +280,7 @@ def test_a_file_that_is_no_network_is_not_taken(known, tmp_path):
 def test_a_network_without_an_address_is_brought(known, tmp_path, monkeypatch):
     files = (NetworkFile(SHA256, len(DATA)),)
     monkeypatch.setitem(NETWORKS._loaded, "yamnet", replace(known, files=files))
-    assert "bring its file with --from" in str(run("yamnet").exception)
+    assert "give its file with --from" in str(run("yamnet").exception)
     (tmp_path / "x").write_bytes(DATA)
     run("yamnet", "--from", tmp_path / "x")
     assert find_network("yamnet").read_bytes() == DATA

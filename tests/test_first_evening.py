@@ -67,7 +67,7 @@ def test_an_evening_with_nothing_but_a_microphone(
     with recording(labmic.env) as process:
         wait_for(lambda: len(sounds()) > 5)
         info = hearthlog("info", "logs")
-        assert "a starter, which has never heard this home" in info.stdout
+        assert "a starter model, not trained on this home" in info.stdout
         assert info.stdout.splitlines()[-1].endswith("hearthlog review logs --queue")
         queue = hearthlog("review", "logs", "--queue", "--save", "ten.txt")
         assert queue.returncode == 0, queue.stderr
@@ -88,7 +88,7 @@ def test_an_evening_with_nothing_but_a_microphone(
         wait_for(lambda: [m.model for m in latest("info")] == ["home-1"])
         wait_for(lambda: len(latest("label")) > 40)
         back = hearthlog("models", "rollback")
-        assert "is the champion again, after home-1" in back.stdout, back.stderr
+        assert "is champion again, after home-1" in back.stdout, back.stderr
         wait_for(lambda: [m.model for m in latest("info")] == ["general"])
         again = hearthlog("models", "promote", "home-1")
         assert again.returncode == 0, again.stderr  # who insisted once is not asked again

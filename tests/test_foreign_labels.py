@@ -101,7 +101,7 @@ def test_names_that_are_only_spelt_like_classes_are_not_taken_unasked(take):
     result, marks = take("labels.txt", content)
     assert (result.returncode, result.stdout, marks) == (1, "", [])
     assert "'COUGH' as coughing (2 labels) and 'Türklingel' as tuerklingel (1" in result.stderr
-    assert "--yes takes them so, --map says what else" in result.stderr
+    assert "--yes accepts these classes, --map names others" in result.stderr
     assert result.stderr.count("\n") == 1
 
 
@@ -130,7 +130,7 @@ def test_where_the_input_is_closed_nobody_is_asked(log, tmp_path):
     command = ["sh", "-c", '"$@" <&-', "sh", *HEARTHLOG, "annotate", "import", log, labels]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (1, "")
-    assert "--yes takes them so" in done.stderr
+    assert "--yes accepts these classes" in done.stderr
 
 
 def test_with_a_map_only_classes_that_it_or_hearthlog_knows_are_guessed(take):
@@ -228,9 +228,9 @@ def test_the_microphone_that_is_chosen_goes_before_the_one_in_the_file(take):
         ("a.txt", ["--tier", "x"], 1, "a.txt: has no tiers to choose with --tier"),
         ("a.rttm", ["--column", "label=x"], 1, "a.rttm: has no columns to choose with --column"),
         ("a.csv", ["--column", "label=x"], 1, "a.csv:1: no column 'x'; there is 'start', 'end' or"),
-        ("a.csv", ["--column", "x"], 2, "--column x: say start, end, duration, label,"),
-        ("a.csv", ["--column", "name=label"], 2, "--column name=label: say start, end"),
-        ("a.csv", ["--column", "label="], 2, "--column label=: say start"),
+        ("a.csv", ["--column", "x"], 2, "--column x: write start, end, duration, label,"),
+        ("a.csv", ["--column", "name=label"], 2, "--column name=label: write start, end"),
+        ("a.csv", ["--column", "label="], 2, "--column label=: write start"),
         ("a.eaf", ["--tier", "y", "--tier", "x"], 1, "a.eaf: no tier 'y'; there is 'x'"),
     ],
 )

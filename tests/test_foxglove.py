@@ -246,7 +246,7 @@ def test_a_journal_has_no_token_but_the_name_of_a_file_that_only_we_read(tmp_pat
         os.close(writing)
         with os.fdopen(reading) as lines:
             line = next(each for each in lines if "Lichtblick" in each)
-            file = Path(re.search(r"it, is in (\S+)", line)[1])
+            file = Path(re.search(r"the token, is in (\S+)", line)[1])
             url = file.read_text().strip()
             assert file.parent.stat().st_mode & 0o777 == 0o700
             assert "token" not in line
@@ -671,7 +671,7 @@ def test_who_listens_to_the_network_is_warned(logs):
         with Viewer(url.replace("0.0.0.0", "127.0.0.1")) as viewer:
             viewer.wait_for("serverInfo")
         assert ended(watcher) == 0
-    assert "what is heard here crosses the network in the clear" in "".join(watcher.lines)
+    assert "crosses the network unencrypted" in "".join(watcher.lines)
 
 
 def panels_of(tree):

@@ -66,11 +66,11 @@ def test_the_help_of_a_verb_shows_the_defaults_that_it_documents(verb):
 @pytest.mark.parametrize(
     ("verb", "default"),
     [
-        ("record", "what their names or metadata say, else a guess"),
+        ("record", "from their names or metadata, else a guess"),
         ("recover", "LOG.recovered.mcap"),
         ("review", "the login name"),
-        ("review", "what the logs say, or UTC"),
-        ("watch", "what the logs say, or UTC"),
+        ("review", "the zone in the logs, else UTC"),
+        ("watch", "the zone in the logs, else UTC"),
         ("models list", "that of the configured model, else models"),
     ],
 )
@@ -194,7 +194,7 @@ def test_what_is_not_installed_is_named_with_a_command_that_installs_it(
 def test_what_a_verb_was_called_before_names_the_verb_of_now(hearthlog, words, verb):
     result = hearthlog(*words.split())
     assert (result.returncode, result.stdout) == (2, "")
-    assert f"say `hearthlog {verb} " in result.stderr
+    assert f"use `hearthlog {verb} " in result.stderr
     assert result.stderr.count("\n") == 1
     assert tuple(verb.split()) in VERBS
 
@@ -212,7 +212,7 @@ def test_what_a_verb_was_called_before_names_the_verb_of_now(hearthlog, words, v
 def test_a_verb_that_went_to_the_lab_names_its_module(hearthlog, words, module):
     result = hearthlog(*words.split())
     assert (result.returncode, result.stdout) == (2, "")
-    assert f"say `python -m hearthlog.tools.lab.{module} " in result.stderr
+    assert f"run `python -m hearthlog.tools.lab.{module} " in result.stderr
     assert result.stderr.count("\n") == 1
 
 

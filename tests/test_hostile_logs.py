@@ -109,7 +109,7 @@ def test_of_a_name_that_is_not_utf8_nothing_else_suffers(tmp_path, hearthlog, od
     done = hearthlog("recover", path, "--output", copy)
     first, line = done.stderr.splitlines()
     assert (done.returncode, first) == (0, f"hearthlog: {path}: 10 messages saved")
-    assert "bytes that are not UTF-8 are written as \\xNN in the names or metadata of" in line
+    assert "bytes that are not UTF-8 become \\xNN in the names or metadata of" in line
     with copy.open("rb") as stream:
         found = [(c.topic, bytes(m.data)) for _, c, m in SeekingReader(stream).iter_messages()]
         stream.seek(0)

@@ -256,7 +256,7 @@ def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_
     path = tmp_path / "ten.txt"
     done = run(capfd, "review", home, "--queue", "--save", path)
     assert done.returncode == 0, done.stderr
-    assert "no sound of these lines was kept" in done.stderr
+    assert "no sound of these lines is kept" in done.stderr
     assert not (tmp_path / "ten").exists()
     asked = items(home)
     cannot_judge = asked[0]
@@ -311,7 +311,7 @@ def test_beside_the_label_file_of_a_queue_lies_the_sound_that_was_kept_line_by_l
             sound, rate = soundfile.read(file)
             assert len(sound) / rate == pytest.approx((span[1] - span[0]) / NANOSECONDS, abs=1e-3)
             assert np.abs(sound).max() > 0
-    assert "of the others no sound was kept" in done.stderr
+    assert "the others have no sound" in done.stderr
     begins = [n for n, line in enumerate(lines, 1) if "a minute drawn at random" in line[-1]]
     assert len(begins) == 2
     table = [row for row in done.stdout.splitlines() if re.search(r" a minute, to \d+", row)]
@@ -364,7 +364,7 @@ def test_labels_where_a_queue_did_not_ask_are_told_apart(home, tmp_path, capfd):
     assert end > 0.5
     path.write_text(f"{end - 0.5}\t{end}\tmusic\n{path.read_text()}")
     done = run(capfd, "annotate", "import", home, path)
-    assert f"1 mark in no span of {path.with_suffix('.queue.csv')}: of your own" in done.stderr
+    assert f"1 mark outside the spans of {path.with_suffix('.queue.csv')}: your own" in done.stderr
     assert "8 spans of the queue, 2 minutes drawn at random" in done.stderr
 
 
@@ -383,7 +383,7 @@ def test_a_list_of_a_saved_queue_is_gone_through_as_it_was_chosen(home, tmp_path
 def test_fewer_spans_than_asked_are_said(home, tmp_path, capfd):
     path = tmp_path / "many.txt"
     done = run(capfd, "review", home, "--queue", "random", "--spans", "99", "--save", path)
-    assert f"{len(items(home, 'random', 99))} of the 99 that were asked for" in done.stderr
+    assert f"{len(items(home, 'random', 99))} of the 99 requested" in done.stderr
 
 
 def test_of_no_minutes_none_is_drawn():

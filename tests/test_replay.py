@@ -439,7 +439,7 @@ def test_the_recorded_model_is_found_beside_the_logs_and_asked_for_by_name_if_no
     assert missing.returncode == 3
     digest = load_model(model_file).sha256[:12]
     recorded = f"hearthlog: recorded with model 'simulated' (sha256 {digest})"
-    what = "which was not found; no labels: give it, or another, with --model"
+    what = "which was not found, so there are no labels: name it, or another, with --model"
     assert missing.stderr.splitlines()[0] == f"{recorded}, {what}"
     assert read(tmp_path / "bare", "label") == []
     assert len(read(tmp_path / "bare", "statistics")) == 7200 / 20
@@ -753,7 +753,7 @@ def test_a_label_that_the_recorded_model_does_not_give_is_told(
     result = hearthlog("replay", log.path, "--model", model_file)
     assert result.returncode == 3
     assert f"{count - 3} of the {count} recorded ones again" in result.stdout
-    assert "with the recorded model not all is as recorded" in result.stderr
+    assert "the same model gives other results than recorded" in result.stderr
 
 
 def test_a_damaged_log_is_replayed_up_to_the_damage(folder, model_file, hearthlog, tmp_path):

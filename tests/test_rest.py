@@ -73,7 +73,7 @@ def test_a_pause_closes_the_microphone_and_is_a_gap(labmic, tmp_path):
         wait_for(lambda: not captures(process))
         wait_for(lambda: any(text.startswith("paused until ") for text in health(logs)))
         before = len(features(logs)[0])
-        assert hearthlog("resume", logs).stdout == f"{logs}: is recorded again\n"
+        assert hearthlog("resume", logs).stdout == f"{logs}: recording again\n"
         wait_for_frames(logs, before + 30)
     assert process.returncode == 0, "it was not lost, so all is well"
     [gap] = read(logs, "gap")
@@ -197,8 +197,8 @@ def test_a_new_configuration_is_taken_at_sighup_and_a_wrong_one_is_not(labmic, t
         process.send_signal(signal.SIGHUP)
         said = process.stderr.readline()
         assert said == (
-            f"hearthlog: {file}, line 2: unknown key 'modell'; is model meant?; the recorder goes "
-            "on as it was configured\n"
+            f"hearthlog: {file}, line 2: unknown key 'modell'; is model meant?; the recorder "
+            "keeps its present configuration\n"
         )
         file.write_text("node = 'flat'\n" + good)
         process.send_signal(signal.SIGHUP)

@@ -706,9 +706,9 @@ def test_a_port_that_is_in_use_is_said(recorded_home, capfd):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--save", "a.rrd", "--web"], (2, "--save makes a file")),
+        (["--save", "a.rrd", "--web"], (2, "--save writes a file")),
         (["--save", "a.rrd", "--queue", "novel"], (2, "of a queue it is a label file")),
-        (["--day", "2026-03-01", "--start", "2026-03-01T07:00"], (2, "--day is a span of its own")),
+        (["--day", "2026-03-01", "--start", "2026-03-01T07:00"], (2, "--day excludes --start")),
         (["--day", "someday", "--save", "a.rrd"], (2, "not a day such as 2026-03-01")),
         (["--day", "2020-01-01", "--save", "a.rrd"], (1, "in this span of time")),
         (["--start", "2026-03-01T08", "--end", "2026-03-01T07"], (2, "is not after --start")),
@@ -743,7 +743,7 @@ def test_the_end_of_the_input_ends_a_review_whose_page_nobody_opened(recorded_ho
     command = [*HEARTHLOG, "review", str(recorded_home), "--queue", "--web"]
     done = subprocess.run(command, input="", capture_output=True, text=True, check=False)
     assert done.returncode in {0, 3}
-    assert "nobody opened the page, and the input ended" in done.stderr
+    assert "the input ended before anybody opened the page" in done.stderr
 
 
 def test_a_queue_of_logs_without_labels_is_refused(tmp_path, capfd, day):

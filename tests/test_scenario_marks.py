@@ -235,4 +235,4 @@ def test_the_model_of_a_scenario_learns_from_its_marks_and_no_other_does(
     assert home_data["flushing_water"]["segments"] == 0
     assert find_home_logs([folder]).latest_scenario_models("voices") == []
     done = run(capfd, "train", "--home", folder, "--scenario", "voices")
-    assert (done.returncode, "no log has labels of it" in done.stderr) == (2, True)
+    assert (done.returncode, "no log has its labels" in done.stderr) == (2, True)

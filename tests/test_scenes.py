@@ -282,7 +282,7 @@ def test_what_the_model_has_learned_from_is_counted(heard, training_set, new_cli
     assert new.sources_learned == 0
     result = run(capfd, *words_of(model_file, training_set))
     assert result.returncode == 3
-    assert f"has learned from {known.sources} of the {known.sources} sources" in result.stderr
+    assert f"was trained on {known.sources} of the {known.sources} sources" in result.stderr
 
 
 def test_a_model_of_simulated_sounds_is_said_to_be_one_once(second_file, new_clips, capfd):

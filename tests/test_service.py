@@ -298,7 +298,7 @@ def test_a_service_takes_over_another_configuration_and_refuses_a_wrong_one(serv
     service.write("/etc/home.toml", "node = 'one\n")
     service.run("systemctl", "reload", "hearthlog")
     said = ("journalctl", "-u", "hearthlog", "-o", "cat")
-    service.wait(lambda: "goes on as it was configured" in service.run(*said).stdout)
+    service.wait(lambda: "keeps its present configuration" in service.run(*said).stdout)
     service.write("/etc/home.toml", "node = 'two'\n")
     service.run("systemctl", "reload", "hearthlog")
     service.wait(lambda: list(logs_of(service).rglob("two_*.active")))

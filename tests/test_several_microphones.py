@@ -106,7 +106,7 @@ def test_training_asks_for_a_base_and_then_learns_of_both_microphones(home, capf
     done = run(capfd, "train", "--home", home, "--base", file_of("kitchen"))
     assert done.returncode == 0, done.stderr
     assert "several microphones" not in done.stderr
-    assert "what it would change" in done.stderr
+    assert "comparing it with the current model" in done.stderr
 
 
 def test_models_are_judged_by_what_each_microphone_heard_at_the_same_time(

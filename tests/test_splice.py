@@ -97,7 +97,7 @@ def test_what_logs_have_twice_is_merged_once_and_counted(recorded, hearthlog, tm
     output = tmp_path / "both.mcap"
     result = hearthlog("merge", hour, first, "-o", output)
     assert sorted(raw_messages(output)) == sorted(rows)
-    line = f"hearthlog: {len(part)} messages left out that the logs have twice\n"
+    line = f"hearthlog: {len(part)} messages left out, which the logs contain twice\n"
     assert (result.returncode, result.stderr) == (0, line)
     assert len(part) > 100
 
@@ -139,7 +139,7 @@ def test_equal_messages_of_one_log_are_all_kept_and_those_of_its_copy_left_out(h
             assert len(raw_messages(written)) == 60
         copy = tmp_path / f"{number}merge.mcap"
         more = equal_messages(tmp_path / f"more{number}.mcap", 40)  # 20 of them at a later time
-        line = "hearthlog: 120 messages left out that the logs have twice\n"
+        line = "hearthlog: 120 messages left out, which the logs contain twice\n"
         for verb, *form in (("merge",), ("export", "--format", "rosbag2")):
             together = tmp_path / f"{number}{verb}-together{'' if form else '.mcap'}"
             if not form:
@@ -162,7 +162,7 @@ def test_a_chunk_that_a_log_holds_twice_is_merged_once(hearthlog, tmp_path):
     twice = tmp_path / "2.mcap.active"  # without an index
     twice.write_bytes(data[:end] + chunk)
     result = hearthlog("merge", twice, "-o", tmp_path / "all.mcap")
-    assert "hearthlog: 49 messages left out that the logs have twice\n" in result.stderr
+    assert "hearthlog: 49 messages left out, which the logs contain twice\n" in result.stderr
     assert raw_messages(tmp_path / "all.mcap") == raw_messages(log)
 
 

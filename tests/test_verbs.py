@@ -199,7 +199,7 @@ def test_a_verb_that_draws_imports_nothing_and_writes_for_nobody_else(folder, co
 @needs_viewer
 def test_watching_imports_nothing_of_the_folder(folder):
     with running(folder, f"{WATCHING} --port {free_port()}") as process:
-        assert "look with" in process.stderr.readline()
+        assert "open with" in process.stderr.readline()
     assert process.returncode == 0
     assert sprung(folder) == []
 

@@ -404,7 +404,9 @@ def test_who_listens_to_the_network_is_warned(tmp_path):
     with watching(tmp_path, "--bind", "0.0.0.0") as (watcher, _):
         watcher.terminate()
         _, said = watcher.communicate(timeout=30)
-    assert "whoever reaches this port, perhaps a web page in a browser, sees what is heard" in said
+    assert (
+        "anybody who reaches this port, even a web page in a browser, sees everything shown" in said
+    )
 
 
 def test_options_that_exclude_each_other_are_wrong_use(hearthlog, tmp_path):

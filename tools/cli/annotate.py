@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 
 
-_SCENARIO = "Scenario that the marks are of, by its name; else they are of the sounds of the home."
+_SCENARIO = "Scenario of the marks, by name; without it the marks are of the sounds of the home."
 _SHOWN = 10  # names or kinds of labels per message
 
 annotate = typer.Typer(
@@ -60,31 +60,31 @@ def import_labels(
     *,
     class_map: Annotated[
         Path | None,
-        typer.Option("--map", help='What labels mean, as TOML: "Tap Water" = "tap_water".'),
+        typer.Option("--map", help='Classes of labels, as TOML: "Tap Water" = "tap_water".'),
     ] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Take Tap Water as tap_water without a question.")
+        bool, typer.Option("--yes", help="Accept Tap Water as tap_water without asking.")
     ] = False,
     tier: Annotated[
-        list[str] | None, typer.Option(help="Tier of ELAN to read; may be given again.")
+        list[str] | None, typer.Option(help="ELAN tier to read; may be repeated.")
     ] = None,
     column: Annotated[
         list[str] | None,
         typer.Option(
-            help="Column of a table to read, as label=Species, or start=1 where it has no names; "
-            "may be given again."
+            help="Column of a table, such as label=Species, or start=1 in a table without "
+            "names; may be repeated."
         ),
     ] = None,
     microphone: Annotated[
-        str | None, typer.Option(help="Microphone of all labels, whatever the file says.")
+        str | None, typer.Option(help="Microphone of all labels; overrides the file.")
     ] = None,
     reviewer: Annotated[
         str | None,
-        typer.Option(help="Who labelled, where the file does not say.", show_default="you"),
+        typer.Option(help="Name of the annotator, if the file has none.", show_default="you"),
     ] = None,
     scenario: Annotated[str, typer.Option(help=_SCENARIO, show_default="none")] = "",
     strict: Annotated[
-        bool, typer.Option("--strict", help="Take nothing unless every label can be taken.")
+        bool, typer.Option("--strict", help="Import nothing unless every label can be imported.")
     ] = False,
 ) -> None:
     """Add the labels of a file as marks to review layers, one beside each log.
@@ -153,7 +153,7 @@ def import_labels(
     _print_amounts(taken)
     existing = sum(map(len, by_log.values())) - len(taken)
     if existing:
-        print_notice(f"{number(existing, 'mark')} stood there already")
+        print_notice(f"{number(existing, 'mark')} existed already")
     if asked.exists():
         minutes = sum(span.chosen == RANDOM for span in seen)
         print_notice(
@@ -161,7 +161,9 @@ def import_labels(
             f"{number(minutes, 'minute')} drawn at random"
         )
         if others := unasked(spans, taken):
-            print_notice(f"{number(len(others), 'mark')} in no span of {asked}: of your own choice")
+            print_notice(
+                f"{number(len(others), 'mark')} outside the spans of {asked}: your own choice"
+            )
     if taken:
         what, of = (
             (f"scenario {scenario}, from these", f" --scenario {scenario}")
@@ -238,7 +240,7 @@ def _columns(given: Sequence[str]) -> dict[str, str]:
     pairs = [text.partition("=")[::2] for text in given]
     for text, (field, name) in zip(given, pairs, strict=True):
         if field not in COLUMNS or not name:
-            wrong_use(f"--column {text}: say {listed(COLUMNS)}, and the column: label=Species")
+            wrong_use(f"--column {text}: write {listed(COLUMNS)}, and the column: label=Species")
     return dict(pairs)
 
 
@@ -258,13 +260,13 @@ def _agree(labels: Path, folded: "Sequence[Folded]", *, yes: bool) -> None:
         print_notice(f"taken: {text}")
     elif not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise DataError(
-            f"{labels}: not spelt as names of classes are: {text}; --yes takes them so, --map says "
-            "what else they are"
+            f"{labels}: not spelled like a class: {text}; --yes accepts these classes, --map "
+            "names others"
         )
     else:
-        print_notice(f"{labels}: not spelt as names of classes are: {text}")
+        print_notice(f"{labels}: not spelled like a class: {text}")
         if not typer.confirm("Take them so?", err=True):
-            print_notice("nothing was taken; --map says what they are")
+            print_notice("nothing was imported; --map names their classes")
             raise typer.Exit(1)
 
 
@@ -295,9 +297,9 @@ def _print_amounts(marks: "Sequence[Mark]") -> None:
 def enrol(
     label: Annotated[str, typer.Argument(metavar="CLASS", help="What is heard.")],
     *,
-    home: Annotated[Path, typer.Option(help="Folder of the home's training set.")],
+    home: Annotated[Path, typer.Option(help="Folder of the training set of the home.")],
     file: Annotated[
-        list[Path] | None, typer.Option(help="Audio file to enrol; may be given again.")
+        list[Path] | None, typer.Option(help="Audio file to enrol; may be repeated.")
     ] = None,
     log: Annotated[
         Path | None,
@@ -310,7 +312,7 @@ def enrol(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(help="How much of a file (default: all) or of a microphone (default: 5)."),
+        typer.Option(help="Seconds of the file (default: all) or of the microphone (default: 5)."),
     ] = None,
 ) -> None:
     """Take seconds of a sound from a file, a log or a microphone to learn from.
@@ -336,7 +338,7 @@ def enrol(
         listening = partial(print_notice, f"listening for {seconds:g} s")
         done = enrolment.enrol_microphone(home, label, microphone or "", seconds, listening)
     elif first is None or last is None or seconds is not None:
-        wrong_use("--log wants --start and --end, and no --seconds")
+        wrong_use("--log needs --start and --end, and takes no --seconds")
     else:
         done = [enrolment.enrol_log(home, label, log, first, last)]
     for enrolled in done:

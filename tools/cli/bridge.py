@@ -32,7 +32,7 @@ def bridge(
         typer.Argument(
             help="Folder that the recorder writes to.",
             readable=False,
-            show_default="that of the configuration",
+            show_default="the folder of the configuration",
         ),
     ] = None,
     *,
@@ -62,10 +62,10 @@ def bridge(
 
     settings, own = load_bridge_settings(config)
     if not own.has_outputs():
-        where = "no --config is given" if config is None else f"{config} has no table of the bridge"
+        where = "no --config is given" if config is None else f"{config} has no bridge table"
         wrong_use(
-            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md says how to "
-            "tell others"
+            f"{where}: `[bridge.page]` in one shows a page of the home; docs/bridge.md describes "
+            "the other outputs"
         )
     modules = needed_modules(own)
     if not (own.page or own.ping or any(modules.values())):
@@ -103,12 +103,12 @@ def replay(
         typer.Argument(
             help="Logs, or folders of logs, or URLs such as s3://bucket/home.",
             parser=log_location,
-            show_default="those of the configuration",
+            show_default="the logs of the configuration",
         ),
     ] = None,
     *,
     config: Annotated[
-        Path, typer.Option(help="Configuration, a TOML file with tables `bridge.alert`.")
+        Path, typer.Option(help="Configuration, a TOML file with `bridge.alert` tables.")
     ],
     start: Start = None,
     end: End = None,
@@ -131,7 +131,7 @@ def replay(
     first, last = parse_span(start, end)
     settings, own = load_bridge_settings(config)
     if not own.alert:
-        wrong_use(f"{config}: has no rule; docs/alerts.md says how to write a [[bridge.alert]]")
+        wrong_use(f"{config}: has no rule; docs/alerts.md shows how to write a [[bridge.alert]]")
     home = find_home_logs(logs or [settings.output])
     _check_node(home, settings.node)
     if timezone is None and "timezone" in settings.model_fields_set:
@@ -140,7 +140,7 @@ def replay(
     first, last = _span(home, settings.node, first, last)
     losses = list(home.losses)
     longest = max(history(rule) for rule in own.alert)
-    with share_done("reading what was heard") as progress:
+    with share_done("reading the labels") as progress:
         heard = read_activity(home, settings.node, first - longest, last, losses.append, progress)
     found = {rule.name: notifications(rule, heard, first, last, zone)[0] for rule in own.alert}
     microphones = {source_microphone(name) for name in heard.coverage}
@@ -162,7 +162,7 @@ def _check_node(home: "HomeLogs", node: str) -> None:
 
     nodes = nodes_of(home)
     if node not in nodes:
-        there = f"there are those of {listed(nodes, 'and')}" if nodes else "there is no log at all"
+        there = f"there are those of {listed(nodes, 'and')}" if nodes else "there are no logs"
         raise DataError(f"no logs of the recorder {node!r} (node in the configuration); {there}")
 
 
@@ -175,7 +175,7 @@ def _span(home: "HomeLogs", node: str, first: int | None, last: int | None) -> t
     last = until if last is None else last
     if first >= last or first >= until or last <= begin:
         there = f"{_utc(begin)} to {_utc(until)}"
-        wrong_use(f"the logs are of {there}; --start and --end leave nothing")
+        wrong_use(f"the logs cover {there}; --start and --end select nothing")
     return first, last
 
 

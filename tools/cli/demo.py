@@ -47,9 +47,11 @@ def demo(
     from hearthlog.tools.home.simulate import write_day
 
     if look and not has_display():
-        raise HearthlogError("there is no display here: leave --open out, and look elsewhere")
+        raise HearthlogError(
+            "there is no display; run without --open and open the file on another machine"
+        )
     if output.exists():
-        raise HearthlogError(f"{output}: exists already; delete it or choose another --output")
+        raise HearthlogError(f"{output}: already exists; delete it or choose another --output")
     starter = starter_here(Path(GENERAL))
     model = load_model(starter)
     day, logs, timeline = output / "day.flac", output / "logs", output / "day.rrd"
@@ -64,12 +66,14 @@ def demo(
     began = time.perf_counter()
     record_files(settings, FileSource([day], start), Flag())
     took = time.perf_counter() - began
-    print(f"recorded and labelled at {60 * minutes / took:.0f} times the speed of life")
+    print(f"recorded and labelled at {60 * minutes / took:.0f} times real time")
     right, of_known = _agreement(logs, start, truth.spans, model)
     print(
-        f"{right:.0%} of the labels are right, and {of_known:.0%} of those of sounds that it knows"
+        f"{right:.0%} of all labels are correct, and {of_known:.0%} of the labels of known sounds"
     )
-    print("(it has learned from none of these recordings; any other sound is right as unknown)")
+    print(
+        "(none of these recordings were used for training; for any other sound, unknown is correct)"
+    )
 
     _say(f"3. hearthlog info {logs}")
     info(logs)
@@ -78,7 +82,7 @@ def demo(
     save_timeline(read_timeline([logs]), timeline)
 
     _say(f"Look at it:           {_command('rerun')} {hidden_options()} {timeline}")
-    print("                      (by these options no web page finds what Rerun shows)")
+    print("                      (with these options no web page can find the viewer)")
     print(f"What is true:         {day.with_suffix('.txt')}, a label track for Audacity")
     print(f"Record a microphone:  {_command('hearthlog')} record")
     if look:

@@ -58,17 +58,18 @@ def discover(
     groups: Annotated[
         Path | None,
         typer.Option(
-            help="File of the groups, by which they are known again.",
+            help="File of the groups, which keeps their numbers.",
             show_default="groups.safetensors in the folder of logs",
         ),
     ] = None,
     name: Annotated[
         list[str] | None,
-        typer.Option(help="Name a group, as 3=doorbell, and mark its sounds; may be given again."),
+        typer.Option(help="Name a group, such as 3=doorbell, and mark its sounds; may be "
+                          "repeated."),
     ] = None,
     undo: Annotated[
         list[int] | None,
-        typer.Option(help="Take the name of a group back, and its marks; may be given again."),
+        typer.Option(help="Remove the name of a group, and its marks; may be repeated."),
     ] = None,
     reviewer: Annotated[str | None, typer.Option(help="Who names.", show_default="you")] = None,
     timezone: Timezone = None,
@@ -168,7 +169,7 @@ def _group(
 
     known = load_groups(file)
     with (
-        share_done("reading what was heard") as progress,
+        share_done("reading the labels") as progress,
         read_sounds(home, *looked, progress, known) as sounds,
     ):
         groups, rows, points = find_groups(sounds, known, least)
@@ -211,10 +212,10 @@ def _name(
         groups, summary = _renamed(groups, summary, {each: ""}, file)
     losses: list[str] = []
     if names:
-        with share_done("reading what was heard") as progress:
+        with share_done("reading the labels") as progress:
             marked, losses = name_groups(home, groups, names, looked, reviewer, progress)
         for each, (made, left) in marked.items():
-            more = f"; {left} are marked or looked at by somebody already" if left else ""
+            more = f"; {left} are marked or looked at by a reviewer already" if left else ""
             print_notice(f"group {each}: {number(made, 'mark')} of {names[each]}{more}")
         groups, summary = _renamed(groups, summary, names, file)
     return summary, losses
@@ -289,20 +290,21 @@ def voices(
         Path | None,
         typer.Option(
             "--voices",
-            help="File of the voices, by which they are known again.",
+            help="File of the voices, which keeps their numbers.",
             show_default="voices.safetensors in the folder of logs",
         ),
     ] = None,
     name: Annotated[
-        list[str] | None, typer.Option(help="Name a voice, as 2=anna; may be given again.")
+        list[str] | None, typer.Option(help="Name a voice, such as 2=anna; may be repeated.")
     ] = None,
     undo: Annotated[
-        list[int] | None, typer.Option(help="Take the name of a voice back; may be given again.")
+        list[int] | None, typer.Option(help="Remove the name of a voice; may be repeated.")
     ] = None,
     home: Annotated[
         Path | None,
         typer.Option(
-            help="Training set of voices, to enrol a minute in of each that is named now."
+            help="Training set of voices, in which to enrol a minute of each voice that is "
+                 "named now."
         ),
     ] = None,
     output: Annotated[
@@ -335,7 +337,7 @@ def voices(
     path = file or _default_file(VOICES, logs, "voices")
     with locked_file(path):
         known = load_voices(path)
-        with share_done("reading what was said") as progress:
+        with share_done("reading the speech") as progress:
             speech = read_speech(found, *span, progress)
         heard, of = find_voices(speech, known)
         _check_numbers(VOICES, heard, [*(undo or []), *names])

@@ -19,27 +19,25 @@ def doctor(
     paths: LocalLogs,
     *,
     live: Annotated[
-        bool, typer.Option("--live", help="Look at the recorders of the folder, not at its logs.")
+        bool, typer.Option("--live", help="Check the recorders of the folder, not its logs.")
     ] = False,
     ping_url: Annotated[
         str | None,
         typer.Option(
             "--ping",
-            help="With --live: ask for this address if all is well, for /fail below if not.",
+            help="With --live: request this address if all is well, and its /fail if not.",
         ),
     ] = None,
     ping_file: Annotated[
         Path | None,
         typer.Option(
             "--ping-file",
-            help="The same, with the address in a file of one line: no other account sees it.",
+            help="File with the address of --ping in its only line, hidden from other accounts.",
         ),
     ] = None,
     bundle: Annotated[
         Path | None,
-        typer.Option(
-            help="New ZIP file for somebody who helps; nothing of what was heard is in it."
-        ),
+        typer.Option(help="ZIP file for a bug report; it contains nothing that was heard."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -53,7 +51,7 @@ def doctor(
     if ping_url is not None and ping_file is not None:
         wrong_use("give either --ping or --ping-file")
     if (live or bundle is not None) and len(paths) > 1:
-        wrong_use("--live and --bundle are of one folder of logs")
+        wrong_use("--live and --bundle take one folder of logs")
     if bundle is not None:
         _write_bundle(bundle, paths[0])
         return
@@ -110,7 +108,7 @@ def _examine_live(
     from hearthlog.analyzer.recorder_status import examine_live
 
     if ping_url is not None and not is_ping_address(ping_url):
-        wrong_use("--ping wants an address such as https://hc-ping.com/your-uuid")
+        wrong_use("--ping needs an address such as https://hc-ping.com/your-uuid")
     if ping_file is not None:
         ping_url = read_ping_address(ping_file)
     states = examine_live(folder)
@@ -159,9 +157,7 @@ def _count(files: "list[Findings]", level: str) -> int:
 
 
 def recover(
-    logs: Annotated[
-        list[Path], typer.Argument(help="Logs that were cut or damaged.", readable=False)
-    ],
+    logs: Annotated[list[Path], typer.Argument(help="Truncated or damaged logs.", readable=False)],
     *,
     output: Annotated[
         Path | None,
@@ -171,9 +167,7 @@ def recover(
     ] = None,
     in_place: Annotated[
         bool,
-        typer.Option(
-            "--in-place", help="Give it the log's own name; that one is kept as *.damaged."
-        ),
+        typer.Option("--in-place", help="Replace the log; the damaged one is kept as *.damaged."),
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -227,7 +221,7 @@ def _say(log: Path, recovery: "Recovery") -> None:
     end = "" if recovery.complete else "; the log had no end, or a damaged one"
     print_notice(f"{log}: {recovery.messages}{of} messages saved{end}")
     if recovery.escaped:
-        what = "bytes that are not UTF-8 are written as \\xNN in the names or metadata of"
+        what = "bytes that are not UTF-8 become \\xNN in the names or metadata of"
         print_notice(f"{log}: {what} {abridged([shortened(n, 60) for n in recovery.escaped], 5)}")
     for text in dict.fromkeys([*map(str, recovery.damages), *recovery.losses]):
         print_notice(f"{log}: {text}")

@@ -60,7 +60,7 @@ def scenes(
     model: ModelFile,
     *,
     data: Clips,
-    scenes: Annotated[int, typer.Option(min=1, max=100, help="How many to compose.")] = 3,
+    scenes: Annotated[int, typer.Option(min=1, max=100, help="Number of scenes.")] = 3,
     minutes: Annotated[float, typer.Option(min=0.25, max=60, help="Length of each.")] = 30.0,
     floor: Annotated[
         float, typer.Option(min=-120, max=0, help="Level of the noise in dBFS.")
@@ -68,8 +68,8 @@ def scenes(
     colour: Annotated[
         Literal["white", "pink", "brown"], typer.Option(help="Of the noise.")
     ] = "white",
-    gain: Annotated[float, typer.Option(min=-60, max=60, help="Of the clips, in dB.")] = 0.0,
-    seed: Annotated[int, typer.Option(min=0, help="Another one composes other scenes.")] = 10,
+    gain: Annotated[float, typer.Option(min=-60, max=60, help="Level of the clips in dB.")] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the scenes.")] = 10,
     scenario: OwnScenario = None,
     plot: Plot = None,
     as_json: Json = False,
@@ -135,7 +135,9 @@ def scenes(
     warnings += learned_lines(found.sources_learned, found.sources)
     if found.lacking:
         names = ", ".join(found.lacking)
-        warnings.append(f"{data}: has no clip of {names}: what is labelled so is a false alarm")
+        warnings.append(
+            f"{data}: has no clip of {names}: every label of these classes is a false alarm"
+        )
     end_with_warnings(warnings)
 
 
@@ -144,7 +146,7 @@ def learned_lines(learned: int, sources: int) -> list[str]:
     if not learned:
         return []
     count = f"{learned:,} of the {number(sources, 'source')}"
-    return [f"the model has learned from {count}: the figures flatter it; leave these out"]
+    return [f"the model was trained on {count}: the figures are too good; leave these out"]
 
 
 def read_model_and_clips(
@@ -184,10 +186,10 @@ class _Group(TyperGroup):
         module = next((_LAB[word] for word in (*args[:1], *options) if word in _LAB), None)
         if module and args[0] not in self.commands and not ctx.resilient_parsing:
             command = f"python -m hearthlog.tools.lab.{module}"
-            wrong_use(f"say `{command} …` in a checkout of hearthlog; its --help lists the options")
+            wrong_use(f"run `{command} …` in a checkout of hearthlog; its --help lists the options")
         verb = next((verb for option, verb in _MOVED.items() if option in options), None)
         if verb and args[0] not in self.commands and not ctx.resilient_parsing:
-            wrong_use(f"say `hearthlog evaluate {verb} …`; its --help lists the options")
+            wrong_use(f"use `hearthlog evaluate {verb} …`; its --help lists the options")
         return super().parse_args(ctx, args)
 
 
@@ -198,7 +200,7 @@ evaluate = typer.Typer(
 _Method = Annotated[str | None, typer.Argument(help=METHODS, show_default=METHOD)]
 ScenarioOption = Annotated[str, typer.Option(help=SCENARIO)]
 Folds = Annotated[
-    Literal["segment", "source", "collection"], typer.Option(help="What is never split.")
+    Literal["segment", "source", "collection"], typer.Option(help="What folds never split.")
 ]
 
 
@@ -211,7 +213,7 @@ def evaluate_log(
     ],
     topic: Annotated[
         str | None,
-        typer.Option(help="Segments to compare; by default what the recorder labelled."),
+        typer.Option(help="Topic of the segments; by default the recorder's."),
     ] = None,
     plot: Plot = None,
     as_json: Json = False,

@@ -41,7 +41,7 @@ def export(
         str | None,
         typer.Option(
             "--format",
-            help=f"Makes a folder with one file for each topic: {listed(_BY_TOPIC)}; or "
+            help=f"Write a folder with one file for each topic: {listed(_BY_TOPIC)}; or "
             f"{listed(_FOLDERS)}.",
         ),
     ] = None,
@@ -49,8 +49,8 @@ def export(
         bool,
         typer.Option(
             "--in-place",
-            help="With --format rosbag2: make one bag of a folder of logs as they lie, by a "
-            "metadata.yaml in it.",
+            help="With --format rosbag2: make a folder of logs a bag, by writing a "
+            "metadata.yaml into it.",
         ),
     ] = False,
     topics: Topics = None,
@@ -68,11 +68,11 @@ def export(
 
     if in_place:
         if output_format != "rosbag2" or output or topics or start or end:
-            wrong_use("--in-place goes with --format rosbag2, and with nothing else")
+            wrong_use("--in-place goes with --format rosbag2 only")
         _describe_as_bag(logs)
         return
     if output is None:
-        wrong_use("name what to make: --output FILE, or --output FOLDER with --format")
+        wrong_use("give --output FILE, or --output FOLDER with --format")
     suffix = output.suffix[1:]
     format_ = FORMATS.get(output_format or suffix)
     if format_ is None:
@@ -90,7 +90,7 @@ def export(
         repeated = save(selection, output, format_, progress, folder=not one_file)
     print(output)
     if repeated:
-        print_notice(f"{number(repeated, 'message')} left out that the logs have twice")
+        print_notice(f"{number(repeated, 'message')} left out, which the logs contain twice")
     end_with_warnings(unfinished_lines(selection.unfinished))
 
 
@@ -106,11 +106,12 @@ def _describe_as_bag(logs: list[Path]) -> None:
     warnings = []
     if bag.unfinished:
         names = ", ".join(map(str, bag.unfinished))
-        warnings.append(f"not in the bag, for it is unfinished: {names}")
+        warnings.append(f"not in the bag, because it is unfinished: {names}")
     if bag.overlapping:
         warnings.append(
-            f"{bag.overlapping[0]} begins before another log ends, and rosbag2 plays one after the "
-            "other; --output BAG instead of --in-place puts all in the order of time"
+            f"{bag.overlapping[0]} begins before another log ends, and rosbag2 plays one log "
+            "after the other; use --output BAG instead of --in-place to sort all messages by "
+            "time"
         )
     end_with_warnings(warnings)
 
@@ -181,7 +182,7 @@ def cut(
         repeated = merge_logs(selection, output, progress, latched=True)
     print(output)
     if repeated:
-        print_notice(f"{number(repeated, 'message')} left out that the logs have twice")
+        print_notice(f"{number(repeated, 'message')} left out, which the logs contain twice")
     end_with_warnings(unfinished_lines(selection.unfinished))
 
 
@@ -202,5 +203,5 @@ def merge(logs: Logs, *, output: NewLog) -> None:
         repeated = merge_logs(selection, output, progress)
     print(output)
     if repeated:
-        print_notice(f"{number(repeated, 'message')} left out that the logs have twice")
+        print_notice(f"{number(repeated, 'message')} left out, which the logs contain twice")
     end_with_warnings(unfinished_lines(selection.unfinished))

@@ -45,7 +45,7 @@ def info(
     Exit status 3: a file is unfinished or damaged, or sound is missing.
     """
     if catalog:
-        wrong_use("say `hearthlog catalog FOLDER`")
+        wrong_use("use `hearthlog catalog FOLDER`")
     from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.models.modelfile.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
@@ -257,11 +257,11 @@ def _lines(summary: "LogSummary") -> Iterator[str]:
         model = f"{stream['model']} ({stream['model_sha256'][:12]})" if stream["model"] else "none"
         device = stream["device"] or "no microphone"
         yield (
-            f"{stream['microphone']}: {device}, features {stream['feature_set']}, "
-            f"model {model}{', a starter, which has never heard this home' * stream['starter']}"
+            f"{stream['microphone']}: {device}, features {stream['feature_set']}, model "
+            f"{model}{', a starter model, not trained on this home' * stream['starter']}"
         )
     latest, worst = _health(summary.latest_health), _health(summary.health)
-    for what, one in (("health", latest), ("health, at its worst", worst)):
+    for what, one in (("health", latest), ("health, worst status", worst)):
         if one is not None and not (one is worst and worst == latest):
             yield f"{what}: {one['level']}, {one['time']} {one['name']}: {one['message']}"
 
@@ -308,7 +308,9 @@ def catalog(
     *,
     workers: Annotated[
         int,
-        typer.Option(min=1, max=256, help="Processes; worth it where thousands of files are new."),
+        typer.Option(
+            min=1, max=256, help="Number of processes; useful with thousands of new files."
+        ),
     ] = 1,
     scheduler: Scheduler = None,
     export: Annotated[
@@ -370,14 +372,13 @@ def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
 
     previous = read_catalog(folder)
     for line in () if previous is None else previous.unusable:
-        print_notice(f"{line}; it is made anew")
+        print_notice(f"{line}; it is rebuilt")
     try:
         with open_workers(workers, scheduler) as pool, share_done("reading logs") as progress:
             return write_catalog(folder, previous, progress, pool)
     except KeyboardInterrupt:
         print_notice(
-            "interrupted; what was read is in the catalogue, and the same command goes on from "
-            "there"
+            "interrupted; the catalogue has what was read so far, and the same command continues"
         )
         raise
 

@@ -38,7 +38,7 @@ def gist(summary: LogSummary) -> Iterator[str]:
             f"{f' ({segments[label]})' * (class_name(label) != SILENCE)}"
             for label in known
         )
-        yield f"{microphone} heard, as labelled (segments): {', '.join(amounts)}"
+        yield f"{microphone}, as labelled (segments): {', '.join(amounts)}"
         other = seconds.keys() - set(known)
         yield (
             f"{microphone} is unsure of: {unsure['seconds'] / 60:.1f} min ({unsure['segments']}) "
@@ -62,16 +62,15 @@ def next_step(summary: LogSummary, path: Path) -> str | None:
     for counts in summary.segments.values():
         heard.update(map(class_name, counts))
     if not (heard or summary.label_seconds):
-        return "nothing was heard, not even quiet: hearthlog devices lists the microphones"
+        return "no sound was recorded, not even silence: hearthlog devices lists the microphones"
     if not heard.keys() - {SILENCE}:
-        return "nothing but quiet was heard yet: leave it recording, or try the microphone"
+        return "only silence was recorded so far: leave it recording, or test the microphone"
     marked = any(name.partition("/")[2] == REVIEW for name in summary.segments)
     if marked and latest["starter"] and not _has_learned(summary.layers):
         return (
-            f"a model of this home, from what is marked ({JUDGED_BY}): "
-            f"hearthlog train --home {place}"
+            f"train a model on the marks of this home ({JUDGED_BY}): hearthlog train --home {place}"
         )
-    return f"ten spans to go through: hearthlog review {place} --queue"
+    return f"review ten spans: hearthlog review {place} --queue"
 
 
 def _has_learned(layers: Sequence[Path]) -> bool:
@@ -98,13 +97,16 @@ class Accuracy:
         """Yield what was checked, and how much of it was correct."""
         checked = number(len(self.minutes), "minute")
         if not len(self.minutes):
-            yield "not checked here: how many of these labels are right in this home is not known"
+            yield (
+                "not checked here: nobody has reviewed how many of these labels are right "
+                "in this home"
+            )
         else:
             classes = listed(list(self._classes()), "and") or "nothing in them"
             yield f"checked here, {checked} drawn at random: {classes}"
             yield (
-                "sounds of one kind with at most ten seconds between them count once here; in "
-                "brackets the share of all, nine times in ten"
+                "sounds of one class with at most ten seconds between them count once; 90 % "
+                "intervals in brackets"
             )
             if beside := int(self.minutes.television.sum()):
                 names = listed([in_words(name).lower() for name in SET_APART], "and")
@@ -119,8 +121,8 @@ class Accuracy:
             )
         if self.looked_at:
             yield (
-                f"of {number(self.looked_at, 'span')} that were asked for or chosen, "
-                f"{self.right} had the right label (the queue asks for doubtful ones)"
+                f"of {number(self.looked_at, 'span')} of the review queue or chosen, "
+                f"{self.right} had the right label (the queue prefers doubtful ones)"
             )
 
     def as_json(self) -> dict[str, object]:

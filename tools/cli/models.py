@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
 def fetch(
     name: Annotated[
-        str | None, typer.Argument(help="A network, as yamnet; without any they are listed.")
+        str | None, typer.Argument(help="Network, such as yamnet; without a name all are listed.")
     ] = None,
     source: Annotated[
         Path | None,
-        typer.Option("--from", help="A file of the network that you have, instead of a download."),
+        typer.Option("--from", help="File of the network, instead of a download."),
     ] = None,
 ) -> None:
     """Fetch a network of sounds, with which labels are truer in a home that nobody has heard.
@@ -52,7 +52,7 @@ def fetch(
 
     if name is None:
         if source is not None:
-            wrong_use("say which network it is: hearthlog models fetch NAME --from FILE")
+            wrong_use("name the network: hearthlog models fetch NAME --from FILE")
         _list()
         return
     network = NETWORKS.get(name)
@@ -60,7 +60,10 @@ def fetch(
     path = _put(network) if source is None else _put_from(network, source)
     print(path)
     if path.is_relative_to(network_folders()[0]) and (SYSTEM_UNITS / NAME).exists():
-        print_notice("the service of this machine does not look there: for it, run this with sudo")
+        print_notice(
+            "the system service does not search there: to install the network for the "
+            "service, use sudo"
+        )
     end_with_warnings(_tried(network, path))
 
 
@@ -77,17 +80,17 @@ def _put(network: "EmbeddingNetwork") -> Path:
     except ModelError:
         pass
     else:
-        print_notice("it is there already")
+        print_notice("it is already installed")
         return path
     file = network.files[0]
     if not file.url:
-        raise ModelError(f"{network.name}: there is no address of it; bring its file with --from")
+        raise ModelError(f"{network.name}: it has no download address; give its file with --from")
     what = f"fetching {file.size / 1e6:.1f} MB from {file.url.split('/')[2]}"
     try:
         with share_done(what, announce=True) as report:
             download(file.url, path, file.size, file.sha256, report)
     except DownloadError as error:
-        raise DownloadError(f"{error}; or bring its file: models fetch NAME --from FILE") from error
+        raise DownloadError(f"{error}; or give its file: models fetch NAME --from FILE") from error
     return path
 
 
@@ -117,7 +120,12 @@ def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
         return [str(error)]
     if probe.different_answers:
         first = probe.different_answers[0]
-        return [f"{path}: hears otherwise than models were made with ({first}): labels are worse"]
+        return [
+            (
+                f"{path}: differs from the network that models were trained with ({first}): "
+                "labels are worse"
+            )
+        ]
     print_notice(
         f"it works: {1000 * probe.seconds:.2g} ms for a window; recorders take it when they start"
     )
@@ -143,7 +151,8 @@ def _list() -> None:
 
 
 models = typer.Typer(
-    no_args_is_help=True, help="Keep models in a folder: compare them, and choose which one labels."
+    no_args_is_help=True,
+    help="Manage a folder of models: compare them, and choose which one labels.",
 )
 models.command()(fetch)
 
@@ -176,7 +185,7 @@ def list_(folder: _Folder = None, as_json: Json = False) -> None:
     place = models_folder(folder)
     entries = list_models(place)
     if not place.is_dir():
-        print_notice(f"{place}: no such folder of models; these come with hearthlog")
+        print_notice(f"{place}: no such folder of models; these models come with hearthlog")
     if as_json:
         print(json.dumps([_as_json(entry) for entry in entries], indent=2))
     else:
@@ -215,7 +224,9 @@ def compare(
     ] = None,
     live: Annotated[
         bool,
-        typer.Option("--live", help="Compare what champion and candidate said while recording."),
+        typer.Option(
+            "--live", help="Compare the labels of champion and candidate while recording."
+        ),
     ] = False,
     scenario: OwnScenario = None,
     as_json: Json = False,
@@ -231,7 +242,7 @@ def compare(
 
     if live:
         if data or scenario or (a, b) != ("champion", "candidate"):
-            wrong_use("--live is of champion and candidate, and of --logs alone")
+            wrong_use("--live compares champion and candidate, and takes --logs only")
         _compare_live(logs or _logs_folder(), as_json=as_json)
         return
     if (data is None) == (logs is None):
@@ -244,11 +255,11 @@ def compare(
     heard = next((one for one in (first, second) if one.description.embedding), first)
     recordings = _recordings(data, logs, chosen, heard, left_out)
     if logs is not None and not recordings:
-        print_notice("nothing is marked: it is said how the models differ, not which is better")
+        print_notice("there are no marks: the differences are shown, not which model is better")
         shares = _minutes_in_logs(first, second, logs)
         if not shares:
             print_notice(
-                "there are no recent logs that they have not learned from: record for some hours"
+                "there are no recent logs that neither was trained on: record for some hours"
             )
         if as_json:
             print(json.dumps({"said": _shares_json(shares)}, indent=2))
@@ -268,8 +279,8 @@ def compare(
     warnings = left_out_lines(left_out)
     if not comparison.held_out:
         warnings.append(
-            "every source is one that these models have learned from: this says nothing of how "
-            "good they are on others"
+            "the models were trained on every source: this does not show how good they are on "
+            "other recordings"
         )
     end_with_warnings(warnings)
 
@@ -284,13 +295,13 @@ def promote(
     logs: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Logs of the home to judge it by.",
+            help="Logs of the home to check the model with.",
             readable=False,
-            show_default="where they are made",
+            show_default="the folder of the models",
         ),
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Let it label without a judgement, or against it.")
+        bool, typer.Option("--anyway", help="Promote without the check, or against its result.")
     ] = False,
 ) -> None:
     """Make a model the champion, if it does no harm; a recorder that runs takes it over.
@@ -319,7 +330,7 @@ def rollback(folder: _Folder = None) -> None:
     from hearthlog.models.modelfile.registry import rollback as roll_back
 
     model, before = roll_back(models_folder(folder))
-    print(f"{model.name} ({model.sha256[:12]}) is the champion again{_after(before)}")
+    print(f"{model.name} ({model.sha256[:12]}) is champion again{_after(before)}")
 
 
 def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) -> None:
@@ -484,7 +495,7 @@ def _shares_json(shares: list["_ClassShare"]) -> dict[str, list[float]]:
 def _print_comparison(comparison: "Comparison", shares: list["_ClassShare"]) -> None:
     a, b = comparison.a, comparison.b
     print(f"{a.scores.segments} segments from {a.scores.groups} sources", end="")
-    print(f"; {comparison.sources_left_out} sources left out that a model has learned from")
+    print(f"; {comparison.sources_left_out} sources left out, which a model was trained on")
     for reason, count in comparison.skipped.items():
         print(f"{count} recordings left out: {reason}")
     print()
@@ -523,7 +534,7 @@ def _verdict(comparison: "Comparison") -> str:
         return "they are the same model"
     change = f"macro F1 of {b.name} is {gain:+.3f}"
     if interval is None:
-        return f"no clear difference can be told from one source: {change}"
+        return f"one source cannot show a clear difference: {change}"
     change += f" (95 % interval {interval[0]:+.3f} to {interval[1]:+.3f})"
     if not comparison.clear:
         return f"no clear difference: {change}"

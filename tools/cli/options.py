@@ -19,9 +19,9 @@ _LAST = (1 << 63) - 1  # log time
 
 METHOD = "embedding where its network is, else room"
 METHODS = (
-    "How to learn: embedding (as room, and by what a network hears), room, room21 (the 21 features "
-    "of auros21), bands, paper, svm (the inputs of room, a support vector machine), or one that "
-    "another distribution brings: see docs/classifiers.md."
+    "How to learn: embedding (room with the embeddings of a network), room, room21 (the 21 "
+    "features of auros21), bands, paper, svm (the inputs of room, a support vector machine), or "
+    "the method of another distribution: see docs/classifiers.md."
 )
 
 
@@ -88,7 +88,7 @@ LocalLogs = Annotated[
 LogsFolder = Annotated[
     Path,
     typer.Argument(
-        help="Folder that a recorder writes to.",
+        help="Folder of a recorder's logs.",
         readable=False,
         default_factory=logs_folder,
         show_default="logs",
@@ -96,35 +96,35 @@ LogsFolder = Annotated[
 ]
 Topics = Annotated[
     list[str] | None,
-    typer.Option("--topics", help="Topic, or pattern such as '/mic/*'; may be given again."),
+    typer.Option("--topics", help="Topic, or pattern such as '/mic/*'; may be repeated."),
 ]
 Start = Annotated[
     str | None,
     typer.Option(
         metavar="TIME",
-        help="From this log time on, as 2026-03-01T07:00 (UTC unless it says otherwise).",
+        help="First log time, such as 2026-03-01T07:00 (UTC unless it has an offset).",
     ),
 ]
 End = Annotated[
     str | None,
-    typer.Option(metavar="TIME", help="Up to this log time, which is not part of it."),
+    typer.Option(metavar="TIME", help="Log time of the end, exclusive."),
 ]
 RetentionDays = Annotated[
     int | None,
     typer.Option(
-        help="Delete logs that are older than so many days on which something was recorded.",
+        help="Delete logs older than this many days with recordings.",
         show_default="no limit",
     ),
 ]
 MaxBagFiles = Annotated[
     int | None,
-    typer.Option(help="Delete the oldest logs beyond so many.", show_default="no limit"),
+    typer.Option(help="Delete the oldest logs beyond this number.", show_default="no limit"),
 ]
 MaxRecordSize = Annotated[
     str | None,
     typer.Option(
         metavar="SIZE",
-        help="Delete the oldest logs beyond so many bytes, such as 20G, of all.",
+        help="Delete the oldest logs beyond this total size, such as 20G.",
         show_default="no limit",
     ),
 ]
@@ -132,30 +132,31 @@ MinFreeSpace = Annotated[
     str | None,
     typer.Option(
         metavar="SIZE",
-        help="Delete the oldest logs while fewer bytes are free on the disk; 0: none.",
+        help="Delete the oldest logs while the disk has less free space; 0: never.",
         show_default="500M",
     ),
 ]
-NewLog = Annotated[Path, typer.Option("--output", "-o", help="Log to make, *.mcap.")]
+NewLog = Annotated[Path, typer.Option("--output", "-o", help="New log, *.mcap.")]
 Microphone = Annotated[
-    str | None, typer.Option(help="Name of the microphone, where there are several.")
+    str | None, typer.Option(help="Name of the microphone, if there are several.")
 ]
 Timezone = Annotated[
     str | None,
     typer.Option(
-        help="Time zone of the home, as Europe/Vienna.", show_default="what the logs say, or UTC"
+        help="Time zone of the home, such as Europe/Vienna.",
+        show_default="the zone in the logs, else UTC",
     ),
 ]
 CLIPS = "Manifest of labelled clips (CSV), or the folder of a manifest.csv."
 Clips = Annotated[Path, typer.Option(help=CLIPS)]
-SCENARIO = "What is told apart: bathroom, general, or a TOML file."
+SCENARIO = "Classes: bathroom, general, or a TOML file."
 OwnScenario = Annotated[
-    str | None, typer.Option(help=SCENARIO, show_default="what the (first) model was trained for")
+    str | None, typer.Option(help=SCENARIO, show_default="the scenario of the (first) model")
 ]
 Scheduler = Annotated[
-    str | None, typer.Option(help="Work on this Dask cluster, as tcp://host:port.")
+    str | None, typer.Option(help="Dask cluster to work on, such as tcp://host:port.")
 ]
-Plot = Annotated[Path | None, typer.Option(help="Picture to make, *.png.")]
+Plot = Annotated[Path | None, typer.Option(help="Picture to write, *.png.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 
 
@@ -264,7 +265,7 @@ def scenario_files(given: list[str] | None) -> dict[str, Path]:
         if not (name and equals and file):
             wrong_use(f"--scenario {text[:80]!r}: say NAME=FILE, the name and its model file")
         if name in files:
-            wrong_use(f"--scenario {name}: is given twice; each scenario has one model")
+            wrong_use(f"--scenario {name}: given twice; each scenario has one model")
         files[name] = Path(file)
     return files
 

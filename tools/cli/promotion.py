@@ -51,22 +51,22 @@ def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
     _print_changes(evidence, verdict.model, verdict.champion)
     if evidence.changes.pairs():
         command = shlex.join(["hearthlog", "review", *map(str, home), "--queue", model])
-        print(printable(f"hear what changes: `{command}`"))
+        print(printable(f"listen to the changes: `{command}`"))
     _print_right("sounds of the minutes that were drawn at random", evidence.random, verdict)
     _print_right("silences of these minutes", evidence.quiet, verdict)
-    _print_right("other sounds that were marked and not learned from", evidence.marks, verdict)
+    _print_right("other marked sounds that it was not trained on", evidence.marks, verdict)
     if not evidence.random.sounds + evidence.quiet.sounds:
         print(
-            "no minutes of this home that were drawn at random are reviewed: wrong marks cannot be "
-            "seen; `hearthlog review logs --queue` asks for some"
+            "no randomly drawn minutes of this home are reviewed, so wrong marks go unnoticed; "
+            "`hearthlog review logs --queue` offers some"
         )
 
 
 def refusal(judgement: "Judgement", name: str) -> str:
     """Return a line on why a model may not label, and how to override."""
     return (
-        f"{name} refused: {'; '.join(judgement.reasons)}; "
-        f"`hearthlog models promote {name} --anyway` lets it label all the same"
+        f"{name} refused: {'; '.join(judgement.reasons)}; `hearthlog models promote {name} "
+        "--anyway` promotes it all the same"
     )
 
 
@@ -81,7 +81,7 @@ def _print_changes(evidence: "HomeComparison", model: str, champion: str) -> Non
     end = (mean if changes.each and day < _WHOLE_DAY else "") + end
     print(
         f"\n{model} in place of {champion} would change{much}{whole}, judged by "
-        f"{time_words(evidence.minutes)} of the last two weeks that it has not learned from{end}"
+        f"{time_words(evidence.minutes)} of the last two weeks that it was not trained on{end}"
     )
     print_changes(changes, champion, model)
 
@@ -145,8 +145,8 @@ def _trial_verdict(trial: Trial) -> str:
     random, name = trial.random.plus(trial.quiet), trial.candidate
     if not random.sounds:
         return (
-            "no minutes drawn at random are reviewed since: which is better cannot be told; "
-            "`hearthlog review logs --queue` asks for some"
+            "no randomly drawn minutes were reviewed since, so neither can be called better; "
+            "`hearthlog review logs --queue` offers some"
         )
     low, high = gain_interval(random)
     where = f"right where {trial.champion} is not {random.gained} times, the reverse {random.lost}"

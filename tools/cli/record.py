@@ -39,8 +39,7 @@ def record(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Audio files, or folders of them, in the order of time; without any, the "
-            "microphone."
+            help="Audio files, or folders of them, in time order; without any, the microphone."
         ),
     ] = None,
     output: Annotated[
@@ -50,7 +49,7 @@ def record(
         Path | None,
         typer.Option(
             help="Model file, or a link to one; general or bathroom, which come with hearthlog; "
-            "none: no labels. Another file that takes its place speaks within about a second.",
+            "none: no labels. A file that replaces it takes effect within about a second.",
             show_default="models/champion.safetensors if there is one, else general",
         ),
     ] = None,
@@ -58,7 +57,7 @@ def record(
         list[str] | None,
         typer.Option(
             metavar="NAME=FILE",
-            help="A model that labels beside it, on topics of its own, as "
+            help="Additional model with its own topics, such as "
             "speakers=models/speakers.safetensors; may be repeated.",
         ),
     ] = None,
@@ -72,8 +71,8 @@ def record(
     channel: Annotated[
         int | None,
         typer.Option(
-            help="Channel to hear of several, from 1 on.",
-            show_default="the first one, and of files their mean",
+            help="Channel of several to record, from 1.",
+            show_default="the first; of files the mean of all",
         ),
     ] = None,
     name: Annotated[
@@ -85,17 +84,17 @@ def record(
     start: Annotated[
         str | None,
         typer.Option(
-            help="Time of the files' first sample, as 2026-03-01T07:00:00 (UTC unless it says "
-            "otherwise).",
-            show_default="what their names or metadata say, else a guess",
+            help="Time of the first sample of the files, such as 2026-03-01T07:00:00 (UTC "
+            "unless it has an offset).",
+            show_default="from their names or metadata, else a guess",
         ),
     ] = None,
     start_pattern: Annotated[
         str | None,
         typer.Option(
             metavar="PATTERN",
-            help="How the names of files say when they begin, as %d-%m-%Y_%Hh%M (of strptime).",
-            show_default="known ones, such as 20260301_070000",
+            help="Time format in the file names, such as %d-%m-%Y_%Hh%M (as for strptime).",
+            show_default="common ones, such as 20260301_070000",
         ),
     ] = None,
     realtime: Annotated[
@@ -103,11 +102,13 @@ def record(
     ] = False,
     max_bag_duration: Annotated[
         int | None,
-        typer.Option("--max-bag-duration", "-d", help="Seconds a file.", show_default="3600"),
+        typer.Option("--max-bag-duration", "-d", help="Seconds per log.", show_default="3600"),
     ] = None,
     max_bag_size: Annotated[
         str | None,
-        typer.Option("--max-bag-size", "-b", help="Bytes a file, such as 10M.", show_default="any"),
+        typer.Option(
+            "--max-bag-size", "-b", help="Bytes per log, such as 10M.", show_default="any"
+        ),
     ] = None,
     retention_days: RetentionDays = None,
     max_bag_files: MaxBagFiles = None,
@@ -116,7 +117,7 @@ def record(
     keep_audio: Annotated[
         str | None,
         typer.Option(
-            help="Keep sound beside the log: off, events, unsure (of what it is) or always; but "
+            help="Keep sound with the log: off, events, unsure (low confidence) or always; "
             "never speech.",
             show_default="off",
         ),
@@ -162,7 +163,7 @@ def record(
     reload_requests = _look_at_hangup(stop, load, configured)
     if files:
         if len(settings.microphone) > 1:
-            wrong_use("files take the place of one microphone; the configuration has several")
+            wrong_use("files replace one microphone, but the configuration has several")
         lives = realtime and sys.stderr.isatty()  # live line for real time, else a progress bar
         with ExitStack() as shown:
             progress = ignore_progress if lives else shown.enter_context(share_done("recording"))
@@ -173,7 +174,7 @@ def record(
             recording = record_files(settings, source, stop, reload_requests, state)
         losses = [*refused, *source.warnings]
         if not recording.labels and settings.model != NO_MODEL:
-            doubts.append("the sound is too short for a label; a model needs a second of it")
+            doubts.append("the sound is too short for a label; a model needs one second")
         for line in [*doubts, *losses]:
             print_notice(line)
     elif start is not None or realtime or start_pattern is not None:
@@ -181,7 +182,7 @@ def record(
     else:
         recording = _listen(settings, stop, reload_requests)
         if reload_requests.restart:
-            print_notice("the configuration was changed; starting again with it")
+            print_notice("the configuration has changed; restarting")
             os.execv(sys.executable, sys.orig_argv)  # noqa: S606  with the original arguments
     _say(recording, losses)
 
@@ -204,7 +205,7 @@ def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
     from hearthlog.recorder.recording_session import RecorderState
     from hearthlog.tools.cli.status_line import living_line
 
-    print_notice("Ctrl-C ends it, and completes the log")
+    print_notice("press Ctrl-C to stop and complete the log")
     state = RecorderState()
     with living_line(state, settings):
         yield state
@@ -233,9 +234,9 @@ def _report_network(settings: "Settings") -> None:
         return
     absent = missing_modules(YAMNET.suffix)
     print_notice(
-        "labels are truer in a home that nobody has heard with a network that has heard two "
-        f"million clips: hearthlog models fetch {YAMNET.name} (4 MB, once)"
-        + (f"; it wants LiteRT, too; {remedy(*absent)}" if absent else "")
+        "a network pretrained on two million clips makes labels in a new home more accurate: "
+        f"hearthlog models fetch {YAMNET.name} (4 MB, once)"
+        + (f"; it also needs LiteRT; {remedy(*absent)}" if absent else "")
     )
 
 
@@ -251,7 +252,7 @@ def _say(recording: "RecordingSummary", losses: list[str]) -> None:
         print_notice(str(old.damage))
     if recording.gaps:
         gaps, frames = number(recording.gaps, "gap"), number(recording.frames_lost, "frame")
-        print_notice(f"{gaps}, {frames} not heard")
+        print_notice(f"{gaps}, {frames} lost")
     if damaged or recording.gaps or recording.models_refused or losses:
         raise typer.Exit(3)
 
@@ -270,7 +271,7 @@ def _look_at_hangup(
         try:
             changed = load() != configured
         except HearthlogError as error:
-            print_notice(f"{error}; the recorder goes on as it was configured")
+            print_notice(f"{error}; the recorder keeps its present configuration")
             return
         if changed:
             reload_requests.restart = True

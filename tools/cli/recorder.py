@@ -54,7 +54,7 @@ def devices(*, as_json: Json = False) -> None:
         raise typer.Exit(1)
 
 
-config = typer.Typer(help="Show the configuration of the recorder, and check it.")
+config = typer.Typer(help="Show and check the configuration of the recorder.")
 
 
 @config.callback(invoke_without_command=True)
@@ -106,7 +106,7 @@ def check(
         print_notice(line)
     if errors or problems:
         raise typer.Exit(max([1, *(error.status for error in errors)]))
-    print(f"{file}: can be used")
+    print(f"{file}: valid")
     if warnings:
         raise typer.Exit(3)
 
@@ -152,7 +152,7 @@ def pause(
     _check_folder(logs)
     pause_schedule.pause(logs, None if duration is None else _read_duration(duration))
     until = "until `hearthlog resume`" if duration is None else f"for {duration}, or until resume"
-    print(f"{logs}: paused {until}; its recorders close their microphones within a second")
+    print(f"{logs}: paused {until}; its recorders close the microphones within a second")
 
 
 def resume(logs: LogsFolder) -> None:
@@ -161,7 +161,7 @@ def resume(logs: LogsFolder) -> None:
 
     _check_folder(logs)
     was_paused = pause_schedule.resume(logs)
-    print(f"{logs}: {'is recorded again' if was_paused else 'was not paused'}")
+    print(f"{logs}: {'recording again' if was_paused else 'was not paused'}")
 
 
 def _check_folder(logs: Path) -> None:
@@ -178,7 +178,7 @@ def _read_duration(text: str) -> timedelta:
         wrong_use(f"--for {text}: not a duration such as 30m, 2h or 1d")
     duration = timedelta(**{_UNITS[match[2]]: int(match[1])})
     if not timedelta() < duration <= _LONGEST:
-        wrong_use(f"--for {text}: more than nothing, and a year at most")
+        wrong_use(f"--for {text}: must be more than zero and at most a year")
     return duration
 
 
@@ -199,7 +199,7 @@ def retain(
         Path | None, typer.Option(help="Configuration of the recorder, a TOML file.")
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say what would be deleted or thinned, and why.")
+        bool, typer.Option("--dry-run", help="Only show what would be deleted or thinned, and why.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -299,7 +299,7 @@ def install_service(
     *,
     user: Annotated[
         bool,
-        typer.Option("--user", help="A service of your own, which records in the current folder."),
+        typer.Option("--user", help="Install a user service, which records in the current folder."),
     ] = False,
     config: Annotated[
         Path | None, typer.Option(help="Configuration of the recorder, a TOML file.")
@@ -307,13 +307,13 @@ def install_service(
     account: Annotated[
         str | None,
         typer.Option(
-            help="User that runs the service of the machine.",
-            show_default="hearthlog; for the bridge one of its own",
+            help="Account that runs the system service.",
+            show_default="hearthlog; a separate one for the bridge",
         ),
     ] = None,
     bridge: Annotated[
         bool,
-        typer.Option("--bridge", help="Instead of the recorder, the bridge that follows its log."),
+        typer.Option("--bridge", help="Install the bridge instead of the recorder."),
     ] = False,
 ) -> None:
     """Make the recorder, or the bridge, a service of systemd: now, at every boot, after upgrades.
@@ -324,7 +324,7 @@ def install_service(
     from hearthlog.tools.service.unit import install_for_system, install_for_user
 
     if user and (bridge or account is not None):
-        wrong_use("--account and --bridge are of the service of the machine; --user runs as you")
+        wrong_use("--account and --bridge are for the system service; --user runs as you")
     if bridge:
         _install_bridge(config, account)
         return
@@ -335,21 +335,21 @@ def install_service(
     print(installed.unit)
     manager = "systemctl --user" if user else "systemctl"
     if installed.started:
-        print_notice(f"it records: `{manager} status hearthlog` says how it is")
+        print_notice(f"it is recording: `{manager} status hearthlog` shows its state")
     else:
-        print_notice("it is enabled, and starts when systemd does")
+        print_notice("it is enabled, and starts with systemd")
     if user and not (_LINGER / getpass.getuser()).exists():
-        print_notice("it ends when you log out; to let it run on: loginctl enable-linger")
+        print_notice("it ends when you log out; to keep it running: loginctl enable-linger")
 
 
 def _install_bridge(config: Path | None, account: str | None) -> None:
     from hearthlog.tools.service.unit import install_bridge
 
     if config is None:
-        wrong_use("--bridge wants --config, with a table such as [bridge.mqtt]")
+        wrong_use("--bridge needs --config, with a table such as [bridge.mqtt]")
     installed = install_bridge(config, account)
     print(installed.unit)
     if installed.started:
-        print_notice("it runs: `systemctl status hearthlog-bridge` says how it is")
+        print_notice("it is running: `systemctl status hearthlog-bridge` shows its state")
     else:
-        print_notice("it is enabled, and starts when systemd does")
+        print_notice("it is enabled, and starts with systemd")

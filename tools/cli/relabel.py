@@ -51,13 +51,13 @@ def relabel(
     model: Annotated[
         Path,
         typer.Option(
-            help="Model file, where workers find it too, or general, bathroom or audioset.",
+            help="Model file that the workers can read too, or general, bathroom or audioset.",
             parser=log_location,
         ),
     ],
     workers: Annotated[
         int | None,
-        typer.Option(min=1, max=256, help="Processes; as many as there are cores by default."),
+        typer.Option(min=1, max=256, help="Number of processes; by default one per core."),
     ] = None,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -101,12 +101,10 @@ def _print(result: "Relabelled", model: str) -> None:
         print(f"{number(len(result.active), 'log')} still being written")
     if result.left_out:
         named = [f"{name} (features of {kind})" for name, kind in sorted(result.left_out.items())]
-        print_notice(f"left out, as {model} is for other features: {listed(named, 'and')}")
+        print_notice(f"left out, because {model} needs other features: {listed(named, 'and')}")
     if result.by_features:
         logs_there = number(len(result.by_features), "log")
-        print_notice(
-            f"{logs_there} without the embeddings that {model} takes: labelled without them"
-        )
+        print_notice(f"{logs_there} have no embeddings for {model}: labelled without them")
     for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
         named = [why if str(log.parent) in why else f"{log}: {why}" for log, why in logs.items()]
         for line in first_of(what, sorted(named)):
@@ -135,18 +133,18 @@ _SHOWN, _QUEUED = 10, 60
 
 
 def diff(
-    log: Annotated[
-        str, typer.Argument(help=f"{LOG_HELP} It may be left out, if it is the folder logs.")
-    ],
+    log: Annotated[str, typer.Argument(help=f"{LOG_HELP} By default the folder logs.")],
     a: Annotated[
         str | None,
         typer.Argument(help="A labelling: live, review, or the model of a relabel layer."),
     ] = None,
-    b: Annotated[str | None, typer.Argument(help="Another one; --queue needs none.")] = None,
+    b: Annotated[
+        str | None, typer.Argument(help="The other labelling; not needed with --queue.")
+    ] = None,
     *,
     queue: Annotated[
         bool,
-        typer.Option("--queue", help="Choose spans of a to review: unsure, differing, novel."),
+        typer.Option("--queue", help="List spans of a worth a review: unsure, differing, novel."),
     ] = False,
     spans: Annotated[
         int | None,
@@ -154,7 +152,7 @@ def diff(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--list", help="File to make, *.csv: the queue, or all disagreements."),
+        typer.Option("--list", help="File to write, *.csv: the queue, or all disagreements."),
     ] = None,
     microphone: Microphone = None,
     start: Start = None,
@@ -173,7 +171,7 @@ def diff(
     if a is None or (b is None and not place.exists()):
         place, a, b = log_location(logs_folder()), log, a
     if b is None and not queue:
-        wrong_use(f"{a} and what else? name two labellings, or ask for --queue")
+        wrong_use(f"{a}: name a second labelling, or use --queue")
     check_output("--list", output, ".csv", "a list of spans")
     limits = parse_span(start, end)
     sources = find_labellings(place)
@@ -230,7 +228,7 @@ def _queue(
 
     names = [side.name for side in sides]
     if any(map(is_review, names)):
-        wrong_use("a queue is of what is not reviewed yet: compare other labellings")
+        wrong_use("a queue lists spans without a review: compare other labellings")
     with share_done("reading labels") as progress:
         ranked = make_queue(
             sources,
@@ -243,8 +241,7 @@ def _queue(
         )
     if not ranked.has_uncertainty:
         print_notice(
-            f"{names[0]}: no labels with probabilities, so how sure the model was is no part of "
-            "the score"
+            f"{names[0]}: its labels have no probabilities, so the score leaves uncertainty out"
         )
     figures = {"microphone": microphone, "labelling": names[0], "candidates": ranked.candidates}
     spans = partial(queued, ranked, microphone, *names)

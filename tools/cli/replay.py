@@ -33,25 +33,24 @@ def replay(
         typer.Option(
             "--output",
             "-o",
-            help="New folder for a new log, or a Rerun recording to make, *.rrd; without it what "
-            "came of the replay is counted and compared with what was recorded.",
+            help="New folder for a new log, or a new Rerun recording, *.rrd; without it the "
+            "replay is only compared with the recording.",
         ),
     ] = None,
     model: Annotated[
         Path | None,
         typer.Option(
-            help="Model file, the one that was recorded with or another. Without it the one that "
-            "was recorded with is looked for in the current folder, in models, beside the logs, "
-            "and among those that come with hearthlog; if it is not there, there are statistics "
-            "but no labels (exit status 3)."
+            help="Model file. By default the model of the recording, from the current folder, "
+            "models, the folder of the logs, or hearthlog itself; without it there are "
+            "statistics but no labels (exit status 3)."
         ),
     ] = None,
     scenario: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=FILE",
-            help="A model that labels beside it, as in `hearthlog record`; may be repeated. "
-            "Without it the labels of scenarios are left out.",
+            help="Additional model, as in `hearthlog record`; may be repeated. By default the "
+            "labels of scenarios are left out.",
         ),
     ] = None,
     microphone: Microphone = None,
@@ -60,15 +59,15 @@ def replay(
         typer.Option("--from", help="Replay the features, or the clips of sound."),
     ] = "features",
     rate: Annotated[
-        str, typer.Option("--rate", "-r", help="Multiple of real time, or max.")
+        str, typer.Option("--rate", "-r", help="Speed as a multiple of real time, or max.")
     ] = _MAX_RATE,
-    start_offset: Annotated[float, typer.Option(help="Start so many seconds into the logs.")] = 0.0,
+    start_offset: Annotated[
+        float, typer.Option(help="Start this many seconds into the logs.")
+    ] = 0.0,
     playback_duration: Annotated[
-        float | None, typer.Option(help="End after so many seconds of the logs.")
+        float | None, typer.Option(help="Stop after this many seconds of the logs.")
     ] = None,
-    loop: Annotated[
-        bool, typer.Option("--loop", "-l", help="Begin anew at the end, until Ctrl-C.")
-    ] = False,
+    loop: Annotated[bool, typer.Option("--loop", "-l", help="Repeat until Ctrl-C.")] = False,
     as_json: Json = False,
 ) -> None:
     """Run logs through the pipeline again: with the recorded model, bit for bit as recorded.
@@ -84,7 +83,9 @@ def replay(
 
     _check_span(start_offset, playback_duration)
     if loop and output is not None:
-        wrong_use("--loop writes no log: it would be written again and again; leave out --output")
+        wrong_use(
+            "--loop and --output exclude each other: a loop would write the same log repeatedly"
+        )
     options = ReplayOptions(
         scenarios={name: load_model(file) for name, file in scenario_files(scenario).items()},
         kind="audio" if source == "clips" else "features",
@@ -118,7 +119,10 @@ def replay(
             print_notice(line)
     warnings = _warnings(result)
     if models.are_recorded and not warnings and not result.compared.identical:
-        warnings.append("with the recorded model not all is as recorded: is this another version?")
+        warnings.append(
+            "the same model gives other results than recorded: is this another "
+            "version of hearthlog?"
+        )
     for line in warnings:
         print_notice(line)
     if warnings or models.are_lacking:
@@ -166,7 +170,9 @@ class _Models:
                 recorded = f"recorded with model {info.model!r} (sha256 {short})"
             if model is None:
                 self.are_lacking = True
-                what = "which was not found; no labels: give it, or another, with --model"
+                what = (
+                    "which was not found, so there are no labels: name it, or another, with --model"
+                )
             else:
                 what = f"replayed with {model.name!r} (sha256 {digest[:12]})"
             print_notice(f"{recorded}, {what}")
@@ -202,9 +208,9 @@ def _check_output(output: Path | None, source: Path) -> None:
         check_output(output)
         return
     if output.suffix == ".mcap":
-        wrong_use(f"--output {output}: name a folder, the logs in it have their names by time")
+        wrong_use(f"--output {output}: name a folder; its logs are named by time")
     if output.resolve().is_relative_to(source.resolve()):
-        raise LogError(f"{output}: is in the folder that is replayed; choose another one")
+        raise LogError(f"{output}: is inside the replayed folder; choose another one")
     if not output.is_dir() or any(output.iterdir()):
         check_new(output)
 
@@ -261,9 +267,8 @@ def _warnings(result: "Replay") -> list[str]:
         count = len(result.missing)
         more = f" (and {count - 1} more times)" if count > 1 else ""
         lines.append(
-            f"sound before {moment(result.missing[0])}{more} is not in these logs: the first "
-            "second there has no labels, and the segment that was open begins too late; add the "
-            "logs before"
+            f"sound before {moment(result.missing[0])}{more} is not in these logs: its first "
+            "second has no labels, and an open segment begins too late; add the earlier logs"
         )
     if result.interrupted:
         lines.append(f"interrupted after {result.seconds:.1f} s of sound")

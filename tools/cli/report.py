@@ -22,20 +22,24 @@ def report(
     day: Annotated[
         str | None,
         typer.Option(
-            help="As 2026-03-01, today or yesterday; without --week the last whole day in the logs."
+            help="Such as 2026-03-01, today or yesterday; by default the last complete day in "
+            "the logs."
         ),
     ] = None,
     week: Annotated[
-        str | None, typer.Option(help="As 2026-W09, or a day in it: Monday to Sunday.")
+        str | None, typer.Option(help="Such as 2026-W09, or a day in it: Monday to Sunday.")
     ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", help="The page, *.html (NODE_DAY.html here); a picture is beside it."
+            "--output",
+            "-o",
+            help="Page to write, *.html (by default NODE_DAY.html); its "
+            "picture is written next to it.",
         ),
     ] = None,
     labels: Annotated[
-        str, typer.Option(help="Which labelling: live, or the model of a relabel layer.")
+        str, typer.Option(help="Labelling: live, or the model of a relabel layer.")
     ] = "live",
     timezone: Timezone = None,
 ) -> None:
@@ -64,7 +68,7 @@ def report(
         first = datetime.now(zone).date() - timedelta(days=_NEAR[day or ""])
     count = 1 if week is None else WEEK
     page = output or Path(_name(home_logs, first, count))
-    with share_done("reading what was heard") as progress:
+    with share_done("reading the labels") as progress:
         result = make_report(home_logs, Period(first, count, zone), page, labels, progress)
     print(result.page)
     print(result.picture)

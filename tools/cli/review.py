@@ -54,7 +54,7 @@ _QUEUE = "--queue"
 def review(
     logs: LocalLogs,
     day: Annotated[
-        str | None, typer.Option(help="A day of the home, as 2026-03-01, today or yesterday.")
+        str | None, typer.Option(help="Day of the home, such as 2026-03-01, today or yesterday.")
     ] = None,
     start: Start = None,
     end: End = None,
@@ -65,23 +65,23 @@ def review(
             "--save",
             "--output",
             "-o",
-            help="Make a Rerun recording, *.rrd, instead; with --queue a label file of its spans, "
-            "and a folder of their kept sound.",
+            help="Write a Rerun recording, *.rrd, instead; with --queue a label file of the "
+            "spans, and a folder of their sound.",
         ),
     ] = None,
-    web: Annotated[bool, typer.Option("--web", help="Look in a browser.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Use a browser.")] = False,
     queue: Annotated[
         str | None,
         typer.Option(
-            help="Go through spans that are useful to learn from and minutes drawn at random (as "
-            "without a value), or uncertain, novel, disagreeing or random ones, sounds that the "
-            "network has a name for (hint), a list of `hearthlog diff --list`, or what a model, as "
-            "home-1, would change."
+            help="Review a queue: useful spans and minutes drawn at random (without a value), "
+            "or uncertain, novel, disagreeing or random ones, sounds that the network can "
+            "name (hint), a list of `hearthlog diff --list`, or what a model such as "
+            "home-1 would change."
         ),
     ] = None,
     spans: Annotated[
         int | None,
-        typer.Option(min=1, help="How many to go through.", show_default="10; all of a list"),
+        typer.Option(min=1, help="Number of spans.", show_default="10; a list: all"),
     ] = None,
     labels: Annotated[
         str,
@@ -91,14 +91,14 @@ def review(
     ] = "live",
     microphone: Microphone = None,
     reviewer: Annotated[
-        str | None, typer.Option(help="Who makes the marks.", show_default="the login name")
+        str | None, typer.Option(help="Name of the reviewer.", show_default="the login name")
     ] = None,
     groups: Annotated[
         Path | None,
-        typer.Option(help="Groups of `hearthlog discover`, a file; their sounds are a lane."),
+        typer.Option(help="File of `hearthlog discover`, shown as a lane."),
     ] = None,
     voices: Annotated[
-        Path | None, typer.Option(help="Voices of `hearthlog voices`, a file; they are a lane.")
+        Path | None, typer.Option(help="File of `hearthlog voices`, shown as a lane.")
     ] = None,
     timezone: Timezone = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the viewer.")] = None,
@@ -109,9 +109,9 @@ def review(
     layer at once. Exit status 3: some logs could not be read, or not all of them could be shown.
     """
     if save is not None and (web or port):
-        wrong_use("--save makes a file: --web and --port go without it")
+        wrong_use("--save writes a file and excludes --web and --port")
     if day is not None and (start or end):
-        wrong_use("--day is a span of its own: leave out --start and --end")
+        wrong_use("--day excludes --start and --end")
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.review.lanes import class_precision
     from hearthlog.analyzer.review.timeline_reader import read_timeline
@@ -266,7 +266,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
     show_page(viewer.address)
     with read_keys(keys) as ended, suppress(KeyboardInterrupt):
         if viewer.wait_until_drawn(lambda: ended.is_set() and keys.qsize() <= 1) is None:
-            print_notice("nobody opened the page, and the input ended")
+            print_notice("the input ended before anybody opened the page")
             return
         grid = timeline.grid
         if not items and grid.end - grid.start <= MOST_FRAMES:
@@ -398,7 +398,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
     scenario = scenario_name(labelling)
     of = f" --scenario {scenario}" if scenario else ""
     print_notice(
-        f"{path}: correct the labels, delete the lines that you cannot judge, and take the rest as "
+        f"{path}: correct the labels, delete lines that you cannot judge, and import the rest as "
         f"marks: hearthlog annotate import {logs[0]} {path}{of}"
     )
     end_with_warnings(sources.losses)
@@ -408,10 +408,10 @@ def _report_sounds(files: "Sequence[SoundFile]", folder: Path, lines: int) -> No
     heard = sum(file.first == file.last for file in files)
     if not files:
         print_notice(
-            "no sound of these lines was kept; `hearthlog record --keep-audio unsure` keeps some"
+            "no sound of these lines is kept; `hearthlog record --keep-audio unsure` keeps some"
         )
         return
-    others = "" if heard == lines else "; of the others no sound was kept"
+    others = "" if heard == lines else "; the others have no sound"
     print_notice(f"{folder}: the sound of {heard} of {lines} lines, numbered as they are{others}")
 
 
@@ -433,9 +433,7 @@ def _queue_spans(
 
 def _report_fewer(count: int, choice: _Choice) -> None:
     if choice.spans is not None and count < choice.spans:
-        print_notice(
-            f"{count} of the {choice.spans} that were asked for: no more is left to review"
-        )
+        print_notice(f"{count} of the {choice.spans} requested; no more are left to review")
 
 
 def _microphone(timeline: "Timeline", name: str | None) -> str:
@@ -444,6 +442,6 @@ def _microphone(timeline: "Timeline", name: str | None) -> str:
     if name is not None and name not in timeline.microphones:
         wrong_use(f"--microphone {name}: there is {names}")
     if name is None and len(timeline.microphones) > 1:
-        line = f"marks are of the first microphone of {names}; --microphone chooses another one"
+        line = f"marks are for the first microphone of {names}; --microphone chooses another"
         print(printable(line))
     return name or next(iter(timeline.microphones))

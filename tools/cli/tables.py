@@ -155,7 +155,7 @@ def _amounts(title: str, amounts: "Amounts") -> Iterator[tuple[str, ...]]:
 def _print_disagreements(difference: "LabellingDifference", spans: int) -> None:
     count = len(difference.disagreements.starts)
     if not count:
-        print("they never disagree")
+        print("there are no disagreements")
         return
     which = "" if count <= spans else f": {spans} of them"
     print(f"{count} disagreements, longest first{which}")

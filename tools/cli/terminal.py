@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from queue import SimpleQueue
 
 
-JUDGED_BY = "leave it recording, for ten minutes that it has not learned from judge it"
+JUDGED_BY = "keep recording: the check needs ten minutes that it was not trained on"
 _SHOWN = 10  # list items
 _MOST_TOLD = 100  # recent texts kept
 

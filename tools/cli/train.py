@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 _FEW_SOURCES = 5
 _FEW_SECONDS = 30.0
-_SCENARIO = f"{SCENARIO} With --home alone a scenario of the recorder, by its name."
+_SCENARIO = f"{SCENARIO} With --home only: a scenario of the recorder, by name."
 _SPEAKERS = "speakers"  # the speaker scenario
 
 
@@ -56,8 +56,8 @@ def train(
         typer.Option(
             "--output",
             "-o",
-            help="Model file to make, *.safetensors.",
-            show_default="of a home the next of models/home-1.safetensors …",
+            help="Model file to write, *.safetensors.",
+            show_default="for a home the next of models/home-1.safetensors …",
         ),
     ] = None,
     data: Annotated[list[Path] | None, typer.Option(help=CLIPS)] = None,
@@ -65,7 +65,7 @@ def train(
     home: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Logs, with review layers if there are any, and enrolled sounds, to learn from.",
+            help="Folder of logs with review layers, and of enrolled sounds, to learn from.",
             readable=False,
         ),
     ] = None,
@@ -73,25 +73,24 @@ def train(
         Path | None,
         typer.Option(
             help="Model to adapt to the home, instead of --data.",
-            show_default="the one that labelled the latest log",
+            show_default="the model of the latest log",
         ),
     ] = None,
     method: Annotated[str | None, typer.Option(help=METHODS, show_default=METHOD)] = None,
     cost: Annotated[
         float | None,
-        typer.Option(
-            help="Cost of a wrong segment; docs/evaluate.md says how a good one is found."
-        ),
+        typer.Option(help="Cost of a wrong segment; docs/evaluate.md shows how to find it."),
     ] = None,
     gamma: Annotated[
         float | None,
-        typer.Option(help="Gamma of the kernel times the number of inputs; as --cost."),
+        typer.Option(help="Gamma of the kernel times the number of inputs; see --cost."),
     ] = None,
     smoothing: Annotated[
-        str, typer.Option(help="How labels become segments: hmm, or merge (the paper's).")
+        str, typer.Option(help="Smoothing of labels to segments: hmm, or merge (as in the paper).")
     ] = "hmm",
     seed: Annotated[
-        int, typer.Option(min=0, max=2**31, help="Another one draws other rooms for the clips.")
+        int,
+        typer.Option(min=0, max=2**31, help="Random seed of the rooms simulated for the clips."),
     ] = 0,
     scheduler: Scheduler = None,
     as_json: Json = False,
@@ -113,7 +112,7 @@ def train(
         _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)
     elif not home or scheduler or (cost, gamma, seed) != (None, None, 0):
         wrong_use(
-            "say what to learn from: `hearthlog train --home logs` for a model of this home, or "
+            "name the training data: `hearthlog train --home logs` for a model of this home, or "
             "`hearthlog train --data MANIFEST.csv --scenario general -o general.safetensors`; "
             "--scheduler, --seed, --cost and --gamma go with --data"
         )
@@ -155,8 +154,8 @@ def train(
             _print_next(verdict, output)
         elif scenario and not (data or speakers):
             print(
-                f"\nto let it label: put it in the place of the file of scenario {scenario}, or "
-                f"`hearthlog record --scenario {scenario}={output}`"
+                f"\nto use it, replace the model file of scenario {scenario}, or run `hearthlog "
+                f"record --scenario {scenario}={output}`"
             )
     if left_out:
         raise typer.Exit(3)
@@ -186,7 +185,7 @@ def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
     from hearthlog.models.errors import ModelError
 
     try:
-        with share_done("listening to what it would change", announce=True) as report:
+        with share_done("comparing it with the current model", announce=True) as report:
             return judge(output.parent, model, home, report)
     except ModelError as error:  # the model was written regardless
         print_notice(str(error))
@@ -200,8 +199,8 @@ def _print_next(verdict: "Verdict", output: Path) -> None:
         print(f"\n{refusal(verdict.judgement, verdict.model)}")
     elif output.parent == models_folder():
         print(
-            f"\nno harm is seen: `hearthlog models promote {output.stem}` lets it label, and a "
-            "recorder without --model takes it over within about a second"
+            f"\nthe check found no harm: `hearthlog models promote {output.stem}` makes it "
+            "champion, and a recorder without --model uses it within about a second"
         )
 
 
@@ -225,20 +224,20 @@ def _model_of(home: list[Path], scenario: str) -> Path:
     models = logs.latest_scenario_models(scenario) if scenario else logs.latest_models()
     if not models:
         wrong_use(
-            f"--scenario {scenario}: no log has labels of it; name one that was recorded, or its "
-            "model with --base, or learn one from clips with --data"
+            f"--scenario {scenario}: no log has its labels; name a recorded scenario, or its "
+            "model with --base, or train one from clips with --data"
         )
     (name, sha256), *others = models
     if others:
         names = listed([name, *(other for other, _ in others)], "and")
-        wrong_use(f"the latest logs are labelled by {names}: choose one with --base")
+        wrong_use(f"the latest logs were labelled by {names}: choose one with --base")
     if not name:
         wrong_use("the latest log has no labels: name a model with --base, such as --base general")
     folder = models_folder()
     path = find_model(folder, sha256)
     if path is None:
         wrong_use(
-            f"the latest log is labelled by {name} ({sha256[:12]}), which is neither in "
+            f"the latest log was labelled by {name} ({sha256[:12]}), which is neither in "
             f"{folder} nor a starter model of this version: name its file with --base"
         )
     print_notice(f"adapting {name}, which labelled the latest log")
@@ -268,8 +267,9 @@ def _learned(
     chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
     if UNKNOWN not in chosen.classes:
         print_notice(
-            "fewer than 5 sources have a label of no class, such as other_negative: the model will "
-            "take every sound for one of its classes; add some to be told what is unknown"
+            "fewer than 5 sources have a label outside the classes, such as other_negative: the "
+            "model will assign every sound to one of its classes; add some to have an unknown "
+            "class"
         )
     embedder = clip_embedder(method)
     space = None if embedder is None or embedder.source is None else embedder.source.space
@@ -282,7 +282,7 @@ def _learned(
     if space is not None and without:
         print_notice(
             f"{without} of {len(recordings)} marks of the home have no embedding of "
-            f"{space.network} as it is here: they teach by features alone"
+            f"{space.network} as installed: only their features are used"
         )
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         segments = build_dataset(
@@ -380,8 +380,8 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
         raise DataError(f"the home has no segments of a class of the model ({why})")
     if not is_moved(model):
         print_notice(
-            f"{model.name} is of kind {model.description.kind}: landmarks learn what it says, and "
-            "then from the home"
+            f"{model.name} is of kind {model.description.kind}: landmarks first learn its "
+            "answers, then the home"
         )
     what = f"learning from {len(segments)} segments of the home besides"
     with share_done(what, announce=True):
@@ -393,8 +393,8 @@ def _warn_of_few(segments: "Dataset") -> None:
     for name, amount in segments.amounts.items():
         if amount.sources < _FEW_SOURCES or amount.seconds < _FEW_SECONDS:
             print_notice(
-                f"class {name} has {amount.sources} sources, {amount.seconds:.0f} s: "
-                f"too few to be trusted; better {_FEW_SOURCES} sources and {_FEW_SECONDS:.0f} s"
+                f"class {name} has {amount.sources} sources, {amount.seconds:.0f} s: too few to "
+                f"trust; better {_FEW_SOURCES} sources and {_FEW_SECONDS:.0f} s"
             )
 
 
@@ -404,7 +404,7 @@ def _print(model: "Model", segments: "Dataset") -> None:
     if not adapted:  # an adapted model has the base model's figures, which were printed
         print_figures(model)
     if data.home:
-        home = "also learned from the home"
+        home = "also trained on the home"
         print(home if adapted else f"\n{home} (the figures above are those without it)")
         kept = data.home_confirmed
         rows = [
@@ -440,9 +440,10 @@ def print_figures(model: "Model") -> None:
     )
     if (elsewhere := description.elsewhere) is not None:
         print(
-            f"in collections that nothing was learned from: {elsewhere.right:.0%} of "
+            f"in collections left out of the training: {elsewhere.right:.0%} of "
             f"{elsewhere.segments} segments of its classes right, expected calibration error "
-            f"{elsewhere.expected_calibration_error:.3f} ({elsewhere.collections} left out in turn)"
+            f"{elsewhere.expected_calibration_error:.3f} ({elsewhere.collections} left out in "
+            "turn)"
         )
     parameters = [f"{name} {value:.4g}" for name, value in description.parameters.items()]
     print(*parameters, classifier_kind(description.kind).summary(model), sep=", ", end="\n\n")
@@ -466,20 +467,24 @@ def manifest(
     ],
     folder: Annotated[Path | None, typer.Argument(help="Folder of the collection.")] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Manifest to make, *.csv.")
+        Path | None, typer.Option("--output", "-o", help="Manifest to write, *.csv.")
     ] = None,
     map_file: Annotated[
         Path | None,
-        typer.Option("--map", help="Labels of its categories (TOML), as --print-map prints them."),
+        typer.Option(
+            "--map", help="Labels of the categories (TOML), in the format of --print-map."
+        ),
     ] = None,
     source: Annotated[
-        str | None, typer.Option(help="Name of the sounds in a `folder`; by default its own.")
+        str | None,
+        typer.Option(help="Name of the source of a `folder`; by default the folder's name."),
     ] = None,
     licence: Annotated[
         str | None, typer.Option(help="Licence of the sounds in a `folder`, such as CC0.")
     ] = None,
     print_map: Annotated[
-        bool, typer.Option("--print-map", help="Only print the map of the collection, to edit it.")
+        bool,
+        typer.Option("--print-map", help="Print the map of the collection, for editing, and exit."),
     ] = False,
 ) -> None:
     """List the clips of a collection, with labels, sources and licences, to learn from.
@@ -493,7 +498,7 @@ def manifest(
     if chosen is None:
         wrong_use(f"{collection}: no such collection; choose one of {', '.join(NAMES)}")
     if (source or licence) and chosen != FOLDER:
-        wrong_use(f"--source and --licence are for a folder; {chosen.title} says its own")
+        wrong_use(f"--source and --licence are for a folder; {chosen.title} has its own")
     if print_map:
         print(shipped_map(chosen.name), end="")
         return
@@ -507,8 +512,9 @@ def manifest(
     alone = [label for label, count in made.clips.items() if len(made.groups[label]) == 1 < count]
     if chosen == FOLDER and alone:
         print_notice(
-            f"{', '.join(alone)}: all files count as one recording, for their names differ in a "
-            "number only, and training wants several; give each recording or person a sub-folder"
+            f"{', '.join(alone)}: all files count as one recording, because their names differ "
+            "only in a number, and training needs several; put each recording or person in a "
+            "subfolder"
         )
     if made.missing:
         files = number(made.files, "audio file")
@@ -526,7 +532,7 @@ def _print_manifest(made: "ManifestSummary") -> None:
     print_lines(_counts("licences", made.licences, "unstated"))
     print_lines(_counts("other_negative is", made.negatives))
     print_lines(f"left out: {count:,}, {why}" for why, count in made.left_out.most_common())
-    print_lines(_counts("those that may be one of ours are", made.skipped))
+    print_lines(_counts("clips that may belong to a class of ours are", made.skipped))
 
 
 def _counts(what: str, counts: "Counter[str]", unnamed: str = "") -> list[str]:

@@ -75,7 +75,7 @@ def _reported_address(admission: "Admission", port: int) -> Iterator[None]:
             folder = until_the_end.enter_context(TemporaryDirectory(prefix="hearthlog-"))
             file = Path(folder) / "foxglove-address"
             file.write_text(f"{address}\n")  # only this account can read the folder
-            address = f"ws://{place}/; its whole address, which opens it, is in {file}"
+            address = f"ws://{place}/; its full address, with the token, is in {file}"
         print_notice(f"open in Foxglove or Lichtblick: {address}")
         _report_reach(admission, place)
         yield
@@ -88,8 +88,8 @@ def _report_reach(admission: "Admission", place: str) -> None:
         )
     else:
         print_notice(
-            f"listening on {admission.bind}: what is heard here crosses the network in the clear, "
-            "and so does the token that lets one look; without --bind, only this machine is reached"
+            f"listening on {admission.bind}: everything shown, and the access token, crosses the "
+            "network unencrypted; without --bind only this machine is reachable"
         )
 
 
@@ -117,44 +117,42 @@ _MINUTES = 5
 def watch(
     logs: LogsFolder,
     *,
-    web: Annotated[bool, typer.Option("--web", help="Look in a browser.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Use a browser.")] = False,
     serve: Annotated[
-        bool, typer.Option("--serve", help="Open no viewer here: wait for those that connect.")
+        bool, typer.Option("--serve", help="Open no viewer; wait for viewers to connect.")
     ] = False,
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Wait for Foxglove or Lichtblick instead of Rerun.")
     ] = False,
     port: Annotated[
         int | None,
-        typer.Option(min=1, max=65535, help="Where viewers connect, or, with --web, of the page."),
+        typer.Option(min=1, max=65535, help="Port for viewers, or, with --web, of the page."),
     ] = None,
     bind: Annotated[
         str | None,
         typer.Option(
-            help="With --serve or --foxglove: address of this machine to listen on; by default one "
-            "of loopback, with --serve one that nobody guesses."
+            help="With --serve or --foxglove: address of this machine to listen on; by default "
+            "a loopback address, with --serve a random one."
         ),
     ] = None,
     origin: Annotated[
         str | None,
-        typer.Option(
-            help="With --foxglove: page that may look too, as https://lichtblick.example."
-        ),
+        typer.Option(help="With --foxglove: allowed web page, such as https://lichtblick.example."),
     ] = None,
     start: Annotated[
         str | None,
         typer.Option(
-            help="With --foxglove: play what was recorded from this log time on, as "
-            "2026-03-01T07:00 (UTC unless it says otherwise)."
+            help="With --foxglove: play the recording from this log time, such as "
+            "2026-03-01T07:00 (UTC unless it has an offset)."
         ),
     ] = None,
     end: Annotated[
         str | None,
-        typer.Option(help="With --foxglove: play what was recorded before this log time."),
+        typer.Option(help="With --foxglove: play the recording up to this log time."),
     ] = None,
     minutes: Annotated[
         int | None,
-        typer.Option(min=1, max=120, help="How much is shown.", show_default=str(_MINUTES)),
+        typer.Option(min=1, max=120, help="Seconds to show.", show_default=str(_MINUTES)),
     ] = None,
     timezone: Timezone = None,
 ) -> None:
@@ -255,15 +253,15 @@ def _report_address(url: str, bind: str | None) -> None:
     from hearthlog.analyzer.review.viewer.process import hidden_options
 
     place = urlsplit(url).netloc
-    print_notice(f"look with: rerun {hidden_options()} --connect {url}")
+    print_notice(f"open with: rerun {hidden_options()} --connect {url}")
     if bind is None:
         print_notice(
             f"from another machine, first: ssh -L {place}:{place} and the name of this one"
         )
     else:
         print_notice(
-            f"listening on {bind}: whoever reaches this port, perhaps a web page in a browser, "
-            "sees what is heard here; without --bind, only those who log in to this machine do"
+            f"listening on {bind}: anybody who reaches this port, even a web page in a browser, "
+            "sees everything shown; without --bind only users of this machine can"
         )
 
 
