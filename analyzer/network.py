@@ -386,8 +386,8 @@ def read_ping_address(file: Path) -> str:
     url = data.decode("utf-8-sig", "replace").strip()
     if not is_ping_address(url):
         raise HearthlogError(
-            f"{file}: has no address that can be asked for; write one such as "
-            "https://hc-ping.com/your-uuid on one line"
+            f"{file}: has no web address; write one such as https://hc-ping.com/your-uuid on one "
+            "line"
         )
     return url
 

@@ -54,7 +54,7 @@ def read_topic(address: str) -> TopicAddress:
     form = "write it as ros2:///robot/audio, or ros2:///robot/audio?rate=48000&channels=4"
     topic, _, parameters = address.removeprefix(f"{_TOPIC_SCHEME}://").partition("?")
     if not re.fullmatch(r"(/[A-Za-z_]\w*)+", topic, re.ASCII) or len(address) > _MOST_CHARACTERS:
-        raise SourceError(f"{address[:80]!r} names no topic of ROS 2; {form}")
+        raise SourceError(f"{address[:80]!r} does not name a ROS 2 topic; {form}")
     given = dict(parse_qsl(parameters, keep_blank_values=True))
     if not given.keys() <= {"rate", "channels"} or not all(
         re.fullmatch(r"[1-9]\d{0,5}", text, re.ASCII) for text in given.values()
@@ -80,14 +80,13 @@ def check_address(address: str) -> None:
     scheme = address.partition("://")[0]
     if scheme not in _SCHEMES:
         raise SourceError(
-            f"{scheme[:16]!r} is no address of sound that is taken; "
-            "such begin with rtsp://, http://, https:// or ros2://"
+            f"{scheme[:16]!r} is not a supported address; use rtsp://, http://, https:// or ros2://"
         )
     if not _has_host(address):
         raise SourceError(
-            f"the address {scheme}://… of a microphone has no host, or none that can be told from "
-            "the rest; write it as rtsp://camera/stream, and in a password / as %2F, @ as %40, "
-            "? as %3F and # as %23"
+            f"the address {scheme}://… of a microphone has no host, or an ambiguous one; write "
+            "it as rtsp://camera/stream, and in a password / as %2F, @ as %40, ? as %3F and # "
+            "as %23"
         )
 
 

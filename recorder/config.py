@@ -63,7 +63,7 @@ def _check_path(value: Any) -> Any:
     if isinstance(value, str) and not value.strip():
         raise ValueError("is empty; write a path, or leave the key out")
     if isinstance(value, str) and value.startswith(("~", "$")):
-        raise ValueError(f"{value[:64]!r}: ~ and $ are of the shell; write the whole path")
+        raise ValueError(f"{value[:64]!r}: ~ and $ are not expanded; write the full path")
     if isinstance(value, str) and "\0" in value:
         raise ValueError(f"{value[:64]!r}: no path has the character \\x00; write another one")
     return value
@@ -105,32 +105,36 @@ class MicrophoneSettings(BaseModel):
     device: str = Field(
         default="",
         examples=["USB PnP Sound Device"],
-        description="As `hearthlog devices` lists it, or an rtsp://, http:// or ros2:// address; "
-        "empty: the default one.",
+        description="Name from `hearthlog devices`, or an rtsp://, http:// or ros2:// address; "
+        "empty: the default device.",
     )
     fallback: str = Field(
         default="",
         examples=["USB PnP Sound Device"],
-        description="A device that is heard while that one is not there; empty: none.",
+        description="Fallback device while the device is missing; empty: none.",
     )
     array: Annotated[list[list[float]], AfterValidator(_checked_places)] = Field(
         default=[],
         examples=[[[0.0, 0.0], [0.1, 0.0]]],
-        description="Places of the microphones of an array, [x, y] in metres for each channel; "
-        "empty: one channel is heard.",
+        description="Positions of the microphones of an array, [x, y] in metres for each "
+        "channel; empty: no array.",
     )
     channel: int | None = Field(
         default=None,
         ge=1,
         le=64,
-        description="The channel to hear of several, from 1 on; by default the first one, and of "
-        "files and addresses their mean, or the best one where that hides it.",
+        description="Channel of several to record, from 1; by default the first, and of files "
+        "and addresses the mean of all, or the best one if the mean hides it.",
     )
     model: PlainPath | None = Field(
-        default=None, examples=_MODELS, description="Instead of the recorder's; none: no labels."
+        default=None,
+        examples=_MODELS,
+        description="Model of this microphone, in place of the recorder's; none: no labels.",
     )
     scenarios: Scenarios | None = Field(
-        default=None, examples=_SCENARIOS, description="Instead of the recorder's; {}: none."
+        default=None,
+        examples=_SCENARIOS,
+        description="Scenarios of this microphone, in place of the recorder's; {}: none.",
     )
 
     @property
@@ -148,7 +152,7 @@ class MicrophoneSettings(BaseModel):
         if self.array and is_address(self.device):
             raise ValueError("an address in the network gives one channel, and has no array")
         if self.array and self.channel is not None:
-            raise ValueError("an array is heard with all of its channels; leave `channel` out")
+            raise ValueError("an array uses all of its channels; leave `channel` out")
         return self
 
     @field_serializer("device", "fallback", when_used="json")
@@ -162,7 +166,8 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", validate_default=True)
 
     node: Annotated[str, _checked(check_node_name)] = Field(
-        default="home", description="Name of this recorder, with which the names of its logs begin."
+        default="home",
+        description="Name of this recorder, and first part of the names of its logs.",
     )
     output: PlainPath = Field(default=Path("logs"), description="Folder of the logs.")
     model: PlainPath | None = Field(
@@ -178,102 +183,106 @@ class Settings(BaseModel):
         '{speakers = "models/speakers.safetensors"}; audioset: the names of the network.',
     )
     feature_set: str = Field(
-        default="", examples=["home33"], description="Empty: that of the model, or the default one."
+        default="",
+        examples=["home33"],
+        description="Feature set; empty: the model's, or the default.",
     )
     embedding: str = Field(
         default="",
         max_length=64,
         examples=["yamnet"],
-        description="Network of sounds that listens too, which `hearthlog models fetch` brings; "
-        "none: no network. Empty: yamnet if it is there.",
+        description="Pretrained network, installed by `hearthlog models fetch`; none: no "
+        "network; empty: yamnet if installed.",
     )
     microphone: list[MicrophoneSettings] = Field(
         default=[MicrophoneSettings()],
         min_length=1,
         max_length=16,
-        description="One table for each.",
+        description="One table for each microphone.",
     )
     max_bag_duration: int = Field(default=3600, ge=1, le=86_400, description="Seconds per log.")
     max_bag_size: Size = Field(
-        default=0, examples=["50M"], description="Bytes a file, such as 50M; 0: any."
+        default=0, examples=["50M"], description="Bytes per log, such as 50M; 0: no limit."
     )
     flush_seconds: float = Field(
         default=1.0,
         ge=1.0,
         le=3600,
-        description="So much is lost at most if the recorder is killed.",
+        description="Most that is lost if the recorder is killed.",
     )
     sync_seconds: float = Field(
-        default=5.0, ge=1.0, le=3600, description="So much is lost at most if the power is cut."
+        default=5.0, ge=1.0, le=3600, description="Most that is lost if the power is cut."
     )
     statistics_every: int = Field(
         default=LOGGED_EVERY,
         ge=1,
         le=_MOST_FRAMES,
-        description="Frames from one message of statistics to the next.",
+        description="Frames between messages of statistics.",
     )
     timezone: Annotated[str, _checked(check_time_zone)] = Field(
         default_factory=machine_zone,
-        description="Of the home, as Europe/Berlin; by default that of the machine.",
+        description="Time zone of the home, such as Europe/Berlin; by default the machine's.",
     )
     quiet_hours: list[Annotated[str, _checked(check_quiet_hours)]] = Field(
         default=[],
         examples=[["22:00-06:30"]],
-        description='Hours of every day without listening, as ["22:00-06:30"].',
+        description='Daily hours without listening, such as ["22:00-06:30"].',
     )
     readable_by: ReadableBy = Field(
-        default="owner", description="Who of this machine may read new logs, with their folders."
+        default="owner", description="Accounts of this machine that may read new logs and folders."
     )
     privacy: list[str] = Field(
         default=[],
         examples=[["speech"]],
-        description='Classes whose features are logged coarsely, as ["speech"]: over a second.',
+        description='Classes whose features are logged coarsely, such as ["speech"]: over a '
+        "second.",
     )
-    keep_audio: Keep = Field(default="off", description="Which sound is kept as clips.")
+    keep_audio: Keep = Field(default="off", description="Sound to keep as clips.")
     never_keep: list[str] = Field(
-        default=["speech"], description="Classes whose sound is in no clip, however unsure."
+        default=["speech"],
+        description="Classes whose sound is never in a clip, even with low confidence.",
     )
     clip_pre_roll_seconds: float = Field(
-        default=2.0, ge=0.0, le=30.0, description="What a clip has before its sound."
+        default=2.0, ge=0.0, le=30.0, description="Part of a clip before its sound."
     )
-    clip_minutes_a_day: int = Field(default=30, ge=1, le=1500, description="Of clips, at most.")
+    clip_minutes_a_day: int = Field(default=30, ge=1, le=1500, description="Most clips a day.")
     clip_retention_days: int = Field(
-        default=30, ge=1, le=3650, description="Older clips are deleted."
+        default=30, ge=1, le=3650, description="Age at which clips are deleted."
     )
     clip_min_free_space: int = Field(
         default=500,
         ge=0,
         le=_MOST_MEGABYTES,
-        description="MB on the disk; with less there are no clips, and the log goes on.",
+        description="MB that must be free for clips; the log continues with less.",
     )
     retention_days: int = Field(
-        default=0, ge=0, le=_MOST_DAYS, description="Days with logs that are kept; 0: any number."
+        default=0, ge=0, le=_MOST_DAYS, description="Days with logs to keep; 0: no limit."
     )
     max_bag_files: int = Field(
-        default=0, ge=0, le=_MOST_FILES, description="Finished logs that are kept; 0: any number."
+        default=0, ge=0, le=_MOST_FILES, description="Finished logs to keep; 0: no limit."
     )
     max_record_size: Size = Field(
-        default=0, examples=["20G"], description="Bytes of all logs, such as 20G; 0: any size."
+        default=0, examples=["20G"], description="Bytes of all logs, such as 20G; 0: no limit."
     )
     min_free_space: Size = Field(
         default=500_000_000,
         examples=["500M"],
-        description="Bytes on the disk that logs leave free; 0: none.",
+        description="Bytes that logs leave free on the disk; 0: none.",
     )
     drop_statistics_days: int = Field(
         default=0,
         ge=0,
         le=_MOST_DAYS,
-        description="Days with logs after which they lose the statistics; 0: never.",
+        description="Days with logs after which statistics are removed; 0: never.",
     )
     drop_features_days: int = Field(
-        default=0, ge=0, le=_MOST_DAYS, description="The same with features and statistics."
+        default=0, ge=0, le=_MOST_DAYS, description="The same for features and statistics."
     )
     labels_only_days: int = Field(
         default=0,
         ge=0,
         le=_MOST_DAYS,
-        description="The same with all but labels, segments and gaps.",
+        description="The same for everything but labels, segments and gaps.",
     )
 
     def keeping_rules(self) -> KeepingRules:
@@ -370,8 +379,8 @@ def load_with_origins(
             return settings, origins
         if len(settings.microphone) > 1:
             raise ConfigurationError(
-                f"{file}: has {len(settings.microphone)} microphones; say there what is to be said "
-                f"of one, not on the command line ({', '.join(microphone)})"
+                f"{file}: has {len(settings.microphone)} microphones; put the setting into the "
+                f"table of the microphone, not on the command line ({', '.join(microphone)})"
             )
         merged = settings.microphone[0].model_dump() | microphone
         update = {"microphone": [MicrophoneSettings(**merged)]}
@@ -418,4 +427,4 @@ def _check_microphones(microphones: list[MicrophoneSettings], origins: Origins) 
         if twice is not None:
             what = f"{key} {public_name(twice)!r}" if twice else "the default device"
             where = origins.place(("microphone", len(microphones) - 1))
-            raise ConfigurationError(f"{where}: two microphones have {what}; say which is which")
+            raise ConfigurationError(f"{where}: two microphones have {what}; give each its own")

@@ -214,7 +214,7 @@ def _failed(failures: list[OSError]) -> list[str]:
         return []
     more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
     first = failures[0]
-    return [f"{first.filename}: cannot be looked through or deleted ({first.strerror}){more}"]
+    return [f"{first.filename}: cannot be listed or deleted ({first.strerror}){more}"]
 
 
 _COMMAND = module_command("hearthlog.recorder.disk_keeper")
@@ -286,9 +286,7 @@ class DiskKeeper:
         try:
             return DiskReport(*json.loads(text))
         except (ValueError, TypeError):
-            return DiskReport(
-                "", f"the disk was not looked after (status {process.returncode})", {}
-            )
+            return DiskReport("", f"the limits were not applied (status {process.returncode})", {})
 
 
 def report_messages(node: str, stamp: int, report: DiskReport) -> list[EncodedMessage]:
@@ -310,7 +308,9 @@ def main() -> None:
     try:
         report = keep_disk(rules, may_thin=may_thin)
     except OSError as error:
-        report = DiskReport("", f"{root}: cannot be looked after ({error.strerror or error})", {})
+        report = DiskReport(
+            "", f"{root}: the limits cannot be applied ({error.strerror or error})", {}
+        )
     with suppress(BrokenPipeError):  # the recorder was killed
         os.write(sys.stdout.fileno(), json.dumps(report).encode())
 

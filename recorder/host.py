@@ -93,11 +93,11 @@ def clock_is_synchronized() -> bool | None:
 
 def _problem(temperature: float | None, throttled: int) -> str:
     if throttled & _LOW_VOLTAGE:
-        return "the power supply is too weak: take one that is made for this board"
+        return "the power supply is too weak: use one made for this board"
     if throttled & _SLOWED:
-        return "the board is slowed down, for it is too hot: give it air"
+        return "the board is throttled because it is too hot: improve its cooling"
     if temperature is not None and temperature >= _HOT:
-        return f"the machine is {temperature:.0f} degrees hot: give it air"
+        return f"the machine is {temperature:.0f} degrees hot: improve its cooling"
     return ""
 
 

@@ -51,8 +51,10 @@ def quiet_hours(text: str) -> QuietHours:
     """
     found = _FORM.fullmatch(text)
     if found is None:
-        hyphen = ", with the - of the keyboard" if _DASHES & set(text) else ""
-        raise ConfigurationError(f"{text[:64]!r} are no hours; write them as 22:00-06:30{hyphen}")
+        hyphen = ", with a plain hyphen" if _DASHES & set(text) else ""
+        raise ConfigurationError(
+            f"{text[:64]!r} is not a span of hours; write it as 22:00-06:30{hyphen}"
+        )
     hour, minute, last_hour, last_minute = map(int, found.groups())
     return QuietHours(60 * hour + minute, 60 * last_hour + last_minute)
 

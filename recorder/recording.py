@@ -246,7 +246,7 @@ def _report_starters(
         if name in BY_FEATURES or not takes_embeddings:
             by = f"features alone, as {why}"
         if name:
-            who = f"the starter model {name}, which has never heard this home"
+            who = f"the starter model {name}, not trained on this home"
             say(f"the labels are by {who}: by {by}")
 
 

@@ -77,10 +77,10 @@ class MicrophoneStream:
         )
         if unknown := self.pipeline.unknown_private():
             classes = self.pipeline.classes
-            what = f"this one tells apart {', '.join(classes)}" if classes else "there is none"
+            what = f"this one has the classes {', '.join(classes)}" if classes else "there is none"
             raise ConfigurationError(
-                f"privacy needs a model that knows {', '.join(map(repr, unknown))} ({what}); take "
-                "one that does, or set privacy = [] to log the features of everything"
+                f"privacy needs a model with the class {', '.join(map(repr, unknown))} ({what}); "
+                "use such a model, or set privacy = [] to log the features of everything"
             )
 
     def accepted(self, event: Event, *, log_is_full: bool) -> list[Event]:

@@ -204,10 +204,10 @@ def parse_size(value: object) -> int:
     """
     match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,15})?) ?([kmgt]?)b?", str(value).lower())
     if match is None:
-        raise ValueError(f"{str(value)[:40]!r} is no size; say how many bytes, such as 500M or 20G")
+        raise ValueError(f"{str(value)[:40]!r} is not a size; write bytes, such as 500M or 20G")
     size = int(float(match[1]) * _UNITS[match[2]])
     if size > _LARGEST:
-        raise ValueError("more than any disk has; say how many bytes, such as 500M or 20G")
+        raise ValueError("larger than any disk; write bytes, such as 500M or 20G")
     return size
 
 

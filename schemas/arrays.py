@@ -106,13 +106,13 @@ def read_sealed(path: Path, data: bytes, key: str) -> tuple[dict[str, NDArray[An
 
 
 def damage(
-    path: Path, expected: str, found: str, cure: str = "copy it back from a backup, or make it anew"
+    path: Path, expected: str, found: str, cure: str = "restore it from a backup, or make it again"
 ) -> str:
     """Return the error line for a file with a wrong digest."""
     expected = ascii(expected[:12])[1:-1]  # it may be any text
     return (
-        f"{path}: is not as it was written (digest {found[:12]}, not {expected}): the disk or "
-        f"somebody has changed it; {cure}"
+        f"{path}: is not as it was written (digest {found[:12]}, not {expected}): it was "
+        f"changed, by the disk or by somebody; {cure}"
     )
 
 

@@ -101,8 +101,8 @@ def test_a_full_outbox_drops_the_oldest_and_says_what_to_do(tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
     assert said == [
         (
-            f"{tmp_path}: 3 alerts wait to be told, and the oldest are dropped; see above which "
-            "target cannot be reached, and mend it, or take it out of urls_file"
+            f"{tmp_path}: 3 alerts are waiting, and the oldest are dropped; see above which "
+            "target fails; repair it, or remove it from urls_file"
         )
     ]
 
@@ -136,7 +136,7 @@ def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
         wait_for(lambda: len(said) > 1)
         with server(port) as (_, texts):
             wait_for(lambda: not len(outbox))
-            assert [text[-7:] for text in [t.removesuffix(" (told late)") for t in texts]] == [
+            assert [text[-7:] for text in [t.removesuffix(" (delivered late)") for t in texts]] == [
                 "alert 1",
                 "alert 2",
             ]
@@ -201,7 +201,9 @@ def test_a_ring_is_told_with_its_time_and_late_as_late():
         "it", 1_772_348_400 * SECOND, "None", is_known=True, due=1_772_348_400 * SECOND
     )
     assert message(late, UTC, late.due + SECOND) == "2026-03-01 07:00: None"
-    assert message(late, UTC, late.due + 3600 * SECOND) == "2026-03-01 07:00: None (told late)"
+    assert message(late, UTC, late.due + 3600 * SECOND) == (
+        "2026-03-01 07:00: None (delivered late)"
+    )
     waited = late._replace(due=late.due + 3600 * SECOND)
     assert message(waited, UTC, waited.due + SECOND) == "2026-03-01 07:00: None"
 
@@ -477,7 +479,7 @@ def test_a_bridge_that_is_killed_again_and_again_tells_of_every_ring(tmp_path):
                 process.send_signal(signal.SIGKILL)
             process.communicate(timeout=WAIT)
             assert process.returncode == (-signal.SIGKILL if start < kills else 0)
-        numbers = [int(text.removesuffix(" (told late)").rpartition(" ")[2]) for text in texts]
+        numbers = [int(text.removesuffix(" (delivered late)").rpartition(" ")[2]) for text in texts]
     assert set(numbers) == set(everything)
     assert len(numbers) <= len(everything) + kills
     assert not list((tmp_path / "box").glob("*.json"))

@@ -453,26 +453,34 @@ def test_a_duration_is_read_and_said(text, seconds):
 
 @pytest.mark.parametrize("text", ["", "20", "m", "2 h", "1.5h", 20, None, "h1"])
 def test_what_is_no_duration_is_refused(text):
-    with pytest.raises(ValueError, match="is no duration; write it as 90s, 20m, 1h30m or 7d"):
+    with pytest.raises(
+        ValueError, match="is not a duration; write one such as 90s, 20m, 1h30m or 7d"
+    ):
         read_duration(text)
 
 
 @pytest.mark.parametrize(
     ("keys", "says"),
     [
-        ({"rule": "more_than", "window": "2h"}, "say either count or minutes"),
+        ({"rule": "more_than", "window": "2h"}, "set either count or minutes"),
         (
             {"rule": "more_than", "window": "2h", "count": 1, "minutes": 1},
             "either count or minutes",
         ),
         ({"rule": "more_than", "window": "9d", "count": 1}, "a minute to seven days"),
-        ({"rule": "none_by", "since": "6:00", "by": "10:00"}, "is no time of day; write it as"),
+        (
+            {"rule": "none_by", "since": "6:00", "by": "10:00"},
+            "is not a time of day; write one such as",
+        ),
         ({"rule": "none_by", "since": "10:00", "by": "10:00"}, "are the same time of day"),
-        ({"rule": "longer_than", "longer_than": "1m", "class": "silence"}, "silence is no sound"),
+        (
+            {"rule": "longer_than", "longer_than": "1m", "class": "silence"},
+            "is not a sound",
+        ),
         ({"rule": "unlike_usual", "part": "night", "at": "06:00"}, "a night ends at 07:00"),
         ({"rule": "recorder_silent", "class": "music"}, "Extra inputs are not permitted"),
         ({"rule": "loud"}, "'more_than', 'none_by', 'longer_than', 'recorder_silent'"),
-        ({"rule": "recorder_silent", "quiet_hours": ["22-6"]}, "write them as 22:00-06:30"),
+        ({"rule": "recorder_silent", "quiet_hours": ["22-6"]}, "write it as 22:00-06:30"),
     ],
 )
 def test_a_rule_that_makes_no_sense_is_refused(keys, says):

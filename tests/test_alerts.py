@@ -226,7 +226,7 @@ def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
     assert said == []
     path.write_text('{"x": 3}')
     assert memory.load([COUGHS])["coughs"].until == 0
-    assert said == [f"{path}: cannot be read; all rules begin anew"]
+    assert said == [f"{path}: cannot be read; all rules start over"]
 
 
 def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
@@ -235,7 +235,7 @@ def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
     memory.save([COUGHS], {"coughs": RuleState(until=9 * HOUR * SECOND)})
     watch, _, _ = watching(tmp_path, [COUGHS], HOUR * SECOND, said.append)
     assert watch.needed_from(HOUR * SECOND) < HOUR * SECOND
-    assert said == ["alerts: the clock was ahead, and was set back; the rules begin anew"]
+    assert said == ["alerts: the clock was set back; the rules start over"]
 
 
 def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_to_come(tmp_path):
@@ -254,7 +254,7 @@ def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_t
     assert len(outbox) == 0
     assert memory.load([COUGHS])["coughs"].until == now + 2 * SECOND  # also after a kill
     assert [ring.rule for ring in evaluate(now + 11 * MINUTE)] == ["silent"]
-    assert said == ["alerts: the clock was ahead, and was set back; the rules begin anew"]
+    assert said == ["alerts: the clock was set back; the rules start over"]
 
 
 class Recorder(Thread):
@@ -411,7 +411,7 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
         recorder.join()
     assert {name for name, _ in told} == {"coughs", "water"}
     assert all(rung <= right() for _, rung in told)
-    assert len([line for line in said if "begin anew" in line]) == 1
+    assert len([line for line in said if "start over" in line]) == 1
 
 
 def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each(
@@ -445,7 +445,7 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
 
 def test_rules_of_which_nobody_would_be_told_are_refused(tmp_path):
     home = RecorderAddress(tmp_path, "home", UTC)
-    with pytest.raises(BridgeError, match="nobody would be told; name urls_file in"):
+    with pytest.raises(BridgeError, match="alerts have no target; set urls_file in"):
         AlertsOutput([COUGHS], DeliverySettings(), home, tmp_path, pytest.fail)
 
 

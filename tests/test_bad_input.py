@@ -87,7 +87,7 @@ def test_a_file_of_nan_and_infinity_in_8_channels_at_192_khz(hearthlog, tmp_path
     soundfile.write(path, samples, 192_000, subtype="FLOAT")
     result = hearthlog("record", path, "-o", tmp_path / "logs", "--start", "2026-03-01")
     assert result.returncode == 3
-    line = "wild.wav: 0.05 s are left out: the samples are no numbers (NaN or infinity)"
+    line = "wild.wav: 0.05 s are left out: samples are not finite (NaN or infinity)"
     assert line in result.stderr
     _, _, values = features(tmp_path / "logs")
     assert len(values) in (38, 39)
@@ -126,8 +126,8 @@ def test_a_full_disk_keeps_what_was_recorded_and_the_next_start_completes_it(
     with small_disk(tmp_path / "disk", "1m") as disk:
         message = refused("record", long, "-o", disk, "--start", "2026-03-01T07:00:00")
         assert message == (
-            f"{disk}: cannot be written (No space left on device); what was recorded is kept and "
-            "completed at the next start"
+            f"{disk}: cannot be written (No space left on device); what was recorded is kept, "
+            "and completed at the next start"
         )
         (left,) = disk.rglob("*.mcap.active")
         kept = features(left)[0]

@@ -59,10 +59,13 @@ CONTRADICTIONS = [
         ({"ca_file": "ca.pem"}, "ca_file is for an encrypted connection; write tls = true, or"),
         ({"key_file": "key.pem"}, "key_file is for an encrypted connection; write tls = true"),
         ({"certificate_file": "a.pem"}, "certificate_file is for an encrypted connection; write"),
-        ({"tls": True, "key_file": "key.pem"}, "key_file belongs to a certificate; name that"),
-        ({"password_file": "/etc/hostname"}, "password_file is the password of a user; say of"),
+        (
+            {"tls": True, "key_file": "key.pem"},
+            "key_file needs a certificate; set certificate_file",
+        ),
+        ({"password_file": "/etc/hostname"}, "password_file needs a user name; set user"),
     ]
-] + [({"prometheus": {}}, "bridge.prometheus: gives the figures to nobody; name a text_file, or")]
+] + [({"prometheus": {}}, "bridge.prometheus: has no output; set text_file or")]
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def test_without_the_token_one_learns_how_to_get_the_address_and_nothing_else(se
     answers.add(served.ask("POST", path, "{}", None, Origin=served.url.partition("/?")[0])[::2])
     assert {status for status, _ in answers} == {403}
     for _, text in answers:
-        assert "its whole address" in text
+        assert "its full address" in text
         assert "<" not in text
         assert token[:-1] not in text
 
@@ -136,10 +136,10 @@ def test_who_asks_by_a_name_is_told_so_and_which_key_allows_it(served):
     status, _, text = served.ask("GET", whole, cookie=None, Host="raspberrypi.local:8380")
     assert status == 403
     assert 'names = ["raspberrypi.local"] in [bridge.page]' in text
-    assert "its whole address" not in text
+    assert "its full address" not in text
     for host in ("<script>", "a b", "x" * 300, '"', "[::1"):
         status, _, text = served.ask("GET", whole, cookie=None, Host=host)
-        assert (status, host in text, "in digits" in text) == (403, False, True)
+        assert (status, host in text, "by its IP address" in text) == (403, False, True)
 
 
 @pytest.mark.parametrize(
@@ -173,9 +173,9 @@ def test_the_reasons_of_a_refusal_are_told_apart(served):
             ("broken", "/", f"{cookie}x"),
         ]
     }
-    assert told.pop("nothing").startswith("This page opens with its whole address only")
-    assert told.pop("wrong") == "The token in this address is not the one of the page"
-    assert {*told.values()} == {"What this browser remembers of the page is valid no more"}
+    assert told.pop("nothing").startswith("This page opens only with its full address")
+    assert told.pop("wrong") == "The token in this address is wrong"
+    assert {*told.values()} == {"The cookie of this browser is no longer valid"}
 
 
 def test_a_cookie_is_void_with_another_key_token_or_port_or_after_a_year(monkeypatch):
@@ -195,12 +195,12 @@ def test_a_cookie_is_void_with_another_key_token_or_port_or_after_a_year(monkeyp
     ("table", "what"),
     [
         ({"names": ["http://raspberrypi.local"]}, "without http://"),
-        ({"names": ["*"]}, "is no name of a host"),
-        ({"names": ["a b"]}, "is no name of a host"),
-        ({"frames": ["homeassistant.local"]}, "is no address of a page"),
-        ({"frames": ["http://x; script-src *"]}, "is no address of a page"),
+        ({"names": ["*"]}, "is not a host name"),
+        ({"names": ["a b"]}, "is not a host name"),
+        ({"frames": ["homeassistant.local"]}, "is not the origin of a web page"),
+        ({"frames": ["http://x; script-src *"]}, "is not the origin of a web page"),
         ({"frames": ["http://ha.local/lovelace"]}, "without a path"),
-        ({"frames": ["*"]}, "is no address of a page"),
+        ({"frames": ["*"]}, "is not the origin of a web page"),
     ],
 )
 def test_names_and_frames_that_are_none_are_refused(table, what):
@@ -385,12 +385,12 @@ def test_an_address_of_the_network_comes_with_a_warning(place, tmp_path):
     said = []
     settings = PageSettings(port=free_port(), bind="0.0.0.0")
     HomePage(settings, place, tmp_path, said.append).close()
-    assert "in the clear" in said[1]
+    assert "unencrypted" in said[1]
 
 
 @pytest.mark.parametrize("bind", ["localhost", "box.example", ""])
 def test_an_address_that_is_a_name_is_refused(bind):
-    with pytest.raises(ValidationError, match="in digits"):
+    with pytest.raises(ValidationError, match="not an IP address"):
         PageSettings(bind=bind)
 
 
@@ -632,7 +632,7 @@ def test_a_bridge_that_may_only_read_says_so(served, monkeypatch):
         part("events", lambda it: event_id(start, "music") in {e["id"] for e in it["events"]})
     status, answer = served.mark(event_id(start, "music"), "speech")
     assert status == 422
-    assert "may only read the logs" in json.loads(answer)["error"]
+    assert "may only read the folder of logs" in json.loads(answer)["error"]
 
 
 def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):

@@ -258,7 +258,7 @@ def test_what_came_of_a_name_is_not_said_of_a_group_of_another_file(tmp_path, mo
 
 def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
     monkeypatch.setattr(group_naming.os, "access", lambda *_: False)
-    with pytest.raises(BridgeError, match="may only read the logs"):
+    with pytest.raises(BridgeError, match="may only read the folder of logs"):
         GroupNaming(tmp_path).start(KEY, 3, "kettle")
 
 

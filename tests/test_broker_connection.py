@@ -193,7 +193,7 @@ def test_a_missing_client_certificate_is_guessed_where_the_broker_only_hangs_up(
 ):
     with connected(tls_broker, tls=True, ca_file=authority.file) as (connection, said):
         flush_until(connection, lambda: bool(said))
-    assert "does it want a client certificate? see certificate_file and key_file" in said[0]
+    assert "does it need a client certificate? see certificate_file and key_file" in said[0]
 
 
 # The client leaves the socket to the garbage collector where a certificate is refused.

@@ -526,7 +526,7 @@ def test_clips_that_cannot_be_deleted_are_said_and_the_others_go(old, tmp_path):
     assert deleted == (0, "clips of 1 logs deleted: they were 1 days old")
     level, text = failed
     assert level == 1
-    assert text.startswith(f"clips cannot be looked through or deleted: {stuck[0].parent}/home_")
+    assert text.startswith(f"clips cannot be listed or deleted: {stuck[0].parent}/home_")
     assert text.endswith(": Read-only file system, and 1 more")
 
 
@@ -640,8 +640,8 @@ def test_clips_of_which_nothing_is_whole_are_deleted(noise, tmp_path, size):
 def test_sound_is_not_kept_without_a_model_that_knows_what_is_private(noise, model_file, tmp_path):
     about = asked(tmp_path / "logs", keep_audio="events")
     for reason, others in {
-        "keep_audio = \"always\" needs a model that knows 'speech', which is never kept (there is "
-        "none); take one that does, or set never_keep = [] to keep that too": {
+        "keep_audio = \"always\" needs a model that knows 'speech', which is never kept (there "
+        "is none); use such a model, or set never_keep = [] to keep that too": {
             "keep_audio": "always"
         },
         'keep_audio = "events" needs a model, which says what to keep; give one, or keep it '
@@ -652,7 +652,7 @@ def test_sound_is_not_kept_without_a_model_that_knows_what_is_private(noise, mod
             keep([noise(3)], about)
         assert str(error.value) == reason
     about = asked(tmp_path / "logs", model_file, keep_audio="unsure", never_keep=["speach"])
-    with pytest.raises(ConfigurationError, match=r"that knows 'speach'.*this one tells apart"):
+    with pytest.raises(ConfigurationError, match=r"with the class 'speach'.*this one has "):
         keep([noise(3)], about)
     assert not (tmp_path / "logs").exists()
 

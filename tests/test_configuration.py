@@ -231,10 +231,10 @@ def test_every_number_has_bounds(tmp_path, value):
         ("output = ''", "output: is empty; write a path, or leave the key out"),
         ("[[microphone]]\nmodel = ' '", "model: is empty; write a path"),
         ("[bridge.mqtt]\nhost='x'\npassword_file=''", "password_file: is empty; write a path"),
-        ("output = '~/logs'", "'~/logs': ~ and $ are of the shell; write the whole path"),
-        ("[bridge]\nstate = '$HOME/state'", "~ and $ are of the shell; write the whole path"),
+        ("output = '~/logs'", "'~/logs': ~ and $ are not expanded; write the full path"),
+        ("[bridge]\nstate = '$HOME/state'", "~ and $ are not expanded; write the full path"),
         ("[scenarios]\nbath = '~/bath.safetensors'", "scenarios.bath: '~/bath.safetensors': ~ and"),
-        ("quiet_hours = ['22:00\u201306:30']", "as 22:00-06:30, with the - of the keyboard"),
+        ("quiet_hours = ['22:00\u201306:30']", "as 22:00-06:30, with a plain hyphen"),
         ("quiet_hours = ['22:00-06:00' '12:00-13:00']", "closed, or a comma is missing"),
         ("node = 7", 'node: 7 is not a text in quotes; write node = "7"'),
         ("quiet_hour = ['22:00-06:30']", "unknown key 'quiet_hour'; is quiet_hours meant?"),
@@ -368,7 +368,7 @@ DAILY = "[bridge.mqtt]\nhost = 'x'\n[[bridge.alert]]\nname = 'a'\n"
         (
             '[[bridge.alert]]\nname = "a"\nrule = "recorder_silent"\nsilent_for = "1m"\n',
             1,
-            "bridge.alert: nobody would be told; name urls_file",
+            "bridge.alert: alerts have no target; set urls_file",
         ),
         (
             "[bridge.page]\nport = 9380\n[bridge.prometheus]\nport = 9380\ntoken_file = 'token'\n",
@@ -388,7 +388,7 @@ DAILY = "[bridge.mqtt]\nhost = 'x'\n[[bridge.alert]]\nname = 'a'\n"
         (
             ALERT,
             3,
-            "a: there is no microphone 'kitchn', so that it hears nothing; there is mic",
+            "a: there is no microphone 'kitchn'; there is mic",
         ),
         (
             ALERT.replace("kitchn", "mic"),
@@ -403,22 +403,22 @@ DAILY = "[bridge.mqtt]\nhost = 'x'\n[[bridge.alert]]\nname = 'a'\n"
         (
             ALERT.replace("count = 3", "minutes = 60"),
             3,
-            "a: there cannot be more than 60 minutes in a window of 1 h, so that it never rings",
+            "a: there cannot be more than 60 minutes in a window of 1 h, so it never notifies",
         ),
         (
             ALERT.replace("count = 3", "count = 362"),
             3,
-            "a: there cannot be more than 362 events in a window of 1 h, so that it never rings",
+            "a: there cannot be more than 362 events in a window of 1 h, so it never notifies",
         ),
         (
             f"retention_days = 8\n{DAILY}rule = 'unlike_usual'\n",
             3,
-            "a: retention_days = 8 leaves it no 7 days to compare with, so that it never rings; ke",
+            "a: retention_days = 8 leaves it no 7 days to compare with, so it never notifies; ke",
         ),
         (
             f"retention_days = 15\n{DAILY}rule = 'unusual_day'\n",
             3,
-            "days to compare with, so that it never rings; keep 16 or more",
+            "days to compare with, so it never notifies; keep 16 or more",
         ),
     ],
 )
@@ -534,7 +534,7 @@ def test_a_credential_of_the_service_is_not_missed(hearthlog, tmp_path):
     )
     result = hearthlog("config", "check", file)
     assert result.returncode == 3
-    assert "mqtt: not here; it has to be a credential of the service" in result.stderr
+    assert "mqtt: missing; it must be a credential of the service" in result.stderr
 
 
 def test_a_variable_that_is_wrong_is_named(refused):

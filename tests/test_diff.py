@@ -520,8 +520,8 @@ def test_without_probabilities_a_queue_needs_a_second_labelling(logs, hearthlog)
     alone = hearthlog("diff", logs, "bare", "--queue")
     assert alone.returncode == 1
     assert alone.stderr == (
-        "hearthlog: relabel/bare: the logs do not say how sure the model was (no labels with "
-        "probabilities); name a second labelling to compare it with\n"
+        "hearthlog: relabel/bare: its labels have no probabilities; name a second labelling to "
+        "compare it with\n"
     )
     found = hearthlog("diff", logs, "bare", "two", "--queue", "--spans", 3, "--json")
     assert found.returncode == 0

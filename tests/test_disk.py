@@ -209,7 +209,7 @@ def test_a_second_recorder_of_a_folder_is_refused_with_the_number_of_the_first(
             wait_for(lambda: list(logs.rglob("other_*")))
             third.send_signal(signal.SIGTERM)
     assert second.returncode == 1
-    assert f"is recorded by 'home' already (process {process.pid})" in second.stderr
+    assert f"is in use by the recorder 'home' already (process {process.pid})" in second.stderr
     assert process.returncode == 0, process.errors
     assert {path.name[:5] for path in logs.rglob("*.mcap")} == {"home_", "other"}
 
@@ -222,7 +222,7 @@ def test_a_folder_that_was_moved_away_and_made_again_is_locked_again(labmic, hea
         wait_for_text(process, "can be written again")
         second = hearthlog("record", "--device", labmic.device, "-o", logs, env=labmic.env)
     assert second.returncode == 1
-    assert f"is recorded by 'home' already (process {process.pid})" in second.stderr
+    assert f"is in use by the recorder 'home' already (process {process.pid})" in second.stderr
 
 
 def test_a_folder_that_is_gone_at_the_end_is_no_failure(tmp_path):

@@ -303,7 +303,7 @@ def test_a_network_is_tried_in_a_process_of_its_own(yamnet):
         ("raise ImportError('no libfoo.so')", "cannot be tried (ImportError: no libfoo.so)"),
         ("print('nonsense')", "cannot be tried"),
         ("answer(seconds=0.4)", "too slow here: 0.4 s for a window, every 0.5 s of each of 3"),
-        ("answer(seconds=0.1)", "of each of 3 microphones; this machine holds one every 0.6 s"),
+        ("answer(seconds=0.1)", "of each of 3 microphones; this machine manages one every 0.6 s"),
         ("answer(megabytes=1000)", "takes 1000 MB of memory, and 300 are the most"),
         ("print(json.dumps({'error': 'yamnet.tflite: is bad'}))", "yamnet.tflite: is bad"),
     ],

@@ -303,11 +303,9 @@ def test_a_foreign_page_a_wrong_token_and_another_name_get_nothing(logs):
             assert event["headers"] == nothing
         assert ended(watcher) == 0
     said = "".join(watcher.lines)
-    assert (
-        said.count("a page of https://evil.example; if it is yours, let it look by --origin") == 1
-    )
+    assert said.count("a page of https://evil.example; if it is yours, allow it with --origin") == 1
     assert said.count("the token is missing or wrong") == 1
-    assert said.count("it was asked for by a name") == 1
+    assert said.count("the request used a host name") == 1
 
 
 def test_pages_of_foxglove_and_of_this_machine_may_look(logs):
@@ -351,7 +349,7 @@ def test_a_name_that_somebody_lets_point_here_is_refused(bind, host, admitted):
     if admitted:
         assert b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==" in check()
     else:
-        with pytest.raises(RefusedError, match="by a name"):
+        with pytest.raises(RefusedError, match="host name"):
             check()
 
 
@@ -570,7 +568,7 @@ def test_years_without_a_log_are_passed_over(logs, day, tmp_path):
 def test_nothing_to_play_is_told(refused, logs):
     for span in (("--start", "2027-01-01"), ("--end", "2020-01-01")):
         line = refused("watch", logs, "--foxglove", *span)
-        assert line == "nothing was recorded in this time; `hearthlog info` tells what was"
+        assert line == "nothing was recorded in this time; `hearthlog info` lists what was"
 
 
 def test_what_a_later_version_wrote_passes_as_it_is(tmp_path):

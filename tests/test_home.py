@@ -168,7 +168,7 @@ def test_a_clip_that_cannot_be_read_completely_is_refused_in_one_line(tmp_path):
     rows = "cut.flac,speech,a,train\nnan.wav,yelling,b,train\n"
     (tmp_path / "m.csv").write_text(f"path,label,source_group,split\n{rows}")
     library = ClipLibrary(tmp_path / "m.csv")
-    for label, why in (("speech", "cut short after"), ("yelling", "no numbers")):
+    for label, why in (("speech", "cut short after"), ("yelling", "not finite")):
         (clip,) = library.of(label)
         with pytest.raises(SimulationError, match=f"{why}.*; take it out of the manifest"):
             library.sound(clip, 20)

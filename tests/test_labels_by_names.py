@@ -370,4 +370,4 @@ def test_an_alert_of_a_name_says_where_it_is_to_be_had():
     assert unknown_class(rule, {"mic": {"speech"}, "mic-audioset": {"scream"}}) == ""
     hint = next(name.name for name in audioset_names() if not name.is_event)
     rule = rule.model_copy(update={"label": hint})
-    assert unknown_class(rule, {"mic": {"speech"}}).endswith("a hint alone: it is not counted")
+    assert unknown_class(rule, {"mic": {"speech"}}).endswith("hints and not counted")

@@ -212,6 +212,6 @@ def test_what_is_no_address_of_a_watchdog_is_refused(tmp_path, url):
     (tmp_path / "url").write_text(url)
     result = doctor(tmp_path, "--ping-file", tmp_path / "url")
     assert (result.returncode, result.stdout) == (1, "")
-    assert "has no address that can be asked for" in result.stderr
+    assert "has no web address" in result.stderr
     said = result.stderr.replace(str(tmp_path / "url"), "").replace("https://hc-ping.com", "")
     assert url not in said

@@ -42,8 +42,8 @@ def test_the_hottest_part_counts(sys, tmp_path):
     ("path", "text", "words"),
     [
         (THROTTLED, "0x50005\n", "the power supply is too weak"),
-        (THROTTLED, "0x4\n", "the board is slowed down"),
-        (ZONE.format(1), "81900\n", "the machine is 82 degrees hot: give it air"),
+        (THROTTLED, "0x4\n", "the board is throttled"),
+        (ZONE.format(1), "81900\n", "the machine is 82 degrees hot: improve its cooling"),
     ],
 )
 def test_what_is_wrong_with_the_machine_is_a_warning(sys, tmp_path, path, text, words):

@@ -670,7 +670,7 @@ def test_classes_that_go_while_the_bridge_runs_are_cleared(home, broker):
     [
         ("{", "command: Invalid JSON"),
         ("[]", "command: Input should be an object"),
-        ("{}", "one of correct, told, pause_minutes and resume has to be there"),
+        ("{}", "one of correct, told, pause_minutes and resume is required"),
         ('{"resume": true, "pause_minutes": 3}', "one of correct, told, pause_minutes and"),
         ('{"told": false}', "label belongs to correct and told"),
         ('{"pause_minutes": 1e9}', "pause_minutes: Input should be less than or equal to"),

@@ -118,7 +118,7 @@ def test_a_source_that_comes_ends_and_comes_back_is_in_one_log_without_its_passw
         heard = len(features(logs)[0])
         wait_for_frames(logs, heard + 60)
     name = live_server.address
-    assert f"mic: {name} sends nothing that is known as sound;" in said
+    assert f"mic: {name} sends no sound of a known format;" in said
     assert f"mic: {name} has stopped sending" in said
     (log,) = find_logs(logs)
     (gap,) = read(log, "gap")
@@ -159,12 +159,12 @@ def test_a_camera_that_freezes_is_heard_again(camera, tmp_path):
 @pytest.mark.parametrize(
     ("condition", "reason"),
     [
-        ("html", "sends nothing that is known as sound; check the part after the host"),
-        ("playlist", "sends nothing that is known as sound"),
-        ("locked", "wants a user name and a password"),
+        ("html", "sends no sound of a known format; check the part after the host"),
+        ("playlist", "sends no sound of a known format"),
+        ("locked", "needs a user name and a password"),
         ("silent", "does not answer"),
-        ("ends", "sends nothing that is known as sound"),
-        ("fast", "sends sound faster than it sounds; give the address of a live source"),
+        ("ends", "sends no sound of a known format"),
+        ("fast", "sends sound faster than real time; use the address of a live source"),
     ],
 )
 def test_what_is_wrong_with_a_server_is_said(live_server, tmp_path, condition, reason):
@@ -191,7 +191,7 @@ def test_what_is_wrong_with_a_camera_is_said(camera):
     assert "is not there (404 Not Found)" in why(camera.address("no"))
     assert "has no sound" in why(camera.address("mute"))
     locked = f"127.0.0.1:{camera.locked_port}/sound"
-    assert why(f"rtsp://{locked}").startswith(f"rtsp://{locked} wants a user name and a password")
+    assert why(f"rtsp://{locked}").startswith(f"rtsp://{locked} needs a user name and a password")
     refused = why(f"rtsp://listener:wrong@{locked}")
     assert refused == f"rtsp://{locked} refuses the user name or the password"
     MicrophoneSource(f"rtsp://{USER}{locked}", waits=False).close()
@@ -201,7 +201,7 @@ def test_a_host_that_is_not_there_is_told_from_one_that_refuses():
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))
         assert "refuses the connection" in why(f"rtsp://127.0.0.1:{held.getsockname()[1]}/mic")
-    assert "has a host that nobody knows" in why("http://camera.invalid/mic")
+    assert "has an unknown host" in why("http://camera.invalid/mic")
 
 
 @pytest.mark.parametrize("killed", ["record", "capture"])

@@ -255,7 +255,7 @@ def test_a_home_is_learned_from(logs, trained, tmp_path):
 
 def test_a_model_of_another_network_of_this_name_is_refused(logs, trained, own):
     write_network(own, "levels", spectral_network((1, "any")))
-    with pytest.raises(ModelError, match=r"is for the network levels with sha256 .* train it anew"):
+    with pytest.raises(ModelError, match=r"is for the network levels with sha256 .* retrain it"):
         load_model(trained)
     (origin,) = read_recorder_infos(find_logs(logs)[0], "features")
     with pytest.raises(LogError, match="has features of the network levels with sha256"):
@@ -264,7 +264,7 @@ def test_a_model_of_another_network_of_this_name_is_refused(logs, trained, own):
 
 def test_a_model_of_the_same_network_with_another_hop_is_refused(trained, own):
     write_network(own, "levels", hop_seconds=0.25)
-    with pytest.raises(ModelError, match=r"version .* of feature set levels.*train it anew"):
+    with pytest.raises(ModelError, match=r"version .* of feature set levels.*retrain it"):
         load_model(trained)
 
 

@@ -98,7 +98,7 @@ def test_a_watchdog_that_is_away_is_said_to_be(often):
         pings.update(news())
         time.sleep(0.02)
     pings.close()
-    assert said[0] == "ping: nobody there has taken it (Connection refused); trying again"
+    assert said[0] == "ping: not accepted (Connection refused); trying again"
 
 
 @pytest.mark.usefixtures("often")
@@ -112,7 +112,7 @@ def test_the_address_may_be_in_a_file_and_is_in_no_line(tmp_path):
         pings.close()
     for wrong in ("", "a-secret", "https://", "http://x/a secret", "http://x:y/", "http://[x/"):
         file.write_text(wrong)
-        with pytest.raises(HearthlogError, match="has no address that can be asked for") as error:
+        with pytest.raises(HearthlogError, match="has no web address") as error:
             PingOutput(settings, said.append)
         assert "secret" not in str(error.value)
     assert said == []

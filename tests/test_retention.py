@@ -254,7 +254,7 @@ def test_a_size_that_is_none_is_refused_with_one_line(tmp_path, hearthlog, value
     result = hearthlog("retain", "-o", tmp_path, f"--max-record-size={value}")
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
-    assert line.endswith(" is no size; say how many bytes, such as 500M or 20G")
+    assert line.endswith(" is not a size; write bytes, such as 500M or 20G")
 
 
 @pytest.mark.parametrize(
@@ -355,4 +355,4 @@ def test_what_cannot_be_deleted_is_said_and_the_others_go(logs):
     finally:
         subprocess.run(["chattr", "-i", stuck], check=True)
     assert left(logs) == [logs[0], *logs[2:]]
-    assert "cannot be looked through or deleted (Operation not permitted)" in report.problem
+    assert "cannot be listed or deleted (Operation not permitted)" in report.problem

@@ -195,7 +195,7 @@ def test_what_was_not_recorded_cannot_be_marked_and_nothing_changes(home):
         (START - 2 * SECOND, START - SECOND),
         (hole.ends[-1] + SECOND, hole.ends[-1] + 2 * SECOND),
     ):
-        with pytest.raises(DataError, match="not all of this span was recorded"):
+        with pytest.raises(DataError, match="part of this span was not recorded"):
             marking.mark(start, end, "yelling")
     assert layers(home) == []
     assert marking.undo() is None
@@ -391,7 +391,7 @@ def test_a_span_that_was_not_recorded_is_explained_and_the_session_goes_on(home)
     sitting = Sitting(home)
     sitting.screen.marked = (START - 9 * SECOND, START - 5 * SECOND)
     sitting.session.press("2")
-    assert "not all of this span was recorded" in sitting.said[-1]
+    assert "part of this span was not recorded" in sitting.said[-1]
     sitting.screen.marked = (START + 5 * SECOND, START + 9 * SECOND)
     sitting.session.press("2")
     assert len(layers(home)) == 1
@@ -415,9 +415,9 @@ def test_a_mark_that_cannot_be_shown_is_made_once_and_undone_once(home):
     sitting.screen.marked = (START + 15 * SECOND, START + 19 * SECOND)
     sitting.screen.draws = False
     sitting.session.press("3")
-    assert "what was done is done" in sitting.said[-1]
+    assert "the change was made" in sitting.said[-1]
     sitting.session.press("z")
-    assert "what was done is done" in sitting.said[-1]
+    assert "the change was made" in sitting.said[-1]
     assert [mark.label for mark in layers(home)] == ["speech"]
 
 
@@ -688,7 +688,7 @@ def test_a_queue_without_a_value_is_one_of_useful_spans(home, capfd):
 def test_without_a_display_it_says_what_else_there_is(recorded_home, capfd):
     done = run(capfd, "review", recorded_home)
     assert done.returncode == 1
-    assert "no display here: use --web to look in a browser, or --save FILE.rrd" in done.stderr
+    assert "no display here: use --web for a browser, or --save FILE.rrd" in done.stderr
     assert done.stderr.count("\n") == 1
 
 

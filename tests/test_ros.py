@@ -139,7 +139,7 @@ def test_what_is_wrong_is_said_in_one_line(ros, executable, parameters, environm
 
 def test_a_model_for_embeddings_labels_by_features_alone_and_says_so(ros):
     with ros.node("label", model="general-embedding") as node:
-        assert "this node takes no embeddings: labels by features alone" in node.stdout.readline()
+        assert "this node takes no embeddings: it labels by features only" in node.stdout.readline()
         assert end(node) == ""
 
 

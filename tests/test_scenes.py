@@ -288,7 +288,7 @@ def test_what_the_model_has_learned_from_is_counted(heard, training_set, new_cli
 def test_a_model_of_simulated_sounds_is_said_to_be_one_once(second_file, new_clips, capfd):
     result = run(capfd, *words_of(second_file, new_clips, "--scenes", 2))
     assert result.returncode == 0, result.stderr
-    assert result.stderr.count("simulated sounds alone") == 1
+    assert result.stderr.count("simulated sounds only") == 1
 
 
 def test_a_clip_may_be_a_part_of_a_file(model_file, tmp_path, capfd):

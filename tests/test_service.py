@@ -266,7 +266,7 @@ def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service
     ("told", "said"),
     [
         ("[bridge.ping]\nurl = 'http://x'\n", "who may not read the logs; say there readable_by"),
-        ("", "tells nobody anything; it has no table such as [bridge.mqtt]"),
+        ("", "has no output; add a table such as [bridge.mqtt]"),
         ("[bridge.mqtt]\n", "bridge.mqtt.host: is missing; write host = "),
         (
             "readable_by = 'group'\n[bridge.mqtt]\nhost = 'x'\nca_file = '/home/anna/ca'\n",

@@ -15,8 +15,8 @@ from hearthlog.models.modelfile.registry import insist
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 
 LINE = (
-    "hearthlog: model {} has learned from simulated sounds alone and is mostly wrong about real "
-    "ones, however sure it is; train one from recordings\n"
+    "hearthlog: model {} was trained on simulated sounds only and is mostly wrong about real "
+    "ones, whatever its confidence; train one from recordings\n"
 )
 
 
@@ -54,7 +54,7 @@ def test_its_card_and_the_list_of_models_say_so_too(hearthlog, simulated, model_
     assert found == {"made_up": True, "real": False}
     for name, says in (("made_up", True), ("real", False)):
         card = hearthlog("models", "show", name, "--folder", folder).stdout
-        assert ("Learned from simulated sounds alone" in card) is says
+        assert ("Trained on simulated sounds only" in card) is says
 
 
 def test_a_model_that_takes_the_place_of_another_is_looked_at_as_well(

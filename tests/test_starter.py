@@ -94,7 +94,7 @@ def test_a_starter_has_learned_only_from_what_may_be_shipped(name):
     assert len(collections) > 5
     assert [one for one in collections if not may_be_shipped(one.licence)] == []
     assert model.description.scenario_name == name.removesuffix("-embedding")
-    assert "Not to be passed on" not in model_card(model)
+    assert "Do not pass on" not in model_card(model)
 
 
 @pytest.mark.fast
@@ -104,7 +104,7 @@ def test_a_card_names_the_licences_that_forbid_passing_the_model_on():
     data = model.description.training_data.model_copy(update={"collections": learned})
     described = model.description.model_copy(update={"training_data": data})
     card = model_card(replace(model, description=described))
-    assert "Not to be passed on without asking" in card
+    assert "Do not pass on without permission" in card
     assert "- esc50 (CC BY-NC 3.0)\n" in card
 
 

@@ -199,7 +199,7 @@ def test_a_clip_with_samples_that_are_no_numbers_is_learned_from_around_them(tmp
     assert not data.skipped
     (left,) = data.left_out
     assert left.clip == f"0.55 s of {path}"
-    assert left.reason == "parts of clips, in which the samples are no numbers (NaN or infinity)"
+    assert left.reason == "parts of clips, in which samples are not finite (NaN or infinity)"
     broken[::RATE] = value
     soundfile.write(path, broken, RATE, subtype="FLOAT")
     with pytest.raises(DataError, match=r"class speech has no segments.*0\.85 s of .*broken\.wav"):

@@ -86,8 +86,8 @@ def download(
         if found != sha256:
             _empty(part)
             raise DownloadError(
-                f"{url}: is another file than the one that is known (its sha256 begins with "
-                f"{found[:12]}, not {sha256[:12]}); nothing was kept"
+                f"{url}: differs from the expected file (its sha256 begins with {found[:12]}, "
+                f"not {sha256[:12]}); nothing was kept"
             )
         _give_name(part, _part_path(path, sha256), path)
 
@@ -189,8 +189,8 @@ def _receive_all(url: str, part: BufferedRandom, size: int, progress: Progress) 
     else:
         if _length(part) == size:
             return
-    kept = "; the same command goes on with what came" if _length(part) else ""
-    raise DownloadError(f"{url}: cannot be had ({printable(problem)[:200]}){kept}")
+    kept = "; the same command resumes the download" if _length(part) else ""
+    raise DownloadError(f"{url}: cannot be downloaded ({printable(problem)[:200]}){kept}")
 
 
 def _receive(url: str, part: BufferedRandom, size: int, progress: Progress) -> None:
@@ -203,7 +203,7 @@ def _receive(url: str, part: BufferedRandom, size: int, progress: Progress) -> N
         announced = response.headers.get("Content-Length", "")
         if announced.isascii() and announced.isdigit() and have + int(announced) != size:
             raise DownloadError(
-                f"{url}: is another file than the one that is known ({have + int(announced):,} "
+                f"{url}: differs from the expected file ({have + int(announced):,} "
                 f"bytes, not {size:,}); nothing was kept"
             )
         begin, first = time.monotonic(), have
@@ -212,8 +212,7 @@ def _receive(url: str, part: BufferedRandom, size: int, progress: Progress) -> N
             if have > size:
                 _empty(part)
                 raise DownloadError(
-                    f"{url}: is larger than the file that is known ({size:,} bytes); nothing was "
-                    "kept"
+                    f"{url}: is larger than the expected file ({size:,} bytes); nothing was kept"
                 )
             part.write(block)
             progress(have / size)
@@ -281,7 +280,7 @@ def _check_address(url: str, *, of_here: bool = True) -> None:
     parts = urlsplit(url)
     is_here = of_here and parts.scheme == "http" and parts.hostname in _LOOPBACK
     if parts.scheme != "https" and not is_here:
-        raise DownloadError(f"{url}: is no address that begins with https://")
+        raise DownloadError(f"{url}: is not an https:// address")
 
 
 class _Redirects(HTTPRedirectHandler):

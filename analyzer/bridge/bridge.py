@@ -81,7 +81,7 @@ class PingOutput:
             if time.monotonic() - self._judged <= _JUDGED_SECONDS:
                 problem = ping(self._url, is_well=self._is_well)
                 if problem:
-                    self._say(f"ping: nobody there has taken it ({problem}); trying again")
+                    self._say(f"ping: not accepted ({problem}); trying again")
 
 
 _WATCHDOG_SECONDS = 10.0
@@ -309,7 +309,7 @@ def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
         problems.append(NO_RECIPIENT)
     for path, step in [*_secret_steps(settings, problems), *_other_steps(settings)]:
         if path is not None and not path.is_absolute() and not secret_path(path).exists():
-            warnings.append(f"{path}: not here; it has to be a credential of the service")
+            warnings.append(f"{path}: missing; it must be a credential of the service")
             continue
         try:
             step()

@@ -91,8 +91,8 @@ def _segments(logs: list[Path], event: SoundEvent) -> list[tuple[int, int]]:
 
 REVIEWER = "page of the home"
 READ_ONLY = (
-    "It was not saved: the bridge may only read the logs, not write beside them. Whoever set up "
-    "the box can change that."
+    "It was not saved: the bridge may only read the folder of logs. Whoever set up the box can "
+    "change that."
 )
 _MOST_LOGS = 64  # newest logs from which marks are read: more than a day and a half
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -208,7 +208,7 @@ class _Command(BaseModel):
         """Check which fields are there, or raise `BridgeError`."""
         of_class = self.correct is not None, self.told is not None
         if sum([*of_class, self.pause_minutes is not None, self.resume]) != 1:
-            raise BridgeError("one of correct, told, pause_minutes and resume has to be there")
+            raise BridgeError("one of correct, told, pause_minutes and resume is required")
         if (self.label is not None) != any(of_class):
             raise BridgeError("label belongs to correct and told")
 

@@ -69,7 +69,7 @@ class _Kept(BaseModel, extra="forbid"):
 
 
 def _totals_file(path: Path) -> StateFile[_Kept]:
-    damaged = "is damaged; delete it, and counts begin anew"
+    damaged = "is damaged; delete it, and counts start over"
     return StateFile(path, _Kept, lambda _: None, damaged)
 
 

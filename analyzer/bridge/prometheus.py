@@ -148,11 +148,13 @@ class _Handler(HttpHandler):
         server = cast(_Server, self.server)
         shown = self.headers.get("Authorization", "").encode("utf-8", "replace")
         if not is_asked_in_digits(HOST, self.host) or "Origin" in self.headers:
-            self.send_text(HTTPStatus.FORBIDDEN, "ask for an address in digits, and from no page")
+            self.send_text(
+                HTTPStatus.FORBIDDEN, "request it by IP address, and not from a web page"
+            )
         elif not compare_digest(shown, server.expected):
             self.send_text(
                 HTTPStatus.UNAUTHORIZED,
-                "show the token of token_file in [bridge.prometheus]: `authorization: "
+                "send the token of token_file in [bridge.prometheus], as `authorization: "
                 "credentials_file` of Prometheus does",
                 {"WWW-Authenticate": "Bearer"},
             )
@@ -187,7 +189,7 @@ class _Figures(Collector):
                 events = {names: one.events for names, one in own.items()}
                 yield counter(f"{of}events", "Events of a class, from the log.", events)
                 seconds = {names: one.seconds for names, one in own.items()}
-                yield counter(f"{of}event_seconds", "Seconds that a class was heard.", seconds)
+                yield counter(f"{of}event_seconds", "Seconds of a class, from the log.", seconds)
         of_home = partial(_metric, GaugeMetricFamily, labels=("node",))
         of_microphone = partial(_metric, GaugeMetricFamily, labels=("node", "microphone"))
         present = {(node, each.name): each for each in state.present()}
@@ -198,19 +200,17 @@ class _Figures(Collector):
         yield of_home("recording", "Whether the recorder writes.", {(node,): state.is_recording()})
         yield of_microphone("listening", "Whether labels come.", listening)
         yield of_microphone("level_dbfs", "Mean level of ten seconds.", levels)
-        yield of_microphone(
-            "last_label_timestamp_seconds", "When the newest label was known.", newest
-        )
+        yield of_microphone("last_label_timestamp_seconds", "Time of the newest label.", newest)
         yield _metric(
             GaugeMetricFamily,
             "problem",
-            "Level of what the recorder says of a thing: 0 is well, 1 a warning, 2 an error.",
+            "Health level reported by the recorder: 0 ok, 1 warning, 2 error.",
             problems,
             labels=("node", "subject"),
         )
         with suppress(OSError):  # the disk is missing
             free = shutil.disk_usage(self._home.folder).free
-            yield of_home("free_bytes", "Of the disk of the logs.", {(node,): free})
+            yield of_home("free_bytes", "Free bytes on the disk of the logs.", {(node,): free})
 
 
 def _metric(

@@ -31,14 +31,14 @@ from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.files import read_toml
 
 NO_RECIPIENT = (
-    "bridge.alert: nobody would be told; name urls_file in [bridge.delivery], or a broker in "
+    "bridge.alert: alerts have no target; set urls_file in [bridge.delivery], or a broker in "
     "[bridge.mqtt]"
 )
 
 
 def _check_secret_file(value: Any) -> Any:
     if "://" in str(value):  # a secret, which must not appear in messages
-        raise ValueError("names a file; write the address into that file, on a line of its own")
+        raise ValueError("expects a file; write the address into a file, on a line of its own")
     return value
 
 
@@ -55,7 +55,7 @@ class DeliverySettings(_Table):
     urls_file: SecretFile | None = Field(
         default=None,
         examples=["/etc/hearthlog/alert-urls"],
-        description="Addresses as Apprise reads them, one a line; they are secrets.",
+        description="File of Apprise addresses, one a line; keep it secret.",
     )
 
 
@@ -78,15 +78,13 @@ _Port = Annotated[int, Field(ge=1, le=65535, examples=[8883])]
 
 def _check_ping_address(url: str) -> str:
     if url and not (is_ping_address(url) and url.isprintable() and " " not in url):
-        raise ValueError(
-            "is no address that can be asked for; write one such as https://hc-ping.com/your-uuid"
-        )
+        raise ValueError("is not a web address; write one such as https://hc-ping.com/your-uuid")
     return url
 
 
 def _check_host(name: str) -> str:
     if "/" in name or "@" in name:  # the text may contain a password
-        raise ValueError("is an address; write the name of the host alone, as broker.lan")
+        raise ValueError("is an address; write only the host name, such as broker.lan")
     try:
         encoded = name.encode("idna")
     except UnicodeError:
@@ -102,7 +100,8 @@ _PLACE = r"[a-z0-9]([a-z0-9.-]{0,251}[a-z0-9])?(:[0-9]{1,5})?"
 def _check_name(name: str) -> str:
     if not re.fullmatch(_PLACE, name.lower()):
         raise ValueError(
-            f"{name[:64]!r} is no name of a host; write one as raspberrypi.local, without http://"
+            f"{name[:64]!r} is not a host name; write one such as raspberrypi.local, without "
+            "http://"
         )
     return name.lower()
 
@@ -110,7 +109,7 @@ def _check_name(name: str) -> str:
 def _check_origin(origin: str) -> str:
     if not re.fullmatch(f"https?://{_PLACE}", origin.lower()):
         raise ValueError(
-            f"{origin[:64]!r} is no address of a page's server; write one as "
+            f"{origin[:64]!r} is not the origin of a web page; write one such as "
             "http://homeassistant.local:8123, without a path"
         )
     return origin.lower()
@@ -120,8 +119,7 @@ def _check_bind(address: str) -> str:
     found = ip_of(address)
     if found is None or found.is_multicast:
         raise ValueError(
-            f"{address[:64]!r} is no address: write one of this machine in digits, such as "
-            "127.0.0.1"
+            f"{address[:64]!r} is not an IP address; write one of this machine, such as 127.0.0.1"
         )
     return address
 
@@ -132,27 +130,29 @@ class MqttSettings(_Table):
     host: Annotated[str, AfterValidator(_check_host)] = Field(
         examples=["broker.lan"], description="Name or address of the broker."
     )
-    port: _Port | None = Field(default=None, description="1883, with TLS 8883, by default.")
-    user: str = Field(
-        default="", examples=["hearthlog"], description="Empty: nobody in particular."
-    )
+    port: _Port | None = Field(default=None, description="Port; by default 1883, with TLS 8883.")
+    user: str = Field(default="", examples=["hearthlog"], description="User name; empty: none.")
     password_file: SecretFile | None = Field(
         default=None, examples=["/etc/hearthlog/mqtt-password"], description="Of one line."
     )
     tls: bool = Field(default=False, description="Whether the connection is encrypted.")
     ca_file: PlainPath | None = Field(
-        default=None, description="Of who signs the broker's certificate; none: the machine's own."
+        default=None, description="CA certificates for the broker; none: the machine's."
     )
     certificate_file: PlainPath | None = Field(default=None, description="Of this client.")
     key_file: PlainPath | None = Field(default=None, description="Of this client.")
-    client_id: str = Field(default="", description="Empty: hearthlog- and the recorder's name.")
+    client_id: str = Field(
+        default="", description="MQTT client id; empty: hearthlog- and the recorder's name."
+    )
     topic: _Topic = Field(default="hearthlog", description="Begins all topics.")
-    home_assistant: bool = Field(default=True, description="Whether Home Assistant is told.")
+    home_assistant: bool = Field(
+        default=True, description="Publish discovery messages for Home Assistant."
+    )
     discovery_topic: _Topic = Field(
-        default="homeassistant", description="Where Home Assistant looks for devices."
+        default="homeassistant", description="Discovery topic of Home Assistant."
     )
     commands: bool = Field(
-        default=False, description="Whether corrections and pauses are taken from the broker."
+        default=False, description="Accept corrections and pauses from the broker."
     )
 
     def check_files(self) -> None:
@@ -166,9 +166,9 @@ class MqttSettings(_Table):
         if not self.tls and (name := next((name for name in files if getattr(self, name)), "")):
             problem = f"{name} is for an encrypted connection; write tls = true, or leave it out"
         elif self.key_file and not self.certificate_file:
-            problem = "key_file belongs to a certificate; name that, with certificate_file"
+            problem = "key_file needs a certificate; set certificate_file"
         elif self.password_file and not self.user:
-            problem = "password_file is the password of a user; say of which, with user"
+            problem = "password_file needs a user name; set user"
         else:
             return
         raise BridgeError(f"bridge.mqtt: {problem}")
@@ -180,18 +180,17 @@ class PrometheusSettings(_Table):
     text_file: PlainPath | None = Field(
         default=None,
         examples=["/var/lib/node_exporter/hearthlog.prom"],
-        description="For the textfile collector of node_exporter; ends in .prom.",
+        description="File for the textfile collector of node_exporter; ends in .prom.",
     )
     port: _Port | None = Field(
-        default=None, description="On loopback, with a `token_file`; none: no port."
+        default=None, description="Port on loopback; needs `token_file`; none: no port."
     )
     token_file: SecretFile | None = Field(
         default=None,
-        description="Of one line, which who asks on the port has to show: the `credentials_file` "
-        "of Prometheus.",
+        description="File with the token for the port: the `credentials_file` of Prometheus.",
     )
     readable_by: Literal["owner", "group", "all"] | None = Field(
-        default=None, description="Who of this machine may read `text_file`."
+        default=None, description="Accounts of this machine that may read `text_file`."
     )
 
     def check_readers(self) -> None:
@@ -200,9 +199,7 @@ class PrometheusSettings(_Table):
         Raise `BridgeError` if both are missing.
         """
         if self.text_file is None and self.port is None:
-            raise BridgeError(
-                "bridge.prometheus: gives the figures to nobody; name a text_file, or a port"
-            )
+            raise BridgeError("bridge.prometheus: has no output; set text_file or port")
 
     def unread_text_file(self) -> str:
         """Return a warning if the name of the text file keeps node_exporter from reading it."""
@@ -220,21 +217,22 @@ class PageSettings(_Table):
 
     port: _Port = Field(default=8380, description="Where it is.")
     bind: Annotated[str, AfterValidator(_check_bind)] = Field(
-        default="127.0.0.1", description="Address of this machine; others than loopback, too."
+        default="127.0.0.1",
+        description="Address of this machine to listen on; may be other than loopback.",
     )
     token_file: SecretFile | None = Field(
         default=None,
-        description="Of one line, which the address of the page has to have; by default one is "
-        "made in the folder of the state.",
+        description="File with the token of the page; by default one is created in the state "
+        "folder.",
     )
     names: list[Annotated[str, AfterValidator(_check_name)]] = Field(
         default=[],
-        description="By which it may be opened, beside addresses in digits, as "
-        '["raspberrypi.local"]; with a port where that of a proxy has one.',
+        description="Host names that may open the page, such as "
+        '["raspberrypi.local"]; with a port if the name of a proxy has one.',
     )
     frames: list[Annotated[str, AfterValidator(_check_origin)]] = Field(
         default=[],
-        description='Pages that may show it in a frame, as ["http://homeassistant.local:8123"].',
+        description='Origins that may embed the page, such as ["http://homeassistant.local:8123"].',
     )
 
 
@@ -247,7 +245,7 @@ class PingSettings(_Table):
         description="As of healthchecks.io.",
     )
     url_file: SecretFile | None = Field(
-        default=None, description="Of one line, with that address: who knows it can ping, too."
+        default=None, description="File with that address, which is a secret."
     )
     every_seconds: float = Field(default=60.0, ge=5.0, le=86_400, description="Between pings.")
 
@@ -263,8 +261,8 @@ class BridgeSettings(_Table):
 
     state: PlainPath | None = Field(
         default=None,
-        description="Folder of what the bridge has to remember; by default that of systemd, or "
-        "`bridge` beside the logs.",
+        description="State folder of the bridge; by default systemd's, or `bridge` in the "
+        "folder of logs.",
     )
     mqtt: MqttSettings | None = None
     prometheus: PrometheusSettings | None = None
@@ -337,5 +335,7 @@ def file_schema() -> dict[str, Any]:
     schema = Settings.model_json_schema()
     bridge = BridgeSettings.model_json_schema()
     schema["$defs"] |= bridge.pop("$defs", {})
-    schema["properties"][BRIDGE] = bridge | {"description": "Of the bridge, not of the recorder."}
+    schema["properties"][BRIDGE] = bridge | {
+        "description": "A key of the bridge, not of the recorder."
+    }
     return schema

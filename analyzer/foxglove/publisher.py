@@ -125,7 +125,7 @@ class RecordedSpan:
             if (start is None or last >= start) and (end is None or first < end)
         ]
         if not spans:
-            raise DataError("nothing was recorded in this time; `hearthlog info` tells what was")
+            raise DataError("nothing was recorded in this time; `hearthlog info` lists what was")
         self.start = max(start or 0, spans[0][0])
         last_end = max(last for _, last, _ in spans) + 1
         self.end = last_end if end is None else min(end, last_end)

@@ -84,16 +84,14 @@ class Admission:
         target, fields = _parse(head)
         origin = fields.get("origin")
         if not is_asked_in_digits(self.bind, fields.get("host", "")):
-            raise RefusedError(
-                "refused: it was asked for by a name; connect to an address in digits"
-            )
+            raise RefusedError("refused: the request used a host name; connect by IP address")
         if origin is not None and origin not in _ORIGINS | self.origins and not _is_local(origin):
             shown = origin[:_LONGEST]
             raise RefusedError(
-                f"refused: a page of {shown}; if it is yours, let it look by --origin"
+                f"refused: a page of {shown}; if it is yours, allow it with --origin"
             )
         if not has_token(target, self.token):
-            raise RefusedError("refused: the token is missing or wrong; copy the whole address")
+            raise RefusedError("refused: the token is missing or wrong; copy the full address")
         handed_on = [
             f"{name}: {fields[name.lower()]}" for name in _HANDED_ON if name.lower() in fields
         ]
@@ -109,7 +107,7 @@ def _parse(head: bytes) -> tuple[str, Mapping[str, str]]:
     fields = [match.groups() for match in map(_FIELD.fullmatch, lines) if match]
     named = {name.lower(): value for name, value in fields}
     if method != "GET" or version != "HTTP/1.1" or len(named) != len(lines):
-        raise RefusedError("refused: what came was no request of a viewer")
+        raise RefusedError("refused: not a request of a viewer")
     return target, named
 
 

@@ -324,16 +324,14 @@ def changed_by(  # noqa: PLR0913, PLR0917
     left = without(_where(changed, side), reviewed_time(sources, microphone).spans)
     spans = judgeable_spans(left)
     if not len(spans):
-        raise DataError(
-            f"{after.name}: no span is left in which it says something else than {before.name}"
-        )
+        raise DataError(f"{after.name}: no span is left in which it differs from {before.name}")
     return _listed(spans, changed, side.name, microphone, after.name, count)
 
 
 def _champion(folder: Path, model: Model, paths: list[Path]) -> Model:
     champion = find_champion(folder, paths, model)
     if champion is None:
-        raise DataError(f"{model.name}: no model labels here yet, so there is nothing to change")
+        raise DataError(f"{model.name}: no model labels here yet, so nothing would change")
     if champion.sha256 == model.sha256:
         raise DataError(f"{model.name} labels here already: name a model that would change that")
     if other := other_features(champion, model):

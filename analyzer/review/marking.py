@@ -112,7 +112,7 @@ class Marking:
         )
         labels = [span for span in spans if span[0] < span[1]]
         if not labels:
-            raise DataError(f"{self.corrects} has no label in this span: name what was heard")
+            raise DataError(f"{self.corrects} has no label in this span: name the sound")
         return self._write(start, end, labels)
 
     def delete(self, start: int, end: int) -> list[Mark]:
@@ -194,7 +194,7 @@ class Marking:
         end = min([end, *self.coverage.ends[-1:]])
         pieces = self.coverage.split(start, end) if start < end else []
         if not pieces:
-            raise DataError("not all of this span was recorded: mark a part that was")
+            raise DataError("part of this span was not recorded: mark a recorded part")
         return pieces
 
     def _write(

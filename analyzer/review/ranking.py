@@ -221,8 +221,8 @@ def make_queue(  # noqa: PLR0913
     known = means.uncertainty.exist or means.novelty.exist
     if other is None and ranking != USEFUL and not known:
         raise DataError(
-            f"{side.name}: the logs do not say how sure the model was (no labels with "
-            "probabilities); name a second labelling to compare it with"
+            f"{side.name}: its labels have no probabilities; name a second labelling to compare "
+            "it with"
         )
     labels, differing = np.full(len(spans), -1), np.zeros(len(spans))
     if other is not None:

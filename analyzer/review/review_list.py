@@ -181,7 +181,7 @@ def read_list(path: Path) -> list[ReviewSpan]:
         elif len(record) != len(header):
             raise DataError(f"{where}: has {len(record)} fields, not {len(header)}")
         elif len(spans) == MOST_SPANS:
-            raise DataError(f"{where}: has more than {MOST_SPANS} spans; nobody can review them")
+            raise DataError(f"{where}: has more than {MOST_SPANS} spans; too many to review")
         else:
             spans.append(_span(where, [field.strip() for field in record]))
     if not spans:

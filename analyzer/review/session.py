@@ -219,7 +219,7 @@ class ReviewSession:
         except HearthlogError as error:
             self.say(str(error))
         except (ConnectionError, TimeoutError):
-            self.say("the viewer did not answer, and nothing was done; press the key again")
+            self.say("the viewer did not answer, so nothing was done; press the key again")
 
     def _press(self, key: str) -> None:
         actions = self._actions()
@@ -290,7 +290,7 @@ class ReviewSession:
         try:
             yield
         except (ConnectionError, TimeoutError):
-            self.say("the viewer did not answer: what was done is done, but not shown")
+            self.say("the viewer did not answer: the change was made, but is not shown")
 
     def _play(self) -> None:
         start, end = self._chosen()

@@ -25,7 +25,7 @@ from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource
 
-NO_NUMBERS = "the samples are no numbers (NaN or infinity)"
+NO_NUMBERS = "samples are not finite (NaN or infinity)"
 MOST_SECONDS = 3600.0  # of a clip, which is held in memory
 
 

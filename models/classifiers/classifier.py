@@ -180,7 +180,7 @@ class Classifier:
             theirs = f"these are of {source.network} with another projection"
             if source.network != taken.network:
                 theirs = f"these are of {source.network}"
-        so = "labels by features alone, which are less true"
+        so = "it labels by features only, less accurately"
         if self.names is not None:
             so = "it labels nothing"
         return (

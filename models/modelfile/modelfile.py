@@ -255,13 +255,13 @@ def _problem(description: Description) -> str | None:
     if description.feature_set_version != features.version:
         return (
             f"is for version {description.feature_set_version} of feature set {features.name}; "
-            f"here is version {features.version}: train it anew"
+            f"this is version {features.version}: retrain it"
         )
     if description.feature_set_sha256 != features.digest:
         digest = description.feature_set_sha256[:12]
         return (
             f"is for the network {features.name} with sha256 {digest}; here is "
-            f"{features.digest[:12]}: train it anew, or bring that network back"
+            f"{features.digest[:12]}: retrain it, or restore that network"
         )
     if len(description.feature_names) != features.width:
         count = len(description.feature_names)
@@ -491,7 +491,7 @@ def model_card(model: Model) -> str:
         )
     thin = [f"{name} ({one.sources})" for name, one in amounts.items() if 0 < one.sources < _FEW]
     if thin:
-        lines += ["", f"Thin, by sources, and not to be trusted much: {', '.join(thin)}"]
+        lines += ["", f"Few sources, so not reliable: {', '.join(thin)}"]
     if description.training_data.home:
         lines += [
             "",
@@ -516,7 +516,7 @@ def model_card(model: Model) -> str:
         )
         lines += ["", wanted]
     if description.training_data.simulated:
-        lines += ["", "Learned from simulated sounds alone: the figures are not of real ones."]
+        lines += ["", "Trained on simulated sounds only: the figures do not hold for real ones."]
     lines += [*_elsewhere(description), "", "Learned from recordings of:", ""]
     lines += [
         f"- {item.name or 'unnamed'}: {item.clips} clips, {item.licence or 'licence unstated'}"
@@ -528,7 +528,7 @@ def model_card(model: Model) -> str:
         if not may_be_shipped(item.licence)
     ]
     if kept_back:
-        lines += ["", "Not to be passed on without asking, for what it learned from:", ""]
+        lines += ["", "Do not pass on without permission, because of the training data:", ""]
         lines += [f"- {text}" for text in kept_back]
     return "\n".join(lines) + "\n"
 

@@ -103,8 +103,8 @@ def probe_network(name: str, path: Path) -> Probe:
         raise ModelError(answer["error"])
     if answer["megabytes"] > _MOST_MEGABYTES:
         raise ModelError(
-            f"{path}: the network takes {answer['megabytes']:.0f} MB of memory, and "
-            f"{_MOST_MEGABYTES} are the most"
+            f"{path}: the network takes {answer['megabytes']:.0f} MB of memory, and the limit is "
+            f"{_MOST_MEGABYTES}"
         )
     return Probe(**answer)
 
@@ -175,7 +175,7 @@ def network_path(name: str) -> Path:
     path = find_network(name)
     if path is None:
         raise ModelError(
-            f"the network {name} is not there; hearthlog models fetch {name} brings it"
+            f"the network {name} is not installed; hearthlog models fetch {name} installs it"
         )
     return path
 
@@ -188,8 +188,8 @@ def check_pace(path: Path, probe: Probe, microphones: int = 1) -> None:
     if microphones * probe.seconds > _MOST_SHARE * _HOP_SECONDS:
         of = f" of each of {microphones} microphones" if microphones > 1 else ""
         raise ModelError(
-            f"{path}: too slow here: {probe.seconds:.2g} s for a window, every {_HOP_SECONDS:g} s"
-            f"{of}; this machine holds one every {microphones * probe.hop_seconds:.2g} s"
+            f"{path}: too slow here: {probe.seconds:.2g} s for a window, every {_HOP_SECONDS:g} "
+            f"s{of}; this machine manages one every {microphones * probe.hop_seconds:.2g} s"
         )
 
 

@@ -113,7 +113,7 @@ class ModelWatch:
         except ModelError as error:
             raise ModelError(f"{self._where()}{error}") from error
         for line in damaged:
-            say(f"{self._where()}{line}. It labels all the same")
+            say(f"{self._where()}{line}. It keeps labelling")
         if not damaged and not self._scenario:
             _warn_if_changed(path, loaded.model)
         return loaded
@@ -193,7 +193,7 @@ class ModelWatch:
             return
         if loaded.classifier.feature_set != self.first.classifier.feature_set:
             theirs, ours = (one.classifier.feature_set.name for one in (loaded, self.first))
-            self._refuse(f"it is for feature set {theirs}, not {ours}; start the recorder anew")
+            self._refuse(f"it is for feature set {theirs}, not {ours}; restart the recorder")
             return
         model = loaded.model
         if model.sha256 != self._last.sha256 and (reason := self._unjudged(model)):
@@ -216,8 +216,8 @@ class ModelWatch:
         self._awaited, self._judged = awaited, judged
         promote = f"hearthlog models promote {model.name}"
         if judgement is None:
-            return f"it was not judged in this home; `{promote}` judges it"
-        return f"{judgement.reasons[0]}; `{promote} --anyway` insists"
+            return f"it was not checked in this home; `{promote}` checks it"
+        return f"{judgement.reasons[0]}; `{promote} --anyway` overrides this"
 
     def _refuse(self, reason: str, name: str = "") -> None:
         text = self._refusal(name or self._path.stem, reason)
@@ -234,8 +234,8 @@ class ModelWatch:
 def _warn_if_simulated(model: Model) -> None:
     if model.description.training_data.simulated:
         say(
-            f"model {model.name} has learned from simulated sounds alone and is mostly wrong about "
-            "real ones, however sure it is; train one from recordings"
+            f"model {model.name} was trained on simulated sounds only and is mostly wrong about "
+            "real ones, whatever its confidence; train one from recordings"
         )
 
 
@@ -249,8 +249,8 @@ def _warn_if_changed(path: Path, champion: Model) -> None:
     if is_kept and not is_known and read_judgement(path.parent, champion.sha256) is None:
         say(
             f"model {champion.name} is not the file that was promoted: it was replaced, or the "
-            "disk has changed a bit of it; it labels all the same. Copy it back from a backup, or "
-            f"`hearthlog models promote {champion.name}` judges what is there"
+            "disk has changed a bit of it; it keeps labelling. Restore it from a backup, or "
+            f"check the present file with `hearthlog models promote {champion.name}`"
         )
 
 

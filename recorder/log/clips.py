@@ -213,7 +213,7 @@ class ClipRetention:
         if failures:
             more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
             first = f"{failures[0].filename}: {failures[0].strerror}"
-            text = f"clips cannot be looked through or deleted: {first}{more}"
+            text = f"clips cannot be listed or deleted: {first}{more}"
             notices.append(Notice(WARNING, text))
         return notices
 
@@ -554,11 +554,11 @@ class _MicrophoneClips:
         missing = [name for name in self._never if name not in classes]
         if missing:
             names = ", ".join(repr(name) for name in missing)
-            what = f"this one tells apart {', '.join(classes)}" if classes else "there is none"
+            what = f"this one has the classes {', '.join(classes)}" if classes else "there is none"
             return (
-                f"{problem} that knows {names}, which is never kept ({what}); take one that does, "
-                "or set never_keep = [] to keep that too"
+                f"{problem} with the class {names}, which is never kept ({what}); use such a "
+                "model, or set never_keep = [] to keep that too"
             )
         if not classes and self._keep != "always":
-            return f"{problem}, which says what to keep; give one, or keep it always"
+            return f"{problem} to select the sound; name one, or use keep_audio = always"
         return ""

@@ -102,8 +102,8 @@ def _lock(descriptor: int, folder: Path, node: str) -> None:
     except BlockingIOError as error:
         process = os.pread(descriptor, _NUMBER_SIZE, 0).decode("ascii", "replace").strip()
         raise LogError(
-            f"{folder}: is recorded by {node!r} already (process {process or 'unknown'}); stop "
-            "that one, or give this one another --node or --output"
+            f"{folder}: is in use by the recorder {node!r} already (process "
+            f"{process or 'unknown'}); stop it, or choose another --node or --output"
         ) from error
     try:
         os.ftruncate(descriptor, 0)

@@ -302,7 +302,9 @@ class RollingLog:
         if not self._failing:
             self._failing = True
             what = f"{self._description.root} cannot be written ({self._reason})"
-            self._notices.append(Notice(WARNING, f"{what}: it is held in memory until it can"))
+            self._notices.append(
+                Notice(WARNING, f"{what}: messages are held in memory until it can")
+            )
 
     def _drop_synced(self) -> None:
         """Drop the held messages that are on the disk."""
@@ -322,7 +324,7 @@ class RollingLog:
             if self._writer is not None:
                 self._writer.abandon()
                 self._abandoned, self._writer = self._writer, None
-                kept = "; what was recorded is kept and completed at the next start"
+                kept = "; what was recorded is kept, and completed at the next start"
             what = error.strerror or str(error)
             root = self._description.root
             raise LogError(f"{root}: cannot be written ({what}){kept}") from error

@@ -33,7 +33,7 @@ _REALTIME_FRAMES = 10
 _HEALTH_FRAMES = 200  # every 10 s
 _LONG_FRAMES = 6 * _HEALTH_FRAMES  # a block's overhead is a fifth of the cost of 10 s
 _NAMED = 10  # damaged files listed
-_NO_NUMBERS = "the samples are no numbers (NaN or infinity)"
+_NO_NUMBERS = "samples are not finite (NaN or infinity)"
 
 
 class FileSource:
@@ -104,7 +104,7 @@ class FileSource:
         lines = list(self._choices)
         if self._hole_seconds:
             lines.append(f"{self.device}: {self._hole_seconds:.2f} s are left out: {_NO_NUMBERS}")
-        lines += [f"{fault}; what is there was heard" for fault in self._faults[:_NAMED]]
+        lines += [f"{fault}; the readable part was recorded" for fault in self._faults[:_NAMED]]
         if len(self._faults) > _NAMED:
             lines.append(f"{len(self._faults) - _NAMED:,} more files are damaged or cut short")
         if self._overlaps:
@@ -324,7 +324,7 @@ def find_audio(
                 refused.append(f"left out: {error}")
         if not inside:
             more = f" ({refused[-1]})" if refused else ", such as a.wav or a.flac"
-            raise SourceError(f"{path}: no audio file in this folder that can be read{more}")
+            raise SourceError(f"{path}: no readable audio file in this folder{more}")
         found += inside
     return found, refused
 

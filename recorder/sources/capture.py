@@ -72,7 +72,7 @@ class ArrivalPace:
     def trouble(self) -> str:
         """Return the fault of a settled source; empty if there is none."""
         if self._window < min(self._windows) - _TOLERANCE_SECONDS:
-            return "sends sound faster than it sounds; give the address of a live source"
+            return "sends sound faster than real time; use the address of a live source"
         if self.count < self._window_end:
             return ""
         late = self._window - min(self._windows)

@@ -439,7 +439,7 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
     if sound.ndim not in {1, 2} or sound.dtype.kind not in "if":
         raise SourceError(f"sound of shape {sound.shape} and type {sound.dtype} cannot be heard")
     if rate not in RATES:
-        raise SourceError(f"a sample rate of {rate} Hz cannot be recorded")
+        raise SourceError(f"a sample rate of {rate} Hz is not supported")
     scale = np.float32(1 << 8 * sound.itemsize - 1) if sound.dtype.kind == "i" else np.float32(1)
     size = int(rate * BLOCK_SECONDS)
     starts = range(0, len(sound), size)

@@ -54,18 +54,18 @@ _SAMPLE_BYTES = 4
 # Patterns in ffmpeg's messages, first match first: meaning and remedy.
 _MEANINGS = {
     "401 Unauthorized": "",  # depends on whether the address has a password
-    "403 Forbidden": "may not be heard (403 Forbidden)",
-    "404 Not Found": "is not there (404 Not Found); check the part after the host",
-    "Failed to resolve hostname": "has a host that nobody knows; check its name",
+    "403 Forbidden": "refuses access (403 Forbidden)",
+    "404 Not Found": "does not exist (404 Not Found); check the part after the host",
+    "Failed to resolve hostname": "has an unknown host; check its name",
     "Connection refused": "refuses the connection; check whether it is on, and its port",
     "timed out": "does not answer; check whether it is on and in this network",
     "No route to host|Network is unreachable": "cannot be reached; check the network",
     "certificate": "has a certificate that this machine does not trust",
-    "TLS": "speaks no https; try http://",
+    "TLS": "does not speak https; try http://",
     "matches no streams|454 Session": "has no sound; check whether its microphone is on",
     "unknown keyword 'option'": "needs a newer ffmpeg, 5.0 at least",
     "Invalid|prematurely|whitelist|not permitted|End of file|moov|Output file": (
-        "sends nothing that is known as sound; check the part after the host"
+        "sends no sound of a known format; check the part after the host"
     ),
 }
 
@@ -77,8 +77,8 @@ def check_ffmpeg() -> None:
     """
     if shutil.which("ffmpeg") is None:
         raise SourceError(
-            "ffmpeg is missing, which reads sound from the network: "
-            "install it (Debian: apt install ffmpeg)"
+            "ffmpeg, which reads sound from the network, is missing: install it (Debian: apt "
+            "install ffmpeg)"
         )
 
 
@@ -258,7 +258,7 @@ def explain(address: str, said: str) -> str:
         found = (
             "refuses the user name or the password"
             if urlsplit(address).username is not None
-            else "wants a user name and a password, as in rtsp://user:password@camera/stream"
+            else "needs a user name and a password, as in rtsp://user:password@camera/stream"
         )
     return f"{public_name(address)} {found or 'cannot be read by ffmpeg'}"
 

@@ -189,7 +189,7 @@ def _check_file(path: Path) -> None:
 
 def _check_rate(path: Path, rate: int) -> None:
     if rate not in RATES:
-        raise SourceError(f"{path}: a sample rate of {rate} Hz cannot be recorded")
+        raise SourceError(f"{path}: a sample rate of {rate} Hz is not supported")
 
 
 def _opened(path: Path, complaints: list[bytes]) -> soundfile.SoundFile:

@@ -64,7 +64,7 @@ def check_ros() -> None:
     """
     if find_spec("rclpy") is None:
         raise SourceError(
-            f"there is no rclpy for {sys.executable}, which hears topics of ROS 2: source "
+            f"there is no rclpy for {sys.executable}, which reads ROS 2 topics: source "
             "/opt/ros/jazzy/setup.bash before the start, or that of your ROS 2; a virtual "
             "environment must be made by the Python of ROS, with --system-site-packages"
         )

@@ -196,7 +196,8 @@ class _TopicStream:
         kind = publisher.topic_type
         if kind not in kinds:
             raise DeviceError(
-                f"{self._address.topic} is {kind}, which is no sound; such are {', '.join(kinds)}"
+                f"{self._address.topic} is {kind}, which is not audio; audio types are "
+                f"{', '.join(kinds)}"
             )
         package, _, name = kind.split("/")
         try:
@@ -223,8 +224,7 @@ class _TopicStream:
             self._spin()
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         raise DeviceError(
-            f"nobody publishes {self._address.topic} in domain {domain}; "
-            "is the node running that should?"
+            f"nobody publishes {self._address.topic} in domain {domain}; is its node running?"
         )
 
     def _take(self, read: Callable[[Any], _Sound], message: Any) -> None:

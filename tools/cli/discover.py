@@ -64,8 +64,9 @@ def discover(
     ] = None,
     name: Annotated[
         list[str] | None,
-        typer.Option(help="Name a group, such as 3=doorbell, and mark its sounds; may be "
-                          "repeated."),
+        typer.Option(
+            help="Name a group, such as 3=doorbell, and mark its sounds; may be repeated."
+        ),
     ] = None,
     undo: Annotated[
         list[int] | None,
@@ -304,7 +305,7 @@ def voices(
         Path | None,
         typer.Option(
             help="Training set of voices, in which to enrol a minute of each voice that is "
-                 "named now."
+            "named now."
         ),
     ] = None,
     output: Annotated[

@@ -225,7 +225,7 @@ def _decode(clip: HomeClip) -> Float32:
     if not faults and not len(read):
         faults.append(f"{clip.path}: holds no audio at {clip.start:g} s")
     if not faults and not np.isfinite(read).all():
-        faults.append(f"{clip.path}: samples of it are no numbers (NaN or infinity)")
+        faults.append(f"{clip.path}: samples are not finite (NaN or infinity)")
     if faults:
         raise SimulationError(f"{faults[0]}; take it out of the manifest")
     sound[: len(read)] = read

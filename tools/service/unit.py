@@ -187,7 +187,7 @@ def place_of(folder: Path, name: str) -> Path:
     """
     if shutil.which("systemctl") is None:
         raise ServiceError(
-            "systemd is not here; start `hearthlog record` by the supervisor that this machine has"
+            "systemd is missing; start `hearthlog record` with this machine's supervisor"
         )
     unit = folder / name
     if os.path.lexists(unit) and (unit.is_symlink() or not is_ours(unit.read_text("utf-8"))):
@@ -388,9 +388,7 @@ def install_bridge(config: Path, account: str | None) -> Installed:
         del os.environ[name]  # the service will not have these variables
     settings, bridge = load_bridge_settings(config)
     if not bridge.has_outputs():
-        raise ServiceError(
-            f"{config}: tells nobody anything; it has no table such as [bridge.mqtt]"
-        )
+        raise ServiceError(f"{config}: has no output; add a table such as [bridge.mqtt]")
     logs = STATE / settings.output
     check_seen("the folder of logs", logs)
     if account is None and settings.readable_by == "owner":

@@ -152,8 +152,8 @@ class Outbox:
             for name in sorted(self._waiting, key=lambda each: self._waiting[each].time)[:number]:
                 self._remove(name)
             self._say(
-                f"{self._folder}: {self._most} alerts wait to be told, and the oldest are dropped; "
-                "see above which target cannot be reached, and mend it, or take it out of urls_file"
+                f"{self._folder}: {self._most} alerts are waiting, and the oldest are dropped; "
+                "see above which target fails; repair it, or remove it from urls_file"
             )
 
     def _remove(self, name: str) -> None:
@@ -415,8 +415,8 @@ class Delivery:
                 reason = type(error).__name__
             if reason:
                 self._say(
-                    f"{target.place}: an alert could not be told ({reason}); it is kept, and tried "
-                    "again, a quarter of an hour apart at most"
+                    f"{target.place}: an alert could not be delivered ({reason}); it is kept and "
+                    "retried at least every quarter of an hour"
                 )
                 return told, True
             self._outbox.record_delivery(target.name, notification)
@@ -434,4 +434,4 @@ def message(notification: Notification, zone: tzinfo, now: int | None = None) ->
     """
     late = (time.time_ns() if now is None else now) - notification.due > _LATE
     moment = f"{local_time(notification.time, zone):%Y-%m-%d %H:%M}"
-    return f"{moment}: {notification.text}{' (told late)' if late else ''}"
+    return f"{moment}: {notification.text}{' (delivered late)' if late else ''}"

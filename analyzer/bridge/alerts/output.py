@@ -59,7 +59,7 @@ class RuleProgressStore:
     """Persistent evaluation progress of each rule; a changed rule starts over."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        damaged = "cannot be read; all rules begin anew"
+        damaged = "cannot be read; all rules start over"
         unsaved = "alerts may come twice after the next start"
         self._file = StateFile(path, dict[str, RuleState], say, damaged, unsaved)
 
@@ -105,7 +105,7 @@ class RuleWatch:
         is_ahead = any(own.until > now + AHEAD for own in self._progress.values())
         self._progress = {name: _as_of(own, now) for name, own in self._progress.items()}
         if is_ahead:
-            self._say("alerts: the clock was ahead, and was set back; the rules begin anew")
+            self._say("alerts: the clock was set back; the rules start over")
             self._outbox.forget_after(now + AHEAD)
             self.save(now)
 
@@ -221,7 +221,7 @@ class AlertsOutput:
             self._outbox = Outbox(folder / "outbox", [BROKER, UNREAD], say)
         except OSError as error:
             raise BridgeError(f"{folder}: cannot be used ({error.strerror})") from error
-        twice = "whoever is on an edited line may be told twice"
+        twice = "targets on edited lines may be notified twice"
         self._lines_file = StateFile(
             folder / "lines.json", list[str], say, f"cannot be read; {twice}", twice
         )
@@ -296,7 +296,9 @@ class AlertsOutput:
         targets, problems, names, lacks_package = find_targets(self._file, self._say)
         self._read_file = object() if lacks_package else state
         for problem in problems:
-            self._say(f"alerts: {problem}; the others are told, and who is meant when it is mended")
+            self._say(
+                f"alerts: {problem}; other targets are notified, this one once it is corrected"
+            )
         if self._has_problems and not problems:
             self._say(f"alerts: {self._file}: every line of it can be read now")
         self._has_problems = bool(problems)
@@ -348,7 +350,7 @@ class AlertsOutput:
             known = [raw.between(None, end) for raw in batch]
             if sum(map(len, known)) < sum(map(len, batch)):
                 self._say(
-                    f"alerts: {path}: was the clock ahead? what is of a time to come is left out"
+                    f"alerts: {path}: was the clock ahead? segments in the future are left out"
                 )
             self._heard.push(decode_fields(known, FIELDS))
         except LogError as error:

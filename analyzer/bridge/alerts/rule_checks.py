@@ -40,8 +40,8 @@ def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> st
         return ""
     there = listed(sorted(set().union(*own) - {SILENCE}), "and")
     return (
-        f"{rule.name}: no model here knows the class {rule.label!r}, so that it cannot be heard; "
-        f"there are {there}{_of_network(rule.label)}"
+        f"{rule.name}: no model here has the class {rule.label!r}; there are "
+        f"{there}{_of_network(rule.label)}"
     )
 
 
@@ -52,7 +52,7 @@ def _of_network(label: str) -> str:
         return ""
     if name.is_event:
         return f'; scenarios = {{{AUDIOSET} = "{AUDIOSET}"}} brings it, with a network of sounds'
-    return "; a network of sounds has a name for it, which is a hint alone: it is not counted"
+    return "; the network has a name for it, but its names are hints and not counted"
 
 
 def unknown_microphone(
@@ -71,7 +71,7 @@ def unknown_microphone(
     lacks = (
         f"nothing of the microphone {name!r} was recorded in this time"
         if recorded
-        else f"there is no microphone {name!r}, so that it hears nothing"
+        else f"there is no microphone {name!r}"
     )
     return f"{rule.name}: {lacks}; there is {listed(sorted(microphones))}"
 
@@ -107,7 +107,7 @@ def impossible_amount(rule: AlertRule) -> str:
         return ""
     return (
         f"{rule.name}: there cannot be more than {amount} in a window of "
-        f"{duration_words(rule.window)}, so that it never rings"
+        f"{duration_words(rule.window)}, so it never notifies"
     )
 
 
@@ -123,8 +123,8 @@ def unkept_days(rule: AlertRule, settings: Settings) -> str:
     if not 0 < kept < needed:
         return ""
     return (
-        f"{rule.name}: retention_days = {kept} leaves it no {fewest} days to compare with, so that "
-        f"it never rings; keep {needed} or more"
+        f"{rule.name}: retention_days = {kept} leaves it no {fewest} days to compare with, so it "
+        f"never notifies; keep {needed} or more"
     )
 
 

@@ -30,7 +30,9 @@ def read_duration(text: object) -> int:
     """
     found = _FORM.fullmatch(text) if isinstance(text, str) else None
     if found is None or not any(found.groups()):
-        raise ValueError(f"{str(text)[:64]!r} is no duration; write it as 90s, 20m, 1h30m or 7d")
+        raise ValueError(
+            f"{str(text)[:64]!r} is not a duration; write one such as 90s, 20m, 1h30m or 7d"
+        )
     counts = zip(_UNITS.values(), found.groups(), strict=True)
     return sum(unit * int(count) for unit, count in counts if count)
 
@@ -69,7 +71,9 @@ def _read_minute(text: object) -> int:
     try:
         return quiet_hours(f"{text}-00:00").start
     except HearthlogError:
-        raise ValueError(f"{str(text)[:64]!r} is no time of day; write it as 07:30") from None
+        raise ValueError(
+            f"{str(text)[:64]!r} is not a time of day; write one such as 07:30"
+        ) from None
 
 
 def _check_hours(text: str) -> str:
@@ -82,7 +86,7 @@ def _check_hours(text: str) -> str:
 def _check_name(name: str) -> str:
     if not 0 < len(name) <= _LONGEST_NAME or _CONTROL.search(name):
         raise ValueError(
-            f"{name[:_LONGEST_NAME]!r} is no name of a rule; write 1 to {_LONGEST_NAME} characters "
+            f"{name[:_LONGEST_NAME]!r} is not a rule name; write 1 to {_LONGEST_NAME} characters "
             "in one line, such as Coughing at night"
         )
     return name
@@ -104,9 +108,9 @@ class _Rule(BaseModel):
     )
     cooldown: Window = Field(default="1h", validate_default=True, description="Between two rings.")
     quiet_hours: list[_Hours] = Field(
-        default=[], description='When a ring waits until they end, as ["22:00-06:30"].'
+        default=[], description='Quiet hours, in which notifications wait, such as ["22:00-06:30"].'
     )
-    urgent: bool = Field(default=False, description="Whether it rings in quiet hours, too.")
+    urgent: bool = Field(default=False, description="Notify in quiet hours too.")
 
     def hours(self) -> list[QuietHours]:
         """Return the quiet hours that delay notifications; none for an urgent rule."""
@@ -120,14 +124,14 @@ class _Rule(BaseModel):
 
 class _SoundRule(_Rule):
     label: str = Field(
-        default=ANY_SOUND, alias="class", max_length=64, description="Left out: any sound."
+        default=ANY_SOUND, alias="class", max_length=64, description="Class; by default any sound."
     )
-    microphone: str = Field(default="", description="Left out: all of them together.")
+    microphone: str = Field(default="", description="Microphone; by default all together.")
     confidence: float = Field(
-        default=0.0, ge=0.0, le=1.0, description="Segments that are less sure do not count."
+        default=0.0, ge=0.0, le=1.0, description="Least confidence of a counted segment."
     )
     least_seconds: float = Field(
-        default=0.0, ge=0.0, le=3600.0, description="Shorter events do not count."
+        default=0.0, ge=0.0, le=3600.0, description="Least length of a counted event."
     )
 
     @model_validator(mode="before")
@@ -137,7 +141,7 @@ class _SoundRule(_Rule):
             name = class_name(values["class"])
             if name == SILENCE:
                 raise ValueError(
-                    f"{SILENCE} is no sound; for no sound at all, none_by without a class"
+                    f"{SILENCE} is not a sound; for no sound at all use none_by without a class"
                 )
             return values | {"class": name}
         return values
@@ -159,7 +163,7 @@ class MoreThan(_SoundRule):
     @model_validator(mode="after")
     def _check_amount(self) -> "MoreThan":
         if (self.count is None) == (self.minutes is None):
-            raise ValueError("say either count or minutes")
+            raise ValueError("set either count or minutes")
         return self
 
 
@@ -170,7 +174,10 @@ class NoneBy(_SoundRule):
     since: TimeOfDay
     by: TimeOfDay
     least_share: float = Field(
-        default=0.75, gt=0.0, le=1.0, description="That has to be heard; of less it is not known."
+        default=0.75,
+        gt=0.0,
+        le=1.0,
+        description="Share of the time that must be recorded; with less the result is unknown.",
     )
 
     @model_validator(mode="after")
@@ -185,7 +192,9 @@ class LongerThan(_SoundRule):
 
     rule: Literal["longer_than"]
     longer_than: Window
-    pause: Pause = Field(default="10s", validate_default=True, description="That ends a sound.")
+    pause: Pause = Field(
+        default="10s", validate_default=True, description="Pause that ends a sound."
+    )
 
 
 class RecorderSilent(_Rule):
@@ -200,16 +209,19 @@ class UnlikeUsual(_SoundRule):
 
     rule: Literal["unlike_usual"]
     part: Literal["day", "night"] = Field(
-        default="day", description="Of the day before, or 22:00 to 07:00."
+        default="day", description="Compare the day before, or the night from 22:00 to 07:00."
     )
     of: Literal["count", "minutes"] = Field(default="count", description="What is compared.")
     which: Literal["more", "less", "both"] = Field(default="both", description="That rings.")
     margin: float = Field(
-        default=0.25, ge=0.0, le=10.0, description="Share beyond the highest and the lowest."
+        default=0.25, ge=0.0, le=10.0, description="Share above the highest or below the lowest."
     )
     at: TimeOfDay = Field(default="08:00", validate_default=True)
     least_share: float = Field(
-        default=0.75, gt=0.0, le=1.0, description="That has to be heard for it to be compared."
+        default=0.75,
+        gt=0.0,
+        le=1.0,
+        description="Share of the time that must be recorded for a comparison.",
     )
 
     @model_validator(mode="after")
@@ -223,9 +235,7 @@ class UnusualDay(_Rule):
     """A day, with the night after it, that is as unlike the four weeks before as few are."""
 
     rule: Literal["unusual_day"]
-    once_in: float = Field(
-        default=30.0, ge=7.0, le=LONGEST, description="Days in which one such day is expected."
-    )
+    once_in: float = Field(default=30.0, ge=7.0, le=LONGEST, description="Return period in days.")
     at: TimeOfDay = Field(default="08:00", validate_default=True)
 
     @model_validator(mode="after")
@@ -247,7 +257,7 @@ def _check_names(rules: list[AlertRule]) -> list[AlertRule]:
     names = [rule.name for rule in rules]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise ValueError(f"two rules have the name {twice!r}; say which is which")
+        raise ValueError(f"two rules have the name {twice!r}; give each its own")
     return rules
 
 

@@ -186,7 +186,7 @@ class Connection:
     def _use_tls(self, client: mqtt.Client, settings: MqttSettings) -> None:
         client.tls_set_context(tls_context(settings))
         if settings.certificate_file is None:
-            self._hint = "; does it want a client certificate? see certificate_file and key_file"
+            self._hint = "; does it need a client certificate? see certificate_file and key_file"
 
     def _publish(self, topic: str, payload: str, *, retain: bool) -> bool:
         """Pass a message to the client; return False if the message has to wait."""
@@ -323,7 +323,7 @@ def tls_context(settings: MqttSettings) -> ssl.SSLContext:
 
 
 def _no_password() -> str:
-    raise ValueError("the key is encrypted; write it anew without a password")
+    raise ValueError("the key is encrypted; save it without a password")
 
 
 def read_password(settings: MqttSettings) -> str | None:

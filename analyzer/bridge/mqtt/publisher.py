@@ -236,10 +236,11 @@ class MqttPublisher:
             remedy = (
                 f'a command such as {{"told": true, "label": "{muted[0]}"}} changes that'
                 if self._settings.commands
-                else "that was a command, and commands are not taken now: to change it, take them "
-                f"out of the list `muted` in {self._announced.path}, and start the bridge again"
+                else "a command did that, and commands are off now: to change it, remove the "
+                f"classes from the list `muted` in {self._announced.path}, and start the "
+                "bridge again"
             )
-            self._say(f"mqtt: the broker is not told of {', '.join(muted)}; {remedy}")
+            self._say(f"mqtt: not published: {', '.join(muted)}; {remedy}")
         self._has_said_muted = True
 
     def _topic(self, place: Place) -> str:

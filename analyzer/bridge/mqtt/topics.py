@@ -245,17 +245,17 @@ class RetainedTopics:
             private_folder(folder)
             descriptor = _locked(self.path)
         except OSError as error:
-            self._say(f"{folder}: cannot be used ({error.strerror}); nothing is remembered")
+            self._say(f"{folder}: cannot be used ({error.strerror}); nothing is saved")
             return None
         if descriptor is None:
             self._say(
-                f"{folder}: is used by another bridge; nothing is remembered: give each one "
-                "a `state` of its own in [bridge]"
+                f"{folder}: is used by another bridge; nothing is saved: give each bridge its "
+                "own `state` in [bridge]"
             )
         return descriptor
 
     def _file(self, path: Path) -> StateFile[_Content]:
-        damaged = "cannot be read, and begins anew; all classes are told of"
+        damaged = "cannot be read and starts over; all classes are published"
         return StateFile(path, _Content, self._say, damaged, _UNSAVED)
 
 

@@ -410,12 +410,12 @@ class HomePage:
             raise
         # Other users may read the journal, so it must not have the token.
         if writes_to_journal():
-            whole = f"{address}; its whole address, which opens it, is in {file.absolute()}"
+            whole = f"{address}; its full address, with the token, is in {file.absolute()}"
         say(f"the page of the home: {whole}")
         if not bind.is_loopback:
             say(
-                f"the page listens on {settings.bind}: it crosses the network in the clear, and "
-                "who listens in on the network can read it and its token"
+                f"the page listens on {settings.bind}: it crosses the network unencrypted, and "
+                "others on the network can read it and its token"
             )
 
     def update(self, news: News) -> None:

@@ -212,7 +212,7 @@ async function send(path, asked) {
       body: JSON.stringify(asked),
     });
     if (answer.status === 200 || answer.status === 422) return await answer.json();
-    return { error: "It was not saved: open the page by its whole address again." };
+    return { error: "It was not saved: open the page by its full address again." };
   } catch {
     return { error: "It was not saved: there is no connection to the box." };
   }
@@ -362,7 +362,7 @@ function connect() {
       trouble("There is no connection to the box.");
       return;
     }
-    trouble("The box does not answer this page: perhaps too many are open. It is tried again; if that does not help, open the page by its whole address.");
+    trouble("The box does not answer this page: perhaps too many are open. It is tried again; if that does not help, open the page by its full address.");
     setTimeout(connect, AGAIN);
   });
 }

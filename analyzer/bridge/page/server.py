@@ -30,8 +30,8 @@ from hearthlog.schemas.errors import HearthlogError
 _YEAR = 365 * 24 * 3600
 _PLAIN = re.compile(r"[a-z0-9.:-]{1,253}")  # a name or address that is safe in a message
 _WHOLE = (
-    "This page opens with its whole address only: copy all of it, with what is behind `?token=`. "
-    "`hearthlog bridge` says at its start in which file the address is."
+    "This page opens only with its full address: copy all of it, including what follows "
+    "`?token=`. `hearthlog bridge` prints at its start which file has the address."
 )
 
 
@@ -97,7 +97,7 @@ class PageAdmission:
         if not self._is_named(host):
             return _by_name(host_name(f"//{host}"))
         if len(origins) > 1 or (changes and not origins):
-            return "A request that changes something has to say of which page it is."
+            return "A request that changes something must name its page (Origin)."
         if origins and not self._is_own(origins[0].lower(), host):
             return (
                 "Another page asked. If it is this one behind a proxy, write its name into the "
@@ -109,9 +109,9 @@ class PageAdmission:
             return ""
         reason = ""
         if target.startswith("/?token="):
-            reason = "The token in this address is not the one of the page. "
+            reason = "The token in this address is wrong. "
         elif cookies:
-            reason = "What this browser remembers of the page is valid no more. "
+            reason = "The cookie of this browser is no longer valid. "
         return f"{reason}{_WHOLE}"
 
     def _is_named(self, host: str) -> bool:
@@ -140,10 +140,10 @@ class PageAdmission:
 
 def _by_name(name: str) -> str:
     if not _PLAIN.fullmatch(name):
-        return "This page is asked for by an address in digits, or by a name that is allowed."
+        return "Open this page by its IP address, or by an allowed name."
     return (
         f"This page does not open by the name {name}, which a foreign page could let point here. "
-        "Open it by the address of the box in digits, or allow the name in the configuration: "
+        "Open it by the IP address of the box, or allow the name in the configuration: "
         f'names = ["{name}"] in [bridge.page].'
     )
 

@@ -58,7 +58,7 @@ def has_display() -> bool:
 def check_display(instead: str) -> None:
     """Raise DataError on Linux without an X11 or Wayland display."""
     if not has_display():
-        raise DataError(f"there is no display here: use --web to look in a browser, or {instead}")
+        raise DataError(f"there is no display: use --web for a browser, or {instead}")
 
 
 class ViewerProcess:
@@ -127,7 +127,7 @@ class ViewerProcess:
         ]
         text = (errors or lines or ["it said nothing"])[-1].strip()
         return DataError(
-            f"Rerun's viewer does not run here ({text[:200]}); use --web to look in a browser"
+            f"Rerun's viewer does not run here ({text[:200]}); use --web for a browser"
         )
 
     def close(self) -> None:

@@ -361,7 +361,7 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
         "--save FILE.rrd to make a file that Rerun opens elsewhere, with --queue FILE.txt to "
         "correct it by hand"
         if data is None
-        else "--serve to look from another machine"
+        else "--serve to open it on another machine"
     )
     if data is None:
         return _opened(port, "--expect-data-soon")

@@ -121,7 +121,7 @@ def extract_features(
     frames = samples[: count * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
     heard = np.flatnonzero(np.isfinite(frames).all(axis=1))
     if not len(heard):
-        raise SourceError("the sound is no numbers (NaN or infinity)")
+        raise SourceError("the samples are not finite (NaN or infinity)")
     values = [described.extractor()(InfrasoundFilter()(frames[run])) for run in _runs(heard)]
     times = start + heard * FRAME_NANOSECONDS
     return SoundFeatures(described.feature_names, described.units, times, np.concatenate(values))

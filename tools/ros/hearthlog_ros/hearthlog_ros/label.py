@@ -74,8 +74,8 @@ class LabelNode(Node):
             )
         if self._model.description.embedding is not None:
             self.get_logger().warning(
-                f"model {self._model.name} is for features and embeddings, and this node takes no "
-                "embeddings: labels by features alone, which are less true"
+                f"model {self._model.name} is for features and embeddings, and this node takes "
+                "no embeddings: it labels by features only, less accurately"
             )
 
     def _begin_publishing(self) -> None:
