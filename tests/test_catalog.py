@@ -560,6 +560,14 @@ def test_what_others_put_beside_an_earlier_catalogue_stays(fleet):
     assert len(list(elsewhere.iterdir())) == 2
 
 
+def test_an_exported_table_stays_whatever_its_name_is(fleet, capfd):
+    table = fleet / "catalog.parquet"
+    assert run(capfd, "catalog", fleet, "--export", table).returncode == 3
+    relabelled(find_logs(fleet / "north")[0], [(12, "speech")])
+    assert run(capfd, "catalog", fleet).returncode == 3
+    assert table.exists()
+
+
 def test_a_catalogue_of_unchanged_files_is_not_written_again(fleet):
     write_catalog(fleet)
     before = (fleet / CATALOG).stat().st_ino

@@ -335,7 +335,7 @@ def home_of(folder: str) -> str:
 
 
 def _remove_earlier(folder: Path) -> None:
-    """Delete the catalogue of an earlier version."""
+    """Delete the catalogue of an earlier version, but no table that a person exported."""
     for path in (folder / name for name in _EARLIER):
         if is_local(path) and path.is_symlink():
             continue  # what it leads to is not ours
@@ -344,7 +344,7 @@ def _remove_earlier(folder: Path) -> None:
                 for part in path.glob("home-*.parquet"):
                     part.unlink()
                 path.rmdir()
-            elif path.is_file():
+            elif path.suffix != ".parquet":
                 path.unlink()
 
 
