@@ -103,5 +103,7 @@ def _brought_by(name: str) -> str:
     """Name our example distribution that provides a name, if there is one."""
     for distribution, names in _OF_EXAMPLES.items():
         if name in names:
-            return f"distribution {distribution}, in examples of a clone of hearthlog, brings it; "
+            return (
+                f"distribution {distribution}, in examples of a clone of hearthlog, provides it; "
+            )
     return ""

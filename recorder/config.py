@@ -179,7 +179,7 @@ class Settings(BaseModel):
     scenarios: Scenarios = Field(
         default={},
         examples=_SCENARIOS,
-        description="Models that label beside it, by the name of what for: as "
+        description="Additional models by scenario, such as "
         '{speakers = "models/speakers.safetensors"}; audioset: the names of the network.',
     )
     feature_set: str = Field(
@@ -208,10 +208,10 @@ class Settings(BaseModel):
         default=1.0,
         ge=1.0,
         le=3600,
-        description="Most that is lost if the recorder is killed.",
+        description="Maximum loss in seconds if the recorder is killed.",
     )
     sync_seconds: float = Field(
-        default=5.0, ge=1.0, le=3600, description="Most that is lost if the power is cut."
+        default=5.0, ge=1.0, le=3600, description="Maximum loss in seconds if the power is cut."
     )
     statistics_every: int = Field(
         default=LOGGED_EVERY,
@@ -245,7 +245,9 @@ class Settings(BaseModel):
     clip_pre_roll_seconds: float = Field(
         default=2.0, ge=0.0, le=30.0, description="Part of a clip before its sound."
     )
-    clip_minutes_a_day: int = Field(default=30, ge=1, le=1500, description="Most clips a day.")
+    clip_minutes_a_day: int = Field(
+        default=30, ge=1, le=1500, description="Maximum minutes of clips a day."
+    )
     clip_retention_days: int = Field(
         default=30, ge=1, le=3650, description="Age at which clips are deleted."
     )

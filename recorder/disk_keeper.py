@@ -177,7 +177,7 @@ def keep_disk(rules: KeepingRules, *, may_thin: bool = True) -> DiskReport:
 def _wipes(plan: RetentionPlan, logs: int) -> str:
     return (
         f"the limits would delete all but the newest of {logs} logs ({plan.deletions[-1].why}): "
-        "nothing is deleted; `hearthlog retain` does it, if that is meant"
+        "nothing is deleted; `hearthlog retain` deletes them, if intended"
     )
 
 

@@ -230,10 +230,10 @@ def _embedder(settings: Settings, microphones: int) -> tuple[Embedder | None, st
         say(why)
         return embedder, "the network cannot be used"
     if embedder is not None:
-        return embedder, f"it takes nothing of the network {embedder.source.network}"
+        return embedder, f"it does not use the network {embedder.source.network}"
     if settings.embedding == NO_NETWORK:
         return embedder, "no network is wanted"
-    return embedder, f"the network {NETWORK} is not there"
+    return embedder, f"the network {NETWORK} is not installed"
 
 
 def _report_starters(

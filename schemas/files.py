@@ -23,7 +23,7 @@ def open_regular(path: Path) -> int:
 
     Raise `OSError` if the file cannot be opened, or is no regular file.
     """
-    mode = os.stat(path).st_mode  # noqa: PTH116  goes with what follows
+    mode = os.stat(path).st_mode  # noqa: PTH116  `os.open` below takes the same text
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, "Is a directory", str(path))
     if not stat.S_ISREG(mode):

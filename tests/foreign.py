@@ -222,7 +222,7 @@ FILES = (
         "9.0,12.0,Turdus merula,Eurasian Blackbird,0.4021,day.wav\n"
         "12.0,15.0,Turdus merula,Eurasian Blackbird,0.3021,day.wav\n",
         map='"Human cough" = "coughing"\nFaucet = "tap_water"\n',
-        left_out=("2 labels left out", ":4: 'Eurasian Blackbird' is the name of no class"),
+        left_out=("2 labels left out", ":4: 'Eurasian Blackbird' is not a class name"),
     ),
     ForeignFile(
         "BirdNET-Analyzer",

@@ -159,7 +159,8 @@ def test_none_by_a_time_is_not_known_where_too_little_was_heard(share, known):
     assert found[0].text == (
         "Toilet flush: none from 06:00 to 10:00"
         if known
-        else "Toilet flush from 06:00 to 10:00: not known, for only 70 % of that time was heard"
+        else "Toilet flush from 06:00 to 10:00: unknown, because only 70 % of that time was "
+        "recorded"
     )
 
 

@@ -498,12 +498,12 @@ def test_a_replay_prints_each_ring_and_how_often_each_rule_rings(two_days, heart
     assert done.stdout.splitlines() == [
         (
             "2026-03-02 02:02  coughs: Coughing: 3 times in the last 1 h, more than 2 "
-            "(told at 2026-03-02 06:30)"
+            "(delivered at 2026-03-02 06:30)"
         ),
         "2026-03-02 03:30  no speech: Talking: none from 00:30 to 03:30",
         (
-            "2026-03-03 03:30  no speech: Talking from 00:30 to 03:30: not known, for only 33 % "
-            "of that time was heard"
+            "2026-03-03 03:30  no speech: Talking from 00:30 to 03:30: unknown, because only "
+            "33 % of that time was recorded"
         ),
         "",
         "name       rule       rings  a week  not known",

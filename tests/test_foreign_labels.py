@@ -139,7 +139,7 @@ def test_with_a_map_only_classes_that_it_or_hearthlog_knows_are_guessed(take):
     assert marks == [(1, 2, "door_bell"), (3, 4, "door_bell"), (7, 8, "laughing")]
     assert result.returncode == 3
     assert "1 label left out: " in result.stderr
-    assert ":3: 'Eurasian Blackbird' is the name of no class" in result.stderr
+    assert ":3: 'Eurasian Blackbird' is not a class name" in result.stderr
 
 
 def test_a_map_goes_before_the_name_itself_and_knows_a_label_in_any_capitals(take):
@@ -174,7 +174,7 @@ def test_each_name_that_is_no_class_is_said_once_with_its_number_and_its_first_l
     said = result.stderr.splitlines()
     assert sum("'what 3?'" in line for line in said) == 1
     assert "2 labels left out, the first: " in said[1]
-    assert "labels.txt:1: 'what 0?' is the name of no class" in said[1]
+    assert "labels.txt:1: 'what 0?' is not a class name" in said[1]
     assert said[-1] == "hearthlog: 8 labels more left out, of 4 kinds"
 
 
@@ -254,7 +254,7 @@ HOSTILE = {  # and what is said of them
     ),
     "accents.txt": (
         b"1\t2\ta" + "\u0301\u0323".encode() * (MOST // 4 - 9),
-        "is the name of no class",
+        "is not a class name",
     ),
     "quotes.csv": (b"start,end,label\n" + b'1,2,"a\n' * 900_000, "is not CSV"),
     "columns.csv": (b"start".ljust(MOST, b","), "is not CSV (a record is longer than 1 MB)"),

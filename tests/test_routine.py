@@ -116,7 +116,7 @@ def test_a_usual_day_is_as_usual_and_few_are_called_rare():
     rarity = [judged(month(usual_day, seed=seed)).once_in for seed in range(12)]
     assert sum(each < 7 for each in rarity) >= 9
     assert sum(each >= 30 for each in rarity) <= 1
-    assert judgement_text(judged(month(usual_day))) == "As usual, beside 27 earlier days."
+    assert judgement_text(judged(month(usual_day))) == "As usual, compared with 27 earlier days."
 
 
 def test_getting_up_late_is_said_with_how_much_later():
@@ -126,7 +126,7 @@ def test_getting_up_late_is_said_with_how_much_later():
     assert first.value - first.middle == pytest.approx(120, abs=30)
     assert "first busy half hour from 0" in text_of(found)
     assert "later than usual (06:" in text_of(found)
-    assert judgement_text(found).startswith("Unusual beside 27 earlier days: ")
+    assert judgement_text(found).startswith("Unusual compared with 27 earlier days: ")
 
 
 def test_a_meal_that_is_missed_is_named_by_its_hours():
@@ -194,7 +194,7 @@ def test_one_figure_far_from_usual_is_told_of_a_day_that_is_as_usual_on_the_whol
     far = [(at("01:00") + 300 * n, 2, "coughing", 1) for n in range(20)]
     found = judged(month(lambda rng: sorted([*usual_day(rng), *far])))
     text = judgement_text(replace(found, once_in=2.0))
-    assert text.startswith("On the whole as usual, beside 27 earlier days, but: ")
+    assert text.startswith("On the whole as usual, compared with 27 earlier days, but: ")
     assert "bouts of coughing in the night 2" in text
 
 
@@ -335,7 +335,7 @@ def test_an_alert_tells_of_an_unusual_day_in_the_morning_after_it(logs):
 def test_a_report_says_what_was_unlike_usual_days_and_how_rare_that_is(logs, tmp_path):
     page = tmp_path / "page.html"
     make_report(find_home_logs([logs]), Period(MONDAY + timedelta(days=18), 1, UTC), page)
-    assert "Unusual beside 16 earlier days: " in page.read_text()
+    assert "Unusual compared with 16 earlier days: " in page.read_text()
     assert "o household sounds from 11:" in page.read_text()
 
 

@@ -68,7 +68,7 @@ class PrometheusOutput:
             say(
                 f"bridge.prometheus: every account of this machine may read {settings.text_file}; "
                 'write readable_by = "all" if that is meant, else "owner" or "group": the next '
-                'release takes "owner" if it says nothing'
+                'release uses "owner" by default'
             )
         if line := settings.unread_text_file():
             say(line)
@@ -159,10 +159,10 @@ class _Handler(HttpHandler):
                 {"WWW-Authenticate": "Bearer"},
             )
         elif self.path.partition("?")[0] != "/metrics":
-            self.send_text(HTTPStatus.NOT_FOUND, "there is /metrics")
+            self.send_text(HTTPStatus.NOT_FOUND, "only /metrics exists")
         elif self.has_place():
             if (text := server.current()) is None:
-                self.send_text(HTTPStatus.SERVICE_UNAVAILABLE, "what is known is old")
+                self.send_text(HTTPStatus.SERVICE_UNAVAILABLE, "the metrics are stale")
             else:
                 self.send(HTTPStatus.OK, text, _TEXT)
 

@@ -125,7 +125,7 @@ def _check_bind(address: str) -> str:
 
 
 class MqttSettings(_Table):
-    """A broker, and how one speaks to it."""
+    """An MQTT broker and its connection."""
 
     host: Annotated[str, AfterValidator(_check_host)] = Field(
         examples=["broker.lan"], description="Name or address of the broker."
@@ -175,7 +175,7 @@ class MqttSettings(_Table):
 
 
 class PrometheusSettings(_Table):
-    """Where a Prometheus finds its figures."""
+    """Where Prometheus reads the metrics."""
 
     text_file: PlainPath | None = Field(
         default=None,

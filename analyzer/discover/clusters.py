@@ -1,4 +1,4 @@
-"""Groups of sounds and voices alike: kinds, files, numbers and names, and where they occur."""
+"""Clusters, common to sound groups and voices: kinds, files, numbers and names, and where they occur."""
 
 import fcntl
 import hashlib
@@ -48,7 +48,7 @@ _Header = TypeVar("_Header", bound=BaseModel)
 
 @dataclass(frozen=True)
 class ClusterKind(Generic[_Header]):
-    """What is found again in a home: groups of sounds, or voices.
+    """A kind of cluster: groups of sounds, or voices.
 
     Attributes
     ----------

@@ -301,8 +301,7 @@ def _usable(
 def _unnamed(path: Path, placed: PlacedMark) -> LineError:
     label = placed.mark.label
     reason = (
-        f"{label[:64]!r} is the name of no class; name one in a --map, as "
-        f'{label[:64]!r} = "tap_water"'
+        f'{label[:64]!r} is not a class name; name one in a --map, as {label[:64]!r} = "tap_water"'
     )
     return LineError(place_text(path, placed.place), OTHER, reason, label)
 

@@ -34,7 +34,7 @@ def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
     if day.night_hours:
         yield _night(day)
     if day.first is not None and day.last is not None:
-        yield f"Lively from {day.first.text} to {day.last.text}. {longest_quiet(day)}".strip()
+        yield f"Active from {day.first.text} to {day.last.text}. {longest_quiet(day)}".strip()
 
 
 def gist_of_week(account: Account) -> Iterator[str]:

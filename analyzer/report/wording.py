@@ -85,11 +85,11 @@ def judgement_text(judged: DayAnomaly) -> str:
     if judged.once_in < WEEK:
         single = [each for each in judged.differences if abs(each.deviation) >= _SINGLE]
         if not single:
-            return f"As usual, beside {compared}."
+            return f"As usual, compared with {compared}."
         odd = replace(judged, differences=single)
-        return f"On the whole as usual, beside {compared}, but: {differences_text(odd)}."
+        return f"On the whole as usual, compared with {compared}, but: {differences_text(odd)}."
     rare = "Unusual" if judged.once_in >= _MONTH else "Somewhat unusual"
-    return f"{rare} beside {compared}: {rarity_text(judged)}. {_sentence(judged)}".strip()
+    return f"{rare} compared with {compared}: {rarity_text(judged)}. {_sentence(judged)}".strip()
 
 
 def too_few_text(days: int) -> str:

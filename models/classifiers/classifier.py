@@ -184,8 +184,8 @@ class Classifier:
         if self.names is not None:
             so = "it labels nothing"
         return (
-            f"it takes embeddings of {taken.network}, and {theirs}: {so} "
-            f"(hearthlog models fetch {taken.network})"
+            f"it needs embeddings of {taken.network}, and {theirs}: {so} (hearthlog models fetch "
+            f"{taken.network})"
         )
 
     def mix(

@@ -87,11 +87,11 @@ def import_labels(
         bool, typer.Option("--strict", help="Import nothing unless every label can be imported.")
     ] = False,
 ) -> None:
-    """Add the labels of a file as marks to review layers, one beside each log.
+    """Import labels from files as marks in the review layers of the logs.
 
-    Where they overlap older marks, they win; labels that stand there already change nothing. If
-    `hearthlog review --queue --save` made the file, spans that still have a label were looked at.
-    Exit status 3: some labels were left out.
+    Imported labels replace older marks that they overlap; labels that exist already change
+    nothing. For a file of `hearthlog review --queue --save`, the spans that still have a
+    label count as reviewed. Exit status 3: some labels were left out.
     """
     from hearthlog.analyzer.logs.layers import find_coverage
     from hearthlog.analyzer.marks.formats.labels import Choice
@@ -265,7 +265,7 @@ def _agree(labels: Path, folded: "Sequence[Folded]", *, yes: bool) -> None:
         )
     else:
         print_notice(f"{labels}: not spelled like a class: {text}")
-        if not typer.confirm("Take them so?", err=True):
+        if not typer.confirm("Import them as these classes?", err=True):
             print_notice("nothing was imported; --map names their classes")
             raise typer.Exit(1)
 
@@ -315,10 +315,11 @@ def enrol(
         typer.Option(help="Seconds of the file (default: all) or of the microphone (default: 5)."),
     ] = None,
 ) -> None:
-    """Take seconds of a sound from a file, a log or a microphone to learn from.
+    """Enrol seconds of a sound from a file, a log or a microphone for training.
 
-    Features are kept, and no sound: a log in the folder `enrolled` of the home, all of it marked.
-    Exit status 3: a file was damaged, or of several some could not be enrolled.
+    Only features are kept, not the sound: as a fully marked log in the folder `enrolled` of
+    the home. Exit status 3: a file was damaged, or some of several files could not be
+    enrolled.
     """
     from hearthlog.analyzer.marks import enrol as enrolment
 

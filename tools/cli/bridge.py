@@ -41,9 +41,10 @@ def bridge(
         typer.Option(help="Configuration of the recorder, a TOML file with a table `bridge`."),
     ] = None,
 ) -> None:
-    """Follow the log of a recorder, and tell a broker, Home Assistant and others what is heard.
+    """Follow the log of a recorder, and publish it to MQTT, Home Assistant and other outputs.
 
-    The recorder takes no notice: only its logs are read. What cannot be told is tried again.
+    The recorder is not affected: the bridge only reads its logs. Failed deliveries are
+    retried.
     """
     from hearthlog.analyzer.bridge.alerts.rule_checks import rule_doubts
     from hearthlog.analyzer.bridge.bridge import (
@@ -115,9 +116,9 @@ def replay(
     timezone: Timezone = None,
     as_json: Json = False,
 ) -> None:
-    """Show when the rules of a configuration would have rung, and how often.
+    """Show when, and how often, the alert rules of a configuration would have notified.
 
-    Exit status 3: a log is damaged or unfinished; what could be read was used.
+    Exit status 3: a log is damaged or unfinished; its readable part was used.
     """
     from hearthlog.analyzer.bridge.alerts.activity import read_activity
     from hearthlog.analyzer.bridge.alerts.evaluation import notifications
@@ -217,7 +218,7 @@ def _days(weeks: float) -> str:
 
 
 def _line(ring: "Notification", zone: tzinfo) -> str:
-    told = f" (told at {_local(ring.due, zone)})" if ring.due > ring.time else ""
+    told = f" (delivered at {_local(ring.due, zone)})" if ring.due > ring.time else ""
     return f"{_local(ring.time, zone)}  {ring.rule}: {ring.text}{told}"
 
 

@@ -76,10 +76,10 @@ def discover(
     timezone: Timezone = None,
     as_json: Json = False,
 ) -> None:
-    """Group the sounds that recur, whatever their labels say, and show each group.
+    """Group recurring sounds, whatever their labels, and show each group.
 
-    Groups keep their numbers in later runs. Where a person has marked a sound already, it stays so.
-    Exit status 3: a log is damaged, unfinished or of other features; the others were used.
+    Groups keep their numbers in later runs. Sounds that a person has marked keep their marks.
+    Exit status 3: a log is damaged, unfinished or has other features; the others were used.
     """
     from hearthlog.analyzer.discover.clusters import locked_file
     from hearthlog.analyzer.discover.groups import GROUPS
@@ -314,10 +314,10 @@ def voices(
     timezone: Timezone = None,
     as_json: Json = False,
 ) -> None:
-    """Tell voices apart where the labels say speech: how many there are, and who speaks when.
+    """Separate the voices in labelled speech: how many there are, and who speaks when.
 
-    Voices keep their numbers in later runs. Exit status 3: a log is damaged, or has no features by
-    which voices can be told apart; the others were used.
+    Voices keep their numbers in later runs. Exit status 3: a log is damaged, or its features
+    cannot separate voices; the others were used.
     """
     from hearthlog.analyzer.discover.clusters import locked_file
     from hearthlog.analyzer.discover.speech import find_voices, read_speech

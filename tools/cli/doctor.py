@@ -41,10 +41,10 @@ def doctor(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check logs: MCAP, the contract, and how they follow each other; or what records them now.
+    """Check logs: container, messages, and sequence of logs; or check running recorders.
 
-    Exit status 1: a log is damaged, or not as hearthlog writes them, or nothing is recorded now; 3:
-    a log has gaps, or is unfinished, or something is not as it should be now.
+    Exit status 1: a log is damaged or violates the format, or nothing is being recorded; 3: a
+    log has gaps or is unfinished, or a recorder has a problem.
     """
     if (ping_url is not None or ping_file is not None) and not live:
         wrong_use("--ping and --ping-file go with --live")
@@ -171,9 +171,9 @@ def recover(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Save what is whole in a log that was cut or damaged, and say what is lost.
+    """Recover the intact messages of a truncated or damaged log, and report the losses.
 
-    The log itself is not touched. Exit status 3: something was lost.
+    The log itself is not changed. Exit status 3: something was lost.
     """
     from hearthlog.schemas.errors import LogError
 

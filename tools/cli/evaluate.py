@@ -76,8 +76,8 @@ def scenes(
 ) -> None:
     """Compose scenes of labelled clips, record them with a model, and score its labels.
 
-    Exit status 3: a class has no clip, the model has learned from some of the clips, or some cannot
-    be read.
+    Exit status 3: a class has no clip, the model was trained on some of the clips, or some
+    cannot be read.
     """
     from hearthlog.analyzer.extras import require
 
@@ -220,7 +220,7 @@ def evaluate_log(
 ) -> None:
     """Compare the labels of a log with those of a reviewer.
 
-    Exit status 3: a log was unfinished, or the reference has labels that the log does not know.
+    Exit status 3: a log is unfinished, or the reference has labels that the model lacks.
     """
     from hearthlog.analyzer.extras import require
 
@@ -277,7 +277,7 @@ def evaluate_model(
 ) -> None:
     """Score a model on labelled clips.
 
-    Exit status 3: the model has learned from some of the clips, or some cannot be read.
+    Exit status 3: the model was trained on some of the clips, or some cannot be read.
     """
     from hearthlog.analyzer.extras import require
 
@@ -336,7 +336,7 @@ def evaluate_method(
     plot: Plot = None,
     as_json: Json = False,
 ) -> None:
-    """Cross-validate a way to learn: learn from a part of the clips, and try it on the rest."""
+    """Cross-validate a training method: train on a part of the clips, and test on the rest."""
     from hearthlog.analyzer.extras import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")

@@ -59,7 +59,7 @@ def export(
 ) -> None:
     """Write logs in another format: one file, or a folder with a file for each topic.
 
-    Exit status 3: a log is unfinished; what is there of it is part of the output.
+    Exit status 3: a log is unfinished; its complete part is in the output.
     """
     from hearthlog.analyzer.export.exporter import export as save
     from hearthlog.analyzer.export.exporter import exportable
@@ -167,10 +167,10 @@ def cut(
     start: Start = None,
     end: End = None,
 ) -> None:
-    """Cut a span of time out of logs, message for message.
+    """Copy the messages of a time span of logs into a new log.
 
-    It begins with what describes the streams (`/mic/info`) as it was at the start of the span.
-    Exit status 3: a log is unfinished; what is there of it is part of the output.
+    It begins with the descriptions of the streams (`/mic/info`) that hold at the start of the
+    span. Exit status 3: a log is unfinished; its complete part is in the output.
     """
     from hearthlog.analyzer.export.merge import merge_logs
     from hearthlog.analyzer.logs.selection import select
@@ -187,11 +187,10 @@ def cut(
 
 
 def merge(logs: Logs, *, output: NewLog) -> None:
-    """Put logs together, message for message, in the order of their log times.
+    """Merge logs into one, in the order of log times.
 
-    What they have twice, with the same topic, times and bytes, is there once.
-
-    Exit status 3: a log is unfinished; what is there of it is part of the output.
+    Duplicates, messages with the same topic, times and bytes, are written once. Exit status
+    3: a log is unfinished; its complete part is in the output.
     """
     from hearthlog.analyzer.export.merge import merge_logs
     from hearthlog.analyzer.logs.selection import select

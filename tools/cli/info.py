@@ -40,7 +40,7 @@ def info(
     catalog: Annotated[bool, typer.Option("--catalog", hidden=True)] = False,
     as_json: Json = False,
 ) -> None:
-    """Show what is in a log: span, topics, rates, gaps, labels, model, sizes.
+    """Show the contents of a log: span, topics, rates, gaps, labels, model, sizes.
 
     Exit status 3: a file is unfinished or damaged, or sound is missing.
     """
@@ -319,10 +319,10 @@ def catalog(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write FOLDER/catalog.sqlite, a row for each file, and show the homes in the folder.
+    """Write FOLDER/catalog.sqlite, with a row for each file, and summarise the homes in the folder.
 
-    Files that have not changed since the last catalogue are not read again. Exit status 3: a file
-    is unfinished or damaged.
+    Files that have not changed since the last catalogue are not read again. Exit status 3: a
+    file is unfinished or damaged.
     """
     from hearthlog.analyzer.extras import require
     from hearthlog.analyzer.logs.catalog import (

@@ -42,10 +42,11 @@ def fetch(
         typer.Option("--from", help="File of the network, instead of a download."),
     ] = None,
 ) -> None:
-    """Fetch a network of sounds, with which labels are truer in a home that nobody has heard.
+    """Download a pretrained network, which makes labels in a new home more accurate.
 
-    This is the only command of hearthlog that downloads. It says whose the network is, checks that
-    the file is the one that is known, and tries it. Exit status 3: it is there, and cannot be used.
+    This is the only command of hearthlog that downloads. It prints the origin of the network,
+    verifies the digest of the file, and tests the network. Exit status 3: the network is
+    installed but does not work.
     """
     from hearthlog.models.embedding.networks import NETWORKS, network_folders
     from hearthlog.tools.service.unit import NAME, SYSTEM_UNITS
@@ -199,7 +200,7 @@ def show(
     folder: _Folder = None,
     as_json: Json = False,
 ) -> None:
-    """Print a model's card: what it tells apart, how well, and what it learned from."""
+    """Print the card of a model: its classes, accuracy and training data."""
     from hearthlog.models.modelfile.modelfile import model_card
 
     model = _named(models_folder(folder), name)
@@ -231,11 +232,10 @@ def compare(
     scenario: OwnScenario = None,
     as_json: Json = False,
 ) -> None:
-    """Run two models on the same sound, and say which is better, and how surely.
+    """Run two models on the same sound, and report which is better, and how certain that is.
 
-    Sources that one of them has learned from are left out. Exit status 3: there are no others, or
-    some clips cannot be read. Of logs it is also said how much of a day each model gives to each
-    class.
+    Sources that either was trained on are left out. Exit status 3: there are no others, or
+    some clips cannot be read. For logs, the share of each class in a day is reported too.
     """
     from hearthlog.analyzer.evaluation.model_scores import check_features, compare_models
     from hearthlog.analyzer.training.manifest import left_out_lines, load_scenario, scenario_of
@@ -304,10 +304,10 @@ def promote(
         bool, typer.Option("--anyway", help="Promote without the check, or against its result.")
     ] = False,
 ) -> None:
-    """Make a model the champion, if it does no harm; a recorder that runs takes it over.
+    """Make a model the champion, unless it does harm; a running recorder switches to it.
 
-    It is compared with the model that labels now, on recent logs that it has not learned from; the
-    starter that the home began with is not.
+    The model is compared with the current one on recent logs that it was not trained on. No
+    comparison is made with the starter model of a new home.
     """
     from hearthlog.models.modelfile.registry import promote as promote_model
 
@@ -326,7 +326,7 @@ def promote(
 
 @models.command()
 def rollback(folder: _Folder = None) -> None:
-    """Make the champion before the champion again; before the first it was a starter."""
+    """Make the previous champion champion again; before the first, that is a starter model."""
     from hearthlog.models.modelfile.registry import rollback as roll_back
 
     model, before = roll_back(models_folder(folder))

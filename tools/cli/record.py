@@ -126,9 +126,10 @@ def record(
 ) -> None:
     """Record sound to a labelled log, from a microphone or from files.
 
-    SIGINT (Ctrl-C) and SIGTERM complete the log; SIGHUP starts again if the configuration has
-    changed. Exit status 3: there were gaps, or a file was damaged, left out, or began before the
-    end of another, or a log left by an earlier recorder was damaged, or a new model was refused.
+    SIGINT (Ctrl-C) and SIGTERM complete the log; SIGHUP restarts the recorder if the
+    configuration has changed. Exit status 3: there were gaps; a file was damaged, left out,
+    or overlapped the one before; a log of an earlier recorder was damaged; or a new model was
+    refused.
     """
     from hearthlog.recorder.config import NO_MODEL, exposed_passwords, load_settings
     from hearthlog.recorder.recording import record_files

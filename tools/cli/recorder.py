@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def devices(*, as_json: Json = False) -> None:
-    """List the microphones by the names that `hearthlog record --device` takes."""
+    """List the microphones by the names that `hearthlog record --device` accepts."""
     from hearthlog.recorder.sources.process import query_devices
 
     microphones = query_devices()
@@ -64,7 +64,7 @@ def show(
         Path | None, typer.Option("--config", help="Configuration, a TOML file.")
     ] = None,
 ) -> None:
-    """Print what a recorder would be started with, and where each value comes from."""
+    """Print the effective settings of a recorder, and the origin of each value."""
     from hearthlog.recorder.config import load_with_origins
 
     if context.invoked_subcommand is not None:
@@ -82,11 +82,11 @@ def show(
 def check(
     file: Annotated[Path, typer.Argument(help="Configuration, a TOML file.")],
 ) -> None:
-    """Check a configuration before a recorder or a bridge is started with it.
+    """Check a configuration before starting a recorder or a bridge with it.
 
-    Exit status 2: it is wrong; 1: a model, a folder or a file that it names cannot be used; 3:
-    others may read its secrets, a file may be a credential of the service, nobody would read a
-    text file, or an alert cannot ring.
+    Exit status 2: it is invalid; 1: a model, a folder or a file in it cannot be used; 3:
+    others may read its secrets, a file should be a credential of the service, nobody would
+    read a text file, or an alert can never notify.
     """
     from hearthlog.analyzer.bridge.alerts.rule_checks import rule_doubts, unheard_classes
     from hearthlog.analyzer.bridge.bridge import exposed_files, output_problems
@@ -113,7 +113,7 @@ def check(
 
 @config.command()
 def schema() -> None:
-    """Print the JSON schema of the configuration, by which editors check and complete it."""
+    """Print the JSON schema of the configuration, for checks and completion in editors."""
     from hearthlog.analyzer.bridge.settings import file_schema
 
     print(json.dumps(file_schema(), indent=2))
@@ -146,7 +146,7 @@ def pause(
         typer.Option("--for", help="How long, such as 30m, 2h or 1d.", show_default="until resume"),
     ] = None,
 ) -> None:
-    """Have the recorders of a folder close their microphones; the log says when, and why."""
+    """Close the microphones of the recorders of a folder; the log records when, and why."""
     from hearthlog.recorder import pause_schedule
 
     _check_folder(logs)
@@ -203,10 +203,11 @@ def retain(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Delete or thin the oldest logs of a recorder, as its limits ask; it does so by itself.
+    """Delete or thin the oldest logs of a recorder by its limits; a running one does so by itself.
 
-    Never deleted: the newest log, and what is reviewed, locked by a file LOG.keep, unfinished, of
-    another node or unknown. Exit status 3: a limit cannot be met, or a log cannot be deleted.
+    Never deleted: the newest log, and logs that are reviewed, locked by a file LOG.keep,
+    unfinished, or of another node. Exit status 3: a limit cannot be met, or a log cannot be
+    deleted.
     """
     from hearthlog.recorder.config import load_settings
     from hearthlog.schemas.errors import LogError
@@ -316,10 +317,11 @@ def install_service(
         typer.Option("--bridge", help="Install the bridge instead of the recorder."),
     ] = False,
 ) -> None:
-    """Make the recorder, or the bridge, a service of systemd: now, at every boot, after upgrades.
+    """Install the recorder, or the bridge, as a systemd service that starts now and at every boot.
 
-    It is checked first what the service will find. Given again it writes the unit anew, and starts
-    the recorder again: the log is completed, and the next one says in a gap what was not heard.
+    What the service needs is checked first. Run again after an upgrade, the command rewrites
+    the unit and restarts the recorder: the log is completed, and the next log records the
+    gap.
     """
     from hearthlog.tools.service.unit import install_for_system, install_for_user
 

@@ -62,10 +62,10 @@ def relabel(
     scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
-    """Label every frame of logs anew, in layers beside them.
+    """Label every frame of logs again, in layers next to the logs.
 
-    The logs are not changed. Layers that are there and would be the same are left as they are:
-    what was interrupted goes on where it was when it is run again.
+    The logs are not changed. Existing layers with the same result are kept, so an interrupted
+    run continues when it is run again.
 
     Exit status 3: a log is damaged, or was not relabelled; the others are done.
     """
@@ -159,9 +159,9 @@ def diff(
     end: End = None,
     as_json: Json = False,
 ) -> None:
-    """Compare two labellings of some logs, or choose what to review next.
+    """Compare two labellings of logs, or list spans to review next.
 
-    Exit status 3: a log is damaged or unfinished; the others, or what is there, were used.
+    Exit status 3: a log is damaged or unfinished; its readable part and the others were used.
     """
     from hearthlog.analyzer.logs.labelling import find_labellings
     from hearthlog.analyzer.review.review_list import write_list

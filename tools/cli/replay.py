@@ -70,10 +70,11 @@ def replay(
     loop: Annotated[bool, typer.Option("--loop", "-l", help="Repeat until Ctrl-C.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Run logs through the pipeline again: with the recorded model, bit for bit as recorded.
+    """Run logs through the pipeline again; with the recorded model, bit for bit as recorded.
 
-    SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: it was interrupted, a log was
-    unfinished, sound before or between the logs is missing, or labels were not to be had.
+    SIGINT (Ctrl-C) and SIGTERM complete the new log. Exit status 3: the replay was
+    interrupted, a log is unfinished, sound before or between the logs is missing, or there
+    were no labels.
     """
     from hearthlog.analyzer.replay.player import ReplayOptions
     from hearthlog.analyzer.replay.replay import LogSet

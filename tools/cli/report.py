@@ -45,7 +45,7 @@ def report(
 ) -> None:
     """Write a page and a picture of a day or a week, for a carer.
 
-    Exit status 3: a log is damaged or unfinished; the page says that it was not heard.
+    Exit status 3: a log is damaged or unfinished; the page shows its time as not recorded.
     """
     if day is not None and week is not None:
         wrong_use("--day and --week exclude each other")

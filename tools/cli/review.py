@@ -103,10 +103,10 @@ def review(
     timezone: Timezone = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Port of the viewer.")] = None,
 ) -> None:
-    """Show a day or any other span in Rerun, and mark what was heard.
+    """Show a day or another span in Rerun, and mark its sounds.
 
-    Drag a span on the time ruler and press a key in the terminal. Every mark is in the review
-    layer at once. Exit status 3: some logs could not be read, or not all of them could be shown.
+    Drag a span on the time ruler and press a key in the terminal. Every mark is saved in the
+    review layer at once. Exit status 3: some logs could not be read or shown completely.
     """
     if save is not None and (web or port):
         wrong_use("--save writes a file and excludes --web and --port")

@@ -95,11 +95,11 @@ def train(
     scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
-    """Learn a model from labelled sound, and measure it on sources it has not heard.
+    """Train a model on labelled sound, and measure it on sources left out of the training.
 
-    One of a home is judged there; whatever is found, it is written.
-    `hearthlog models promote` ends with 1 if it may not label. Exit status 3: clips were left out
-    that cannot be read, or lines of the manifest.
+    A model of a home is checked there, and written whatever the result; `hearthlog models
+    promote` ends with 1 if the check fails. Exit status 3: clips or manifest rows were left
+    out because they cannot be read.
     """
     from hearthlog.analyzer.extras import require
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
@@ -487,9 +487,9 @@ def manifest(
         typer.Option("--print-map", help="Print the map of the collection, for editing, and exit."),
     ] = False,
 ) -> None:
-    """List the clips of a collection, with labels, sources and licences, to learn from.
+    """List the clips of a collection, with labels, sources and licences, for training.
 
-    Exit status 3: some audio files of the collection are not there.
+    Exit status 3: some audio files of the collection are missing.
     """
     from hearthlog.analyzer.collections.manifest_writer import make_manifest, shipped_map
     from hearthlog.analyzer.collections.readers import FOLDER, NAMES, find_collection

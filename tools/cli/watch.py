@@ -156,9 +156,10 @@ def watch(
     ] = None,
     timezone: Timezone = None,
 ) -> None:
-    """Show what is heard, as it is recorded, until the viewer is closed or Ctrl-C comes.
+    """Show the labels live, until the viewer is closed or Ctrl-C is pressed.
 
-    The recorder takes no notice: only its logs are read. Exit status 3: some could not be read.
+    The recorder is not affected: only its logs are read. Exit status 3: some logs could not
+    be read.
     """
     if web and serve:
         wrong_use("--web opens a viewer here, --serve opens none: choose one")

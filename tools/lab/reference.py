@@ -36,8 +36,8 @@ error says why, and it goes on as before.
 _BRIDGE = """
 ## The bridge
 
-The tables of [the bridge](bridge.md) may stand in the same file: the recorder takes no notice of
-them, and writes none of them into a log. Each is an output; without one nobody is told anything.
+The tables of [the bridge](bridge.md) may stand in the same file: the recorder ignores them,
+and writes none of them into a log. Each is an output; without one nothing is sent.
 `state`, in the table `[bridge]` itself, is the folder of what the bridge has to remember: by
 default that of systemd, or `bridge` beside the logs. The tables `[[bridge.alert]]` are
 [the rules of alerts](alerts.md#rules).

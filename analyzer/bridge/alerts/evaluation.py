@@ -304,8 +304,8 @@ def none_by_conditions(
         is_known = share >= rule.least_share
         text = f"{rule.words}: none {hours}"
         if not is_known:
-            heard_share = f"{int(100 * share)} %"
-            text = f"{rule.words} {hours}: not known, for only {heard_share} of that time was heard"
+            why = f"only {int(100 * share)} % of that time was recorded"
+            text = f"{rule.words} {hours}: unknown, because {why}"
         conditions.append(_at_once(last, text, is_known=is_known))
     return conditions
 

@@ -106,7 +106,9 @@ class _Rule(BaseModel):
     name: Annotated[str, AfterValidator(_check_name)] = Field(
         examples=["Coughing at night"], description="Shown; unique."
     )
-    cooldown: Window = Field(default="1h", validate_default=True, description="Between two rings.")
+    cooldown: Window = Field(
+        default="1h", validate_default=True, description="Minimum time between two notifications."
+    )
     quiet_hours: list[_Hours] = Field(
         default=[], description='Quiet hours, in which notifications wait, such as ["22:00-06:30"].'
     )
@@ -168,7 +170,7 @@ class MoreThan(_SoundRule):
 
 
 class NoneBy(_SoundRule):
-    """None of a class from one time of day to another, of which enough was heard."""
+    """None of a class from one time of day to another, if enough of that time was recorded."""
 
     rule: Literal["none_by"]
     since: TimeOfDay
@@ -198,21 +200,23 @@ class LongerThan(_SoundRule):
 
 
 class RecorderSilent(_Rule):
-    """Nothing from the recorder for a time, not even what it says of its health."""
+    """Nothing from the recorder for a time, not even diagnostics."""
 
     rule: Literal["recorder_silent"]
     silent_for: Window = Field(default="10m", validate_default=True)
 
 
 class UnlikeUsual(_SoundRule):
-    """A day, or its night, outside of what the four weeks before it had."""
+    """A day, or its night, outside the range of the previous four weeks."""
 
     rule: Literal["unlike_usual"]
     part: Literal["day", "night"] = Field(
         default="day", description="Compare the day before, or the night from 22:00 to 07:00."
     )
     of: Literal["count", "minutes"] = Field(default="count", description="What is compared.")
-    which: Literal["more", "less", "both"] = Field(default="both", description="That rings.")
+    which: Literal["more", "less", "both"] = Field(
+        default="both", description="Deviation that notifies."
+    )
     margin: float = Field(
         default=0.25, ge=0.0, le=10.0, description="Share above the highest or below the lowest."
     )
@@ -232,7 +236,7 @@ class UnlikeUsual(_SoundRule):
 
 
 class UnusualDay(_Rule):
-    """A day, with the night after it, that is as unlike the four weeks before as few are."""
+    """A day, with its night, more unusual than most of the previous four weeks."""
 
     rule: Literal["unusual_day"]
     once_in: float = Field(default=30.0, ge=7.0, le=LONGEST, description="Return period in days.")

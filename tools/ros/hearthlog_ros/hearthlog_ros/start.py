@@ -1,4 +1,4 @@
-"""The nodes as programs: an end that is asked for while they are still loaded is one in order."""
+"""The nodes as programs: a stop request during loading ends them cleanly."""
 
 import os
 import signal
