@@ -1,4 +1,4 @@
-"""Clusters, common to sound groups and voices: kinds, files, numbers and names, and where they occur."""
+"""Clusters, common to sound groups and voices: kinds, files, names and occurrences."""
 
 import fcntl
 import hashlib
