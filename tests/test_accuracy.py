@@ -188,7 +188,7 @@ def test_a_span_that_nobody_can_tell_was_neither_right_nor_wrong(tmp_path):
     check(logs, at("10:00"), [(5, 55, "unknown")], chosen=QUEUE)
     assert "review queue" not in "".join(Accuracy(find_home_logs([tmp_path])).lines())
     check(logs, at("11:00"), [(5, 15, "speech")], chosen=QUEUE)
-    assert "of 1 span that" in "".join(Accuracy(find_home_logs([tmp_path])).lines())
+    assert "of 1 span of the review queue" in "".join(Accuracy(find_home_logs([tmp_path])).lines())
 
 
 def test_a_damaged_layer_is_a_loss_and_the_other_minutes_count(tmp_path):

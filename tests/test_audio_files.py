@@ -350,7 +350,7 @@ def test_a_recording_of_files_says_what_is_a_guess_and_what_was_not_heard(hearth
     assert result.returncode == 3
     left_out, gap = result.stderr.splitlines()
     assert left_out.startswith(f"hearthlog: left out: {tmp_path}/in/bad.wav: cannot be read")
-    assert gap == "hearthlog: 1 gap, 71,960 frames not heard"
+    assert gap == "hearthlog: 1 gap, 71,960 frames lost"
     assert [one.frames_lost for one in read(tmp_path / "logs", "gap")] == [71_960]
     begin = features(tmp_path / "logs")[1][0]
     assert begin == read_time("2026-03-01T07:00:00")

@@ -674,7 +674,7 @@ def test_broken_audio_is_found_when_it_is_learned_from(copied, tmp_path):
         (("esc50",), "give the folder of the collection, and --output"),
         (("esc50", "x"), "give the folder of the collection, and --output"),
         (("esc50", "x", "-o", "m.txt"), "a manifest is named *.csv"),
-        (("esc50", "x", "-o", "m.csv", "--licence", "CC0"), "are for a folder; ESC-50 says its"),
+        (("esc50", "x", "-o", "m.csv", "--licence", "CC0"), "are for a folder; ESC-50 has its"),
     ],
 )
 def test_wrong_use_is_told(words, reason):

@@ -569,7 +569,7 @@ def test_a_model_says_that_one_clip_of_the_data_was_learned_from(own, hearthlog)
     assert (unseen.returncode, "learned" in unseen.stderr) == (0, False)
     shared = "../learned/speech/speech_002.flac,speech,elsewhere,,,3.0\n"
     other.write_text(other.read_text() + shared)
-    assert "has learned from 1 of the" in hearthlog(*words).stderr
+    assert "was trained on 1 of the" in hearthlog(*words).stderr
     assert json.loads(hearthlog(*words, "--json").stdout)["sources_learned"] == 1
 
 
@@ -592,4 +592,4 @@ def test_a_model_says_that_it_is_scored_on_what_it_learned_from(own, hearthlog):
     model, manifest = own
     result = hearthlog("evaluate", "model", model, "--data", manifest)
     assert result.returncode == 3
-    assert "has learned from 27 of the 27 sources" in result.stderr
+    assert "was trained on 27 of the 27 sources" in result.stderr

@@ -246,7 +246,7 @@ def test_a_journal_has_no_token_but_the_name_of_a_file_that_only_we_read(tmp_pat
         os.close(writing)
         with os.fdopen(reading) as lines:
             line = next(each for each in lines if "Lichtblick" in each)
-            file = Path(re.search(r"the token, is in (\S+)", line)[1])
+            file = Path(re.search(r"full address is in (\S+)", line)[1])
             url = file.read_text().strip()
             assert file.parent.stat().st_mode & 0o777 == 0o700
             assert "token" not in line

@@ -69,7 +69,7 @@ def test_if_the_recorders_of_a_home_have_different_models_one_is_to_be_chosen(ca
     done = trained(capfd)
     assert (done.returncode, done.stderr) == (
         2,
-        "hearthlog: the latest logs are labelled by one and two: choose one with --base\n",
+        "hearthlog: the latest logs were labelled by one and two: choose one with --base\n",
     )
     assert trained(capfd, "--base", "models/one.safetensors").returncode == 0
     assert base_of("home-1") == sha256_of("one")
@@ -81,7 +81,7 @@ def test_a_model_that_is_gone_is_named(capfd):
         Path("models", f"{name}.safetensors").unlink()
     done = trained(capfd)
     assert done.returncode == 2
-    assert "the latest log is labelled by one (" in done.stderr
+    assert "the latest log was labelled by one (" in done.stderr
     assert done.stderr.endswith("name its file with --base\n")
     assert done.stderr.count("\n") == 1
 

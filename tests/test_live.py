@@ -197,7 +197,7 @@ def test_a_watchdog_is_told_whether_all_is_well(labmic, tmp_path, watchdog):
 
 
 def test_a_watchdog_that_hangs_is_waited_for_a_while(monkeypatch):
-    monkeypatch.setattr(network, "_SECONDS", 0.5)
+    monkeypatch.setattr(network, "_PING_SECONDS", 0.5)
     with closing(create_server(("127.0.0.1", 0))) as server:
         url = f"http://127.0.0.1:{server.getsockname()[1]}/"
         assert network.ping(url, is_well=True) in {"no answer within 0 s", "timed out"}
@@ -208,7 +208,7 @@ def test_a_watchdog_that_hangs_is_waited_for_a_while(monkeypatch):
 def test_what_is_no_address_of_a_watchdog_is_refused(tmp_path, url):
     result = doctor(tmp_path, "--ping", url)
     assert (result.returncode, result.stdout) == (2, "")
-    assert result.stderr.startswith("hearthlog: --ping wants an address")
+    assert result.stderr.startswith("hearthlog: --ping needs an address")
     (tmp_path / "url").write_text(url)
     result = doctor(tmp_path, "--ping-file", tmp_path / "url")
     assert (result.returncode, result.stdout) == (1, "")

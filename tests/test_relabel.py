@@ -571,7 +571,7 @@ def test_a_microphone_of_other_features_is_left_out_and_named(model, day, tmp_pa
         (tmp_path / "merged.mcap").replace(log)
     done = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
     assert done.returncode == 0
-    assert "is for other features: kitchen (features of auros21)\n" in done.stderr
+    assert "needs other features: kitchen (features of auros21)\n" in done.stderr
     topics = {topic for path in find_logs(logs) if is_layer(path) for topic in read_columns([path])}
     assert {topic.split("/")[1] for topic in topics} == {"bath"}
 

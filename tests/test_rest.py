@@ -177,8 +177,8 @@ def test_a_pipe_in_place_of_the_file_is_not_waited_for(tmp_path):
         (["pause", "nowhere"], "nowhere: no such folder; name the folder that the recorder"),
         (["resume", "nowhere"], "nowhere: no such folder; name the folder that the recorder"),
         (["pause", ".", "--for", "soon"], "--for soon: not a duration such as 30m, 2h or 1d"),
-        (["pause", ".", "--for", "0h"], "--for 0h: more than nothing, and a year at most"),
-        (["pause", ".", "--for", "999999d"], "--for 999999d: more than nothing, and a year"),
+        (["pause", ".", "--for", "0h"], "--for 0h: must be more than zero and at most a year"),
+        (["pause", ".", "--for", "999999d"], "--for 999999d: must be more than zero and at most a"),
     ],
 )
 def test_a_pause_that_makes_no_sense(arguments, words):

@@ -660,4 +660,4 @@ def test_the_command_line_and_a_file_name_scenarios(tmp_path, capfd):
         refused = run(capfd, "record", "x.wav", "--scenario", *given_)
         assert (refused.returncode, "say NAME=FILE" in refused.stderr) == (2, True)
     twice = run(capfd, "record", "x.wav", "--scenario", "a=x", "--scenario", "a=y")
-    assert "--scenario a: is given twice" in twice.stderr
+    assert "--scenario a: given twice" in twice.stderr

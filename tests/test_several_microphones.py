@@ -101,7 +101,7 @@ def test_training_asks_for_a_base_and_then_learns_of_both_microphones(home, capf
     asked = run(capfd, "train", "--home", home)
     assert (asked.returncode, asked.stderr) == (
         2,
-        "hearthlog: the latest logs are labelled by two and one: choose one with --base\n",
+        "hearthlog: the latest logs were labelled by two and one: choose one with --base\n",
     )
     done = run(capfd, "train", "--home", home, "--base", file_of("kitchen"))
     assert done.returncode == 0, done.stderr

@@ -158,7 +158,7 @@ def test_logs_are_relabelled_by_the_starter_that_takes_what_they_have(yamnet, ca
     assert done.returncode == 0
     assert "2 layers of" in done.stdout
     assert done.stdout.endswith("frames by general-embedding\n")
-    assert "1 log without the embeddings that general-embedding takes" in done.stderr
+    assert "1 log without embeddings for general-embedding" in done.stderr
 
 
 def test_a_starter_is_promoted_for_the_network_that_is_there(yamnet, capfd):
@@ -211,7 +211,7 @@ def test_on_a_terminal_it_is_said_once_what_a_network_would_gain(tmp_path, capsy
     assert "hearthlog models fetch yamnet (4 MB, once)\n" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "ai_edge_litert", None)
     _report_network(Settings(model=Path("general")))
-    assert "it wants LiteRT, too; try: " in capsys.readouterr().err
+    assert "it also needs LiteRT; try: " in capsys.readouterr().err
     _report_network(Settings(model=NO_MODEL))
     _report_network(Settings(model=Path("home.safetensors")))
     _report_network(Settings(embedding="none"))

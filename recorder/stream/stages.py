@@ -26,21 +26,60 @@ from hearthlog.schemas.messages.topics import (
 )
 
 
-class FeatureMessages:
-    """Encodes the features of one stream of frames, and their statistics over the last window.
+class RollingStatistics:
+    """Statistics of one stream over its last frames.
 
     Every window is summed from its own frames, as running sums would drift over months.
     """
 
-    def __init__(self, microphone: str, window_frames: int, width: int, every: int) -> None:
-        self._microphone = microphone
+    def __init__(self, window_frames: int, width: int) -> None:
         self._length, self._width = window_frames, width
-        self._every = every  # frames between messages of statistics
         self.restart()
 
     def restart(self) -> None:
         """Empty the window: the next frame does not follow the last one."""
         self._recent: Float32 = np.empty((0, self._width), np.float32)
+
+    def __call__(self, features: Float32, places: Indices | None = None) -> tuple[Float32, Float32]:
+        """Compute the statistics at some of the successive frames.
+
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+        places : np.ndarray [shape=(m,)], intp, optional
+            Indices of the frames, ascending from 0; all by default.
+
+        Returns
+        -------
+        mean, std : np.ndarray [shape=(m, d)], float32
+            Over the last window, or over all frames since the start or the last restart if these
+            are fewer; the standard deviation divides by the number of frames.
+        """
+        frames = np.concatenate([self._recent, features])
+        places = np.arange(len(features)) if places is None else places
+        begins = places + len(self._recent) + 1 - self._length
+        filling = int(np.count_nonzero(begins < 0))
+        mean, std = np.empty((2, len(places), self._width), np.float32)
+        for row, begin in enumerate(begins[:filling].tolist()):
+            first = [*frames[: begin + self._length, np.newaxis]]
+            (mean[row],), (std[row],) = mean_and_std(first)
+        windows = [frames[begins[filling:] + place] for place in range(self._length)]
+        mean[filling:], std[filling:] = mean_and_std(windows)
+        self._recent = frames[max(len(frames) - self._length + 1, 0) :].copy()
+        return mean, std
+
+
+class FeatureMessages:
+    """Encodes the features of one stream of frames, and their rolling statistics."""
+
+    def __init__(self, microphone: str, window_frames: int, width: int, every: int) -> None:
+        self._microphone = microphone
+        self._statistics = RollingStatistics(window_frames, width)
+        self._every = every  # frames between messages of statistics
+
+    def restart(self) -> None:
+        """Empty the window: the next frame does not follow the last one."""
+        self._statistics.restart()
 
     def __call__(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
         """Encode the features of successive frames.
@@ -61,23 +100,6 @@ class FeatureMessages:
             *self._encode("features", frames, stamps, {"values": features}),
             *self._encode("statistics", frames[logged], stamps[logged], statistics),
         ]
-
-    def _statistics(self, features: Float32, places: Indices) -> tuple[Float32, Float32]:
-        """Compute mean and standard deviation (of n, not of n - 1) at some of the frames.
-
-        They are over the last window, or over all frames since the restart if these are fewer.
-        """
-        frames = np.concatenate([self._recent, features])
-        begins = places + len(self._recent) + 1 - self._length
-        filling = int(np.count_nonzero(begins < 0))
-        mean, std = np.empty((2, len(places), self._width), np.float32)
-        for row, begin in enumerate(begins[:filling].tolist()):
-            first = [*frames[: begin + self._length, np.newaxis]]
-            (mean[row],), (std[row],) = mean_and_std(first)
-        windows = [frames[begins[filling:] + place] for place in range(self._length)]
-        mean[filling:], std[filling:] = mean_and_std(windows)
-        self._recent = frames[max(len(frames) - self._length + 1, 0) :].copy()
-        return mean, std
 
     def _encode(
         self, kind: str, frames: Int64, stamps: Int64, arrays: Mapping[str, Float32]

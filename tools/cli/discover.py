@@ -133,8 +133,8 @@ def _names(
         is_number = re.fullmatch(r" *[0-9]{1,9} *", place)
         if not is_number or not CLASS_NAME.fullmatch(label) or label in excluded:
             wrong_use(
-                f"--name {text[:64]!r}: say the number of a {kind.noun} and {what}, "
-                f"as {kind.example}"
+                f"--name {text[:64]!r}: give the number of a {kind.noun} and {what}, "
+                f"such as {kind.example}"
             )
         if int(place) in names:
             wrong_use(f"--name {text[:64]!r}: {kind.noun} {int(place)} has another name already")

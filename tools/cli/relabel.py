@@ -104,7 +104,7 @@ def _print(result: "Relabelled", model: str) -> None:
         print_notice(f"left out, because {model} needs other features: {listed(named, 'and')}")
     if result.by_features:
         logs_there = number(len(result.by_features), "log")
-        print_notice(f"{logs_there} have no embeddings for {model}: labelled without them")
+        print_notice(f"{logs_there} without embeddings for {model}: labelled by features only")
     for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
         named = [why if str(log.parent) in why else f"{log}: {why}" for log, why in logs.items()]
         for line in first_of(what, sorted(named)):

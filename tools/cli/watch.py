@@ -75,7 +75,7 @@ def _reported_address(admission: "Admission", port: int) -> Iterator[None]:
             folder = until_the_end.enter_context(TemporaryDirectory(prefix="hearthlog-"))
             file = Path(folder) / "foxglove-address"
             file.write_text(f"{address}\n")  # only this account can read the folder
-            address = f"ws://{place}/; its full address, with the token, is in {file}"
+            address = f"ws://{place}/; its full address is in {file}"
         print_notice(f"open in Foxglove or Lichtblick: {address}")
         _report_reach(admission, place)
         yield

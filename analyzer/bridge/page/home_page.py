@@ -410,7 +410,7 @@ class HomePage:
             raise
         # Other users may read the journal, so it must not have the token.
         if writes_to_journal():
-            whole = f"{address}; its full address, with the token, is in {file.absolute()}"
+            whole = f"{address}; its full address is in {file.absolute()}"
         say(f"the page of the home: {whole}")
         if not bind.is_loopback:
             say(
