@@ -144,7 +144,7 @@ def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
         delivery.close()
     assert len(set(said)) == 1
     assert said[0].startswith(
-        "line 2, json://127.0.0.1: an alert could not be told (no connection)"
+        "line 2, json://127.0.0.1: an alert could not be delivered (no connection)"
     )
     assert not list((tmp_path / "box").iterdir())
 

@@ -640,11 +640,11 @@ def test_clips_of_which_nothing_is_whole_are_deleted(noise, tmp_path, size):
 def test_sound_is_not_kept_without_a_model_that_knows_what_is_private(noise, model_file, tmp_path):
     about = asked(tmp_path / "logs", keep_audio="events")
     for reason, others in {
-        "keep_audio = \"always\" needs a model that knows 'speech', which is never kept (there "
-        "is none); use such a model, or set never_keep = [] to keep that too": {
+        "keep_audio = \"always\" needs a model with the class 'speech', which is never kept "
+        "(there is none); use such a model, or set never_keep = [] to keep that too": {
             "keep_audio": "always"
         },
-        'keep_audio = "events" needs a model, which says what to keep; give one, or keep it '
+        'keep_audio = "events" needs a model to select the sound; name one, or use keep_audio = '
         "always": {"keep_audio": "events", "never_keep": []},
     }.items():
         about = asked(tmp_path / "logs", **others)
@@ -717,7 +717,9 @@ def test_clips_stop_while_a_model_speaks_that_does_not_know_what_is_private(
     assert source.unfinished == [1, 0, 1]
     assert said(paths[0]) == []
     (text,) = said(paths[1])
-    assert text.startswith("no clips: keep_audio = \"always\" needs a model that knows 'speech'")
+    assert text.startswith(
+        "no clips: keep_audio = \"always\" needs a model with the class 'speech'"
+    )
     assert said(paths[2]) == ["clips are kept again"]
 
 

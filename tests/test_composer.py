@@ -264,7 +264,9 @@ def test_a_model_that_takes_embeddings_labels_no_composition_without_its_network
 ):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     settings = Settings(output=tmp_path / "logs", model=starter_file("general-embedding"))
-    with pytest.raises(ModelError, match="the network yamnet is not there; hearthlog models fetch"):
+    with pytest.raises(
+        ModelError, match="the network yamnet is not installed; hearthlog models fetch"
+    ):
         record_composition(evening, settings, START)
     assert not (tmp_path / "logs").exists()
 

@@ -99,8 +99,8 @@ def test_a_configuration_is_checked_before_a_restart(hearthlog, file, tmp_path):
     ("change", "status", "words"),
     [
         (("node", "nodee"), 2, "FILE, line 2: unknown key 'nodee'"),
-        (('"50M"', '"50X"'), 2, "FILE, line 3: max_bag_size: '50X' is no size; say how many bytes"),
-        (("06:30", "6:30"), 2, "FILE, line 5: quiet_hours.0: '22:00-6:30' are no hours"),
+        (('"50M"', '"50X"'), 2, "FILE, line 3: max_bag_size: '50X' is not a size; write bytes"),
+        (("06:30", "6:30"), 2, "FILE, line 5: quiet_hours.0: '22:00-6:30' is not a span of hours"),
         (('"bath"', '"kitchen"'), 2, "FILE, line 12: two microphones have name 'kitchen'"),
         (('"bath"', '"ba/th"'), 2, "FILE, line 13: microphone.1.name: "),
         (('model = "none"', "noise = 1"), 2, "FILE, line 15: unknown key 'microphone.1.noise'"),
@@ -437,7 +437,7 @@ def test_what_the_bridge_could_not_tell_of_is_named_before_it_starts(
     [
         (
             "coughng",
-            "a: no model here knows the class 'coughng', so that it cannot be heard; there",
+            "a: no model here has the class 'coughng'; there",
         ),
         (
             "silent cough",

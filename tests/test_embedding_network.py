@@ -340,7 +340,9 @@ def test_without_a_network_only_who_asked_for_one_is_told():
     assert open_embedder("none") == (None, "")
     embedder, line = open_embedder("yamnet")
     assert embedder is None
-    assert line.startswith("the network yamnet is not there; hearthlog models fetch yamnet brings")
+    assert line.startswith(
+        "the network yamnet is not installed; hearthlog models fetch yamnet installs"
+    )
     assert line.endswith("it; it is recorded without a network")
     embedder, line = open_embedder("other")
     assert embedder is None
@@ -352,7 +354,10 @@ def test_a_configured_network_that_is_not_there_is_noticed(hearthlog, tmp_path, 
     file.write_text(f'model = "none"\nembedding = "yamnet"\noutput = "{tmp_path}/logs"\n')
     done = hearthlog("config", "check", file)
     assert done.returncode == 1
-    assert "the network yamnet is not there; hearthlog models fetch yamnet brings it" in done.stderr
+    assert (
+        "the network yamnet is not installed; hearthlog models fetch yamnet installs it"
+        in done.stderr
+    )
     (folder / "yamnet.tflite").write_bytes(b"half")
     assert "or not all of it: it has 4 bytes" in hearthlog("config", "check", file).stderr
     file.write_text(f'model = "none"\nembedding = "none"\noutput = "{tmp_path}/logs"\n')

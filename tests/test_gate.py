@@ -333,14 +333,14 @@ def test_a_recorder_takes_over_only_what_was_judged(place, monkeypatch, capfd):
     promote(folder, "deaf")
     (line,) = refusals(watch)
     assert line == (
-        "model deaf refused: it was not judged in this home; `hearthlog models promote deaf` "
-        "judges it; going on with one"
+        "model deaf refused: it was not checked in this home; `hearthlog models promote deaf` "
+        "checks it; going on with one"
     )
     assert capfd.readouterr().err == f"hearthlog: {line}\n"
     judged(folder, model, reasons=("silence falls from 10 h to 1.0 min a day",))
     (line,) = refusals(watch)
     assert line.startswith("model deaf refused: silence falls from 10 h to 1.0 min a day; ")
-    assert "`hearthlog models promote deaf --anyway` insists" in line
+    assert "`hearthlog models promote deaf --anyway` overrides this" in line
     time.sleep(0.3)
     assert (list(watch.refusals()), watch.ready) == ([], None)  # said once
     insist(folder, model.sha256)

@@ -422,7 +422,7 @@ def test_what_was_switched_off_stays_so_without_commands_and_one_is_told_how_to_
             home.heard("speech", 0.1)
             assert json.loads(listener.wait_for(f"{ROOT}/mic/event"))["event_type"] == "speech"
         (line,) = bridged.said
-        assert line.startswith("mqtt: the broker is not told of coughing; ")
+        assert line.startswith("mqtt: not published: coughing; ")
         assert str(memory) in line
         content = json.loads(memory.read_text())
         memory.write_text(json.dumps(content | {"muted": []}))
@@ -452,9 +452,7 @@ def test_what_no_model_knows_is_not_switched_off_by_what_is_left_at_the_broker(h
             listener.publish(f"{ROOT}/told/{label}", "OFF", retain=True)
         with Bridged(home.folder, broker, commands=True) as bridged:
             listener.wait_for(f"{COUGHING}/on", "OFF")
-    assert [line.partition("; ")[0] for line in bridged.said] == [
-        "mqtt: the broker is not told of coughing"
-    ]
+    assert [line.partition("; ")[0] for line in bridged.said] == ["mqtt: not published: coughing"]
     memory = json.loads((home.folder.parent / "bridge" / "mqtt-home.json").read_text())
     assert memory["muted"] == ["coughing"]
 

@@ -112,7 +112,9 @@ def test_a_recorder_that_starts_in_a_pause_waits_and_says_so_in_the_gap(labmic, 
 
 @pytest.mark.parametrize("text", ["22-6", "24:00-06:00", "22:00-06:60", "22:00", "", "x" * 999])
 def test_what_are_no_hours_is_refused(text):
-    with pytest.raises(ConfigurationError, match=r"are no hours; write them as 22:00-06:30$"):
+    with pytest.raises(
+        ConfigurationError, match=r"is not a span of hours; write it as 22:00-06:30$"
+    ):
         quiet_hours(text)
 
 

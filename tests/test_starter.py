@@ -145,7 +145,7 @@ def test_without_a_model_the_general_starter_labels_and_says_so(record, tmp_path
     done = record("-o", "logs")
     assert done.returncode == 0
     by = "by features alone, as no network is wanted"
-    assert f"starter model general, which has never heard this home: {by}" in done.stderr
+    assert f"starter model general, not trained on this home: {by}" in done.stderr
     assert model_of(tmp_path / "logs") == ["general"]
 
 

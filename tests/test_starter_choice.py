@@ -83,8 +83,8 @@ def recorded(folder="logs", hour=0, **settings):
 def test_where_a_network_hears_the_starter_that_takes_it_labels_and_says_so(capsys):
     assert recorded() == ["general-embedding"]
     assert capsys.readouterr().err == (
-        "hearthlog: the labels are by the starter model general-embedding, which has never heard "
-        "this home: by what the network yamnet hears\n"
+        "hearthlog: the labels are by the starter model general-embedding, not trained on this "
+        "home: by what the network yamnet hears\n"
     )
     assert recorded("water", model=Path("bathroom")) == ["bathroom-embedding"]
     assert recorded("default", model=Path("models/champion.safetensors")) == ["general-embedding"]
@@ -107,8 +107,8 @@ def test_a_network_that_goes_away_leaves_the_starter_that_needs_none(yamnet, cap
     yamnet.unlink()
     assert recorded(hour=1) == ["general"]
     assert capsys.readouterr().err.endswith(
-        "the labels are by the starter model general, which has never heard this home: by features "
-        "alone, as the network yamnet is not there\n"
+        "the labels are by the starter model general, not trained on this home: by features "
+        "alone, as the network yamnet is not installed\n"
     )
     assert recorded(hour=2, model=Path("general-embedding")) == ["general-embedding"]
     assert "takes embeddings of yamnet, and there are none" in capsys.readouterr().err

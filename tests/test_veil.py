@@ -194,7 +194,7 @@ def test_a_model_that_does_not_know_what_is_private_is_refused(tmp_path, sounds,
     for model, private, what in ((None, "speech", "there is none"), (model_file, "x", "apart")):
         about = Settings(output=tmp_path / "logs", model=model, privacy=[private], timezone="UTC")
         with pytest.raises(
-            ConfigurationError, match=f"needs a model that knows '{private}' .*{what}"
+            ConfigurationError, match=f"needs a model with the class '{private}' .*{what}"
         ):
             record(about, FileSource(sounds, START), Flag())
     assert not (tmp_path / "logs").exists()
