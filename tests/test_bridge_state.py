@@ -227,9 +227,12 @@ def test_who_cannot_be_told_of_a_trouble_ends_nothing():
             '[bridge.mqtt]\nhost = "x"\nport = 70000',
             "line 3: bridge.mqtt.port: 70000 is not a whole number from 1 to 65535",
         ),
-        ('[bridge.ping]\nurl = "ftp://x"', "line 2: bridge.ping.url: is no address that can be"),
-        ('[bridge.page]\nbind = "224.0.0.1"', "line 2: bridge.page.bind: '224.0.0.1' is no"),
-        ('[bridge.page]\nbind = "ff02::1"', "line 2: bridge.page.bind: 'ff02::1' is no address"),
+        ('[bridge.ping]\nurl = "ftp://x"', "line 2: bridge.ping.url: is not a web address"),
+        ('[bridge.page]\nbind = "224.0.0.1"', "line 2: bridge.page.bind: '224.0.0.1' is not an IP"),
+        (
+            '[bridge.page]\nbind = "ff02::1"',
+            "line 2: bridge.page.bind: 'ff02::1' is not an IP address",
+        ),
         ("bridge = 3", "line 1: bridge: is a table; write [bridge]"),
     ],
 )

@@ -80,8 +80,8 @@ def test_a_review_with_a_file_that_is_not_there_is_one_line(home, hearthlog, tmp
 @pytest.mark.parametrize(
     ("options", "status", "says"),
     [
-        (["--name", "rex"], 2, "say the number of a {0.noun} and a "),
-        (["--name", f"{'9' * 5000}=rex"], 2, "say the number of a {0.noun} and a "),
+        (["--name", "rex"], 2, "give the number of a {0.noun} and a "),
+        (["--name", f"{'9' * 5000}=rex"], 2, "give the number of a {0.noun} and a "),
         (["--name", "1=rex", "--name", "1=max"], 2, "{0.noun} 1 has another name already"),
         (["--name", "99=rex"], 1, "there is no {0.noun} 99; `hearthlog {0.verb} LOGS` lists"),
         (["--undo", "99"], 1, "there is no {0.noun} 99; `hearthlog {0.verb} LOGS` lists"),

@@ -247,7 +247,7 @@ def test_every_number_has_bounds(tmp_path, value):
         ("[bridge.mqtt]\nhost='x'\npassword='geheim'", 'write password_file = "/etc/hearthlog/'),
         ("[bridge.mqtt]\nhost='x'\ntopic='a/#'", "'a/#' cannot begin topics; write 1 to 200"),
         ("[[bridge.alert]]\nname='x'\nrule='more'", 'rule is one of "longer_than", "more_than"'),
-        ("[bridge.page]\nbind = 'evil.example'", "'evil.example' is no address: write one"),
+        ("[bridge.page]\nbind = 'evil.example'", "'evil.example' is not an IP address"),
         ("node = flat", 'a text stands in quotes, as node = "home"'),
         ('output = "C:\\Users\\me"', "a text with a backslash stands in single quotes"),
         ("node = 'a'\nnode = 'b'", "(at line 2, the last one); a key or table is given twice"),

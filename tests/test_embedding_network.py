@@ -304,7 +304,7 @@ def test_a_network_is_tried_in_a_process_of_its_own(yamnet):
         ("print('nonsense')", "cannot be tried"),
         ("answer(seconds=0.4)", "too slow here: 0.4 s for a window, every 0.5 s of each of 3"),
         ("answer(seconds=0.1)", "of each of 3 microphones; this machine manages one every 0.6 s"),
-        ("answer(megabytes=1000)", "takes 1000 MB of memory, and 300 are the most"),
+        ("answer(megabytes=1000)", "takes 1000 MB of memory, and the limit is 300"),
         ("print(json.dumps({'error': 'yamnet.tflite: is bad'}))", "yamnet.tflite: is bad"),
     ],
 )

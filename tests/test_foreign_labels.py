@@ -258,7 +258,7 @@ HOSTILE = {  # and what is said of them
     ),
     "quotes.csv": (b"start,end,label\n" + b'1,2,"a\n' * 900_000, "is not CSV"),
     "columns.csv": (b"start".ljust(MOST, b","), "is not CSV (a record is longer than 1 MB)"),
-    "header.csv": (b"start,end,label,a" + b" " * 100_000 + b"b\n1,2,no?\n", "no class"),
+    "header.csv": (b"start,end,label,a" + b" " * 100_000 + b"b\n1,2,no?\n", "not a class name"),
     "wide.txt": ("start\tend\tlabel\n".encode("utf-16") + b"1\0" * (7 << 20), "longer than 1"),
 }
 

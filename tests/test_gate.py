@@ -745,7 +745,7 @@ def test_what_was_looked_at_or_lies_elsewhere_is_not_asked_though_a_model_would_
 def test_when_all_that_a_model_would_change_was_looked_at_that_is_said(lived):
     keep_swapped("speech", "music")
     review(lived, RANDOM, count=MINUTES)
-    with pytest.raises(DataError, match="swapped: no span is left in which it says something else"):
+    with pytest.raises(DataError, match="swapped: no span is left in which it differs from"):
         asked_of("swapped")
 
 
@@ -754,7 +754,7 @@ def test_where_the_recorder_says_something_else_than_the_champion_by_now_nothing
     keep_swapped("speech", "music")
     Path("models/champion.safetensors").unlink()
     Path("models/champion.safetensors").symlink_to("swapped.safetensors")
-    with pytest.raises(DataError, match="one: no span is left in which it says something else"):
+    with pytest.raises(DataError, match="one: no span is left in which it differs from"):
         asked_of("one")
 
 

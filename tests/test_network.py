@@ -188,7 +188,7 @@ def why(address):
 
 
 def test_what_is_wrong_with_a_camera_is_said(camera):
-    assert "is not there (404 Not Found)" in why(camera.address("no"))
+    assert "does not exist (404 Not Found)" in why(camera.address("no"))
     assert "has no sound" in why(camera.address("mute"))
     locked = f"127.0.0.1:{camera.locked_port}/sound"
     assert why(f"rtsp://{locked}").startswith(f"rtsp://{locked} needs a user name and a password")

@@ -688,7 +688,7 @@ def test_a_queue_without_a_value_is_one_of_useful_spans(home, capfd):
 def test_without_a_display_it_says_what_else_there_is(recorded_home, capfd):
     done = run(capfd, "review", recorded_home)
     assert done.returncode == 1
-    assert "no display here: use --web for a browser, or --save FILE.rrd" in done.stderr
+    assert "no display: use --web for a browser, or --save FILE.rrd" in done.stderr
     assert done.stderr.count("\n") == 1
 
 

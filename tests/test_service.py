@@ -377,5 +377,5 @@ def test_without_systemd_nothing_is_installed(hearthlog, tmp_path):
     result = hearthlog(
         "install-service", "--user", env={"PATH": "", "XDG_CONFIG_HOME": str(tmp_path)}
     )
-    assert result.stderr.startswith("hearthlog: systemd is not here")
+    assert result.stderr.startswith("hearthlog: systemd is missing")
     assert not list(tmp_path.iterdir())
