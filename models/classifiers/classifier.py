@@ -184,7 +184,7 @@ class Classifier:
         if self.names is not None:
             so = "it labels nothing"
         return (
-            f"it needs embeddings of {taken.network}, and {theirs}: {so} (hearthlog models fetch "
+            f"it takes embeddings of {taken.network}, and {theirs}: {so} (hearthlog models fetch "
             f"{taken.network})"
         )
 
