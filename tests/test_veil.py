@@ -191,7 +191,10 @@ def test_reports_wait_for_the_features_before_them_unless_there_is_no_sound(mode
 
 
 def test_a_model_that_does_not_know_what_is_private_is_refused(tmp_path, sounds, model_file):
-    for model, private, what in ((None, "speech", "there is none"), (model_file, "x", "has the classes")):
+    for model, private, what in (
+        (None, "speech", "there is none"),
+        (model_file, "x", "this one has"),
+    ):
         about = Settings(output=tmp_path / "logs", model=model, privacy=[private], timezone="UTC")
         with pytest.raises(
             ConfigurationError, match=f"needs a model with the class '{private}' .*{what}"
