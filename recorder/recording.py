@@ -233,7 +233,7 @@ def _embedder(settings: Settings, microphones: int) -> tuple[Embedder | None, st
         return embedder, f"it does not use the network {embedder.source.network}"
     if settings.embedding == NO_NETWORK:
         return embedder, "no network is wanted"
-    return embedder, f"the network {NETWORK} is not installed"
+    return embedder, f"the network {NETWORK} is missing"
 
 
 def _report_starters(

@@ -194,7 +194,7 @@ def test_the_twelve_sounds_of_a_kitchen_are_a_scenario():
 
 @pytest.mark.parametrize("name", [one.name for one in SETS])
 def test_what_is_not_installed_names_the_distribution_that_brings_it(name):
-    line = f"'{name}' is not installed; distribution hearthlog-feature-sets, in examples .* brings"
+    line = f"'{name}' is not installed; distribution hearthlog-feature-sets, in examples .* pro"
     with pytest.raises(ModelError, match=f"feature set {line}"):
         feature_set(name)
     with pytest.raises(DataError, match=f"method {line}"):

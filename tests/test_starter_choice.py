@@ -108,7 +108,7 @@ def test_a_network_that_goes_away_leaves_the_starter_that_needs_none(yamnet, cap
     assert recorded(hour=1) == ["general"]
     assert capsys.readouterr().err.endswith(
         "the labels are by the starter model general, not trained on this home: by features "
-        "alone, as the network yamnet is not installed\n"
+        "alone, as the network yamnet is missing\n"
     )
     assert recorded(hour=2, model=Path("general-embedding")) == ["general-embedding"]
     assert "takes embeddings of yamnet, and there are none" in capsys.readouterr().err

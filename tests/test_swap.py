@@ -336,7 +336,7 @@ def test_a_model_of_which_a_bit_has_changed_is_named_at_the_start_and_labels(
     file.write_bytes(data)
     ModelWatch(file, SimpleQueue(), scenario).close()
     (line,) = capfd.readouterr().err.splitlines()
-    said = rf"{file}: is not as it was written \(digest \w{{12}}, not \w{{12}}\): .* backup.*labelling"
+    said = rf"{file}: is not as it was written \(digest \w{{12}}, not \w{{12}}\): .* backup.*labell"
     assert re.search(said, line)
     assert ("scenario bathroom: " in line) == bool(scenario)
     with pytest.raises(ModelError, match="is not as it was written"):
