@@ -246,21 +246,9 @@ class HttpHandler(BaseHTTPRequestHandler):
     body_limit = 0  # bytes
     fields: Mapping[str, str] = {"Cache-Control": "no-store", "Connection": "close"}
 
-    def get(self) -> None:
-        """Answer a GET request."""
-        raise NotImplementedError
-
-    def post(self) -> None:
+    def do_POST(self) -> None:
         """Answer a POST request; not found by default."""
         self.send_error(HTTPStatus.NOT_FOUND)
-
-    def do_GET(self) -> None:
-        """Answer a GET request."""
-        self.get()
-
-    def do_POST(self) -> None:
-        """Answer a POST request."""
-        self.post()
 
     def setup(self) -> None:
         """Limit the bytes read to a head and a body."""

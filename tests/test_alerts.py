@@ -55,7 +55,7 @@ AHEAD = 400 * 24 * HOUR * SECOND
 
 
 def watching(folder, rules, now, say=pytest.fail):
-    """What evaluates rules, and its notifications and its progress on the disk."""
+    """An evaluation of rules, with its notifications, and its progress on the disk."""
     outbox = Outbox(folder / "box", ["x"], say)
     memory = RuleProgressStore(folder / "rules.json", say)
     return RuleWatch(rules, UTC, outbox, memory, say, now), outbox, memory

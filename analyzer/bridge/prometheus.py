@@ -143,7 +143,7 @@ class _Server(HttpServer):
 class _Handler(HttpHandler):
     """Handler of one request; requests from web pages are refused, whatever the host name."""
 
-    def get(self) -> None:
+    def do_GET(self) -> None:
         """Send the metrics."""
         server = cast(_Server, self.server)
         shown = self.headers.get("Authorization", "").encode("utf-8", "replace")

@@ -218,8 +218,8 @@ def _days(weeks: float) -> str:
 
 
 def _line(ring: "Notification", zone: tzinfo) -> str:
-    told = f" (delivered at {_local(ring.due, zone)})" if ring.due > ring.time else ""
-    return f"{_local(ring.time, zone)}  {ring.rule}: {ring.text}{told}"
+    late = f" (delivered at {_local(ring.due, zone)})" if ring.due > ring.time else ""
+    return f"{_local(ring.time, zone)}  {ring.rule}: {ring.text}{late}"
 
 
 def _local(time: int, zone: tzinfo) -> str:

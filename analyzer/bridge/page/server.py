@@ -218,7 +218,7 @@ _FILES = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
 }
-_ASKED = {"/mark": "event", "/group": "group"}  # JSON field of the labelled subject
+_SUBJECTS = {"/mark": "event", "/group": "group"}  # JSON field of the labelled subject
 _JSON = "application/json"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
@@ -299,7 +299,7 @@ class _Handler(HttpHandler):
         self.fields = self._server.fields
         super().setup()
 
-    def get(self) -> None:
+    def do_GET(self) -> None:
         """Send the page, one of its files, or the stream of changes."""
         if not self._is_admitted(changes=False):
             return
@@ -314,20 +314,20 @@ class _Handler(HttpHandler):
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
-    def post(self) -> None:
+    def do_POST(self) -> None:
         """Accept a label for an event or for the sounds of a group."""
         if not self._is_admitted(changes=True):
             return
-        if self._path not in _ASKED:
+        if self._path not in _SUBJECTS:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
-        asked = self._label(_ASKED[self._path])
-        if isinstance(asked, HTTPStatus):
-            self.send_error(asked)
+        mark = self._label(_SUBJECTS[self._path])
+        if isinstance(mark, HTTPStatus):
+            self.send_error(mark)
             return
         self._server.give_time(self.connection, _MARK_SECONDS)
         try:
-            answer, code = {"said": self._server.actions[self._path](*asked)}, HTTPStatus.OK
+            answer, code = {"said": self._server.actions[self._path](*mark)}, HTTPStatus.OK
         except HearthlogError as error:
             answer, code = {"error": str(error)}, HTTPStatus.UNPROCESSABLE_ENTITY
         self._server.give_time(self.connection, SECONDS)
@@ -368,8 +368,8 @@ class _Handler(HttpHandler):
         if isinstance(content, HTTPStatus):
             return content
         try:
-            asked = json.loads(content)
-            labelled, label = asked[what], asked["label"]
+            mark = json.loads(content)
+            labelled, label = mark[what], mark["label"]
         except (ValueError, KeyError, TypeError, RecursionError):
             return HTTPStatus.BAD_REQUEST
         if not (isinstance(labelled, str) and isinstance(label, str)):

@@ -187,7 +187,7 @@ class _Handler(HttpHandler):
     def _page(self) -> _Server:
         return cast(_Server, self.server)
 
-    def get(self) -> None:
+    def do_GET(self) -> None:
         """Send the page, the files of the viewer, the next request or the next text."""
         name = self._name()
         if name == "":
@@ -210,7 +210,7 @@ class _Handler(HttpHandler):
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
-    def post(self) -> None:
+    def do_POST(self) -> None:
         """Receive an answer, or a key."""
         name = self._name()
         content = self.body()
