@@ -166,7 +166,7 @@ def test_the_command_prints_a_table_and_makes_a_picture(model_file, some, tmp_pa
     words, picture = (model_file, "--data", some), tmp_path / "map.png"
     table = measured(capfd, *words, "--plot", picture)
     assert table.returncode == 3
-    assert "the model has learned from 1" in table.stderr
+    assert "the model was trained on 1" in table.stderr
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert max(map(len, table.stdout.splitlines())) <= 100
     result = measured(capfd, *words, "--json")

@@ -194,7 +194,7 @@ class Watcher:
         sound, logs = str(self._folder.composed), str(self._folder.logs)
         command = [*HEARTHLOG, "record", sound, "-o", logs, "--node", NODE, "--model", "none"]
         second = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
-        if "is recorded by" not in second.stderr:
+        if "is in use by the recorder" not in second.stderr:
             self._problems.append(f"a second recorder was not refused: {second.stderr.strip()}")
 
     def _lose_what_is_not_synced(self) -> None:
