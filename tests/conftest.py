@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from brokers import broker
+from command_server import HEARTHLOG, CommandPopen
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
 from realday import write_real_day
 from spliced import record_logs
@@ -52,7 +53,7 @@ _HOUSEHOLD = Path(__file__).parents[2] / "shared" / "data" / "household"
 _CLIPS = Path(__file__).parent / "data" / "household"
 os.environ["HEARTHLOG_MODEL"] = "none"  # unless a test names one
 os.environ["HEARTHLOG_EMBEDDING"] = "none"  # whatever networks this machine has
-HEARTHLOG = [sys.executable, "-m", "hearthlog.tools.cli.main"]
+subprocess.Popen = CommandPopen
 
 
 def pytest_configure(config):
