@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 
-from hearthlog.models.classifiers.names import is_by_names
+from hearthlog.models.classifiers.network_names import is_by_names
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set

@@ -25,7 +25,13 @@ from pathlib import Path
 _MAIN = "hearthlog.tools.cli.main"
 HEARTHLOG = [sys.executable, "-m", _MAIN]
 FRESH_HEARTHLOG = [sys.executable, "-q", "-m", _MAIN]
-_AT_START = ("PYTHON", "LC_", "LANG", "OPENBLAS", "OMP_")  # variables that act before the first line
+_AT_START = (
+    "PYTHON",
+    "LC_",
+    "LANG",
+    "OPENBLAS",
+    "OMP_",
+)  # variables that act before the first line
 _LEFT_OUT = (  # not of the product, or with threads, which a fork would lose
     *(_MAIN, "hearthlog.tools.lab", "hearthlog.tools.ros"),
     "hearthlog.analyzer.review.viewer",
@@ -161,7 +167,7 @@ def _main():
     except SystemExit as end:
         status = end.code
         if isinstance(status, str):
-            print(status, file=sys.stderr)
+            sys.stderr.write(f"{status}\n")
     except BaseException:  # noqa: BLE001  as an interpreter would
         sys.excepthook(*sys.exc_info())
         status = 1

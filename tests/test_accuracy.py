@@ -24,11 +24,11 @@ from hearthlog.analyzer.accuracy.event_counts import (
     strata_of,
     television_minutes,
 )
-from hearthlog.analyzer.gate.recent_time import reference
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.promotion.recent_time import reference
 from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
 from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report

@@ -31,7 +31,7 @@ from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.settings import DeliverySettings
 from hearthlog.analyzer.bridge.state import page_token
-from hearthlog.analyzer.network import free_port
+from hearthlog.analyzer.http import free_port
 
 # Apprise asks for it where there is one.
 pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")

@@ -14,7 +14,7 @@ import soundfile
 import typer
 
 import hearthlog.tools.home
-from hearthlog.analyzer.network import free_port
+from hearthlog.analyzer.http import free_port
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.tools.cli.main import make_app
 
@@ -92,7 +92,7 @@ from pathlib import Path
 for name in {of_extras}:
     sys.modules[name] = None
 from hearthlog.tools.cli.main import main
-import hearthlog.analyzer.gate.promotion_check, hearthlog.analyzer.review.review_list
+import hearthlog.analyzer.promotion.promotion_check, hearthlog.analyzer.review.review_list
 import hearthlog.analyzer.review.timeline_reader, hearthlog.recorder.recording
 from hearthlog.schemas.messages.message_types import typestore
 typestore()

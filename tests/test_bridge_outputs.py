@@ -13,7 +13,7 @@ from hearthlog.analyzer.bridge.home import RecorderAddress, today
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import BridgeSettings
-from hearthlog.analyzer.network import free_port, listen
+from hearthlog.analyzer.http import free_port, listen
 from hearthlog.schemas.frames import NANOSECONDS
 
 pytestmark = pytest.mark.fast

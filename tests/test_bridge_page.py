@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from servedhome import JSON, PALE_TEXTS, Phone, pages, proxying, serving
 from viewers import address_of, browsing, free_port, patiently
 
-from hearthlog.analyzer import network
+from hearthlog.analyzer import http
 from hearthlog.analyzer.bridge.bridge import open_outputs
 from hearthlog.analyzer.bridge.commands import REVIEWER, EventCorrections, class_of
 from hearthlog.analyzer.bridge.events import SoundEvent
@@ -36,8 +36,8 @@ from hearthlog.analyzer.bridge.page.home_page import (
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings
 from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.http import HttpServer
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.network import HttpServer
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -294,20 +294,20 @@ def test_strangers_who_hold_connections_do_not_keep_out_who_has_the_token(served
     cookie = served.cookie()
     with ExitStack() as held:
         for _ in range(3):
-            for _ in range(network.MOST_ASKING):
+            for _ in range(http.MOST_ASKING):
                 own = held.enter_context(served.connect())
                 with suppress(ConnectionError):
                     own.sendall(so_far)
             assert served.ask("GET", "/", cookie=cookie)[0] == 200
         with patiently(served.open_stream, bool):
             assert served.ask("GET", "/", cookie=cookie)[0] == 200
-        assert len(served.threads()) <= network.MOST_ASKING + network.MOST_ADMITTED
+        assert len(served.threads()) <= http.MOST_ASKING + http.MOST_ADMITTED
 
 
 def test_one_address_of_the_network_takes_no_place_of_another(monkeypatch):
-    monkeypatch.setattr(network, "MOST_ASKING", 4)
+    monkeypatch.setattr(http, "MOST_ASKING", 4)
     with ExitStack() as stack:
-        own = HttpServer("127.0.0.1", 0, network.HttpHandler)
+        own = HttpServer("127.0.0.1", 0, http.HttpHandler)
         stack.callback(own.end)
         own.start()
         first = stack.enter_context(socket.socket())
@@ -330,7 +330,7 @@ def test_too_many_open_pages_leave_room_for_the_page_itself(served):
 
 
 def test_who_sends_a_request_for_ever_is_cut_off(served, monkeypatch):
-    monkeypatch.setattr(network, "SECONDS", 0.2)
+    monkeypatch.setattr(http, "SECONDS", 0.2)
     with served.connect() as connection, suppress(ConnectionError):
         connection.sendall(b"GET / HTTP/1.1\r\n")
         while True:  # until the other side ends: by reset, or by an end

@@ -15,12 +15,12 @@ from kept import keep_models
 from logreader import LogReader
 from logs import read
 from spliced import run
-from test_swap import block, count, labels_by, recording, said, wait_for
+from test_model_changes import block, count, labels_by, recording, said, wait_for
 
-from hearthlog.analyzer.gate.comparison import compare_on_trial, gather_evidence
-from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.promotion.comparison import compare_on_trial, gather_evidence
+from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import promote, target

@@ -201,7 +201,7 @@ def test_what_is_said_of_frames_is_the_same_in_pieces_of_any_size(step):
 
 def test_private_frames_are_those_of_labels_that_wait_for_embeddings_too():
     """The same frames are private, whether a label is known at once or sixteen frames later."""
-    from test_veil import labels_of  # noqa: PLC0415  its labels of speech
+    from test_privacy_filter import labels_of  # noqa: PLC0415  its labels of speech
 
     said = np.zeros(200, np.float32)
     said[80:85] = 0.9
@@ -220,7 +220,7 @@ def test_private_frames_are_those_of_labels_that_wait_for_embeddings_too():
 
 def private_frames(said, logit, *, elsewhere=True):
     """Which of 100 frames are private, of one probability of speech and one logit of its names."""
-    from test_veil import labels_of  # noqa: PLC0415  its labels of speech
+    from test_privacy_filter import labels_of  # noqa: PLC0415  its labels of speech
 
     labels = labels_of(np.full(100, said, np.float32))
     names = np.full(labels.probabilities.shape, logit)
@@ -252,7 +252,7 @@ def test_names_of_a_network_forbid_and_where_they_do_not_features_may_be_less_su
 
 @pytest.mark.parametrize("step", [1, 7, 200])
 def test_names_of_speech_count_for_two_seconds_in_blocks_of_any_size(step):
-    from test_veil import labels_of  # noqa: PLC0415  its labels of speech
+    from test_privacy_filter import labels_of  # noqa: PLC0415  its labels of speech
 
     names = np.full((200, 2), -10.0)
     names[80:85] = PRIVATE_LOGIT

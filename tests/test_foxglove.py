@@ -27,7 +27,7 @@ from waiting import wait_for
 
 from hearthlog.analyzer.foxglove.publisher import RecordedSpan
 from hearthlog.analyzer.foxglove.server import Admission, RefusedError
-from hearthlog.analyzer.network import free_port
+from hearthlog.analyzer.http import free_port
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.logs.columns import read_columns

@@ -15,10 +15,10 @@ import pytest
 from conftest import HEARTHLOG
 from test_capture import wait_for_frames
 from test_disk import small_disk
-from test_rest import recording
-from test_swap import wait_for
+from test_model_changes import wait_for
+from test_pauses import recording
 
-from hearthlog.analyzer import network
+from hearthlog.analyzer import http
 from hearthlog.analyzer.recorder_status import examine_live
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.schemas.logs.files import active_path, find_logs, log_path
@@ -197,11 +197,11 @@ def test_a_watchdog_is_told_whether_all_is_well(labmic, tmp_path, watchdog):
 
 
 def test_a_watchdog_that_hangs_is_waited_for_a_while(monkeypatch):
-    monkeypatch.setattr(network, "_PING_SECONDS", 0.5)
+    monkeypatch.setattr(http, "_PING_SECONDS", 0.5)
     with closing(create_server(("127.0.0.1", 0))) as server:
         url = f"http://127.0.0.1:{server.getsockname()[1]}/"
-        assert network.ping(url, is_well=True) in {"no answer within 0 s", "timed out"}
-    assert network.ping(url, is_well=True) == "Connection refused"
+        assert http.ping(url, is_well=True) in {"no answer within 0 s", "timed out"}
+    assert http.ping(url, is_well=True) == "Connection refused"
 
 
 @pytest.mark.parametrize("url", ["file:///etc/passwd", "watchdog", "https://", "ftp://a/b"])

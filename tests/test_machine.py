@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from logs import read
 from test_capture import wait_for_frames
-from test_rest import recording
+from test_pauses import recording
 
 from hearthlog.recorder.events import OK, WARNING
 from hearthlog.recorder.host import machine_health

@@ -4,7 +4,7 @@ import shutil
 
 from logs import features, read
 from test_capture import wait_for_frames
-from test_rest import recording
+from test_pauses import recording
 
 from hearthlog.analyzer.doctor.examination import examine
 

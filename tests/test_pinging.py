@@ -10,13 +10,13 @@ from threading import Thread
 import pytest
 from pydantic import ValidationError
 
-from hearthlog.analyzer import network
+from hearthlog.analyzer import http
 from hearthlog.analyzer.bridge.bridge import PingOutput
 from hearthlog.analyzer.bridge.home import today
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import PingSettings
-from hearthlog.analyzer.network import free_port
+from hearthlog.analyzer.http import free_port
 from hearthlog.schemas.errors import HearthlogError
 
 pytestmark = pytest.mark.fast
@@ -121,7 +121,7 @@ def test_the_address_may_be_in_a_file_and_is_in_no_line(tmp_path):
 def test_of_a_failure_nothing_is_said_that_has_the_address(monkeypatch):
     for error in (InvalidURL("/a-secret"), ValueError("/a-secret"), BadStatusLine("/a-secret")):
         monkeypatch.setattr("urllib.request.urlopen", lambda *_, e=error, **__: raise_it(e))
-        assert network.ping("http://127.0.0.1/a-secret", is_well=True) == type(error).__name__
+        assert http.ping("http://127.0.0.1/a-secret", is_well=True) == type(error).__name__
 
 
 def raise_it(error):

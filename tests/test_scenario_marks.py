@@ -14,7 +14,6 @@ from test_review import Screen
 from test_scenarios_at_once import START, record, sound
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.gate.recent_time import reference
 from hearthlog.analyzer.logs.catalog import read_catalog
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import LabelledFile, Labellings, find_labellings
@@ -28,6 +27,7 @@ from hearthlog.analyzer.marks.marks import (
     read_review,
     write_marks,
 )
+from hearthlog.analyzer.promotion.recent_time import reference
 from hearthlog.analyzer.review.lanes import timeline_lanes
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.session import ReviewSession, queue_spans

@@ -21,7 +21,7 @@ from logreader import LogReader
 from mcap.records import Channel
 from prometheus_client.parser import text_string_to_metric_families
 from spliced import run
-from test_swap import MICROPHONE, block, wait_for
+from test_model_changes import MICROPHONE, block, wait_for
 
 from hearthlog.analyzer.bridge.alerts.activity import (
     FIELDS,

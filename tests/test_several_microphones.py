@@ -11,13 +11,13 @@ from spliced import run
 from together import record_together
 
 from hearthlog.analyzer.accuracy.checked_minutes import read_reviewed_labels
-from hearthlog.analyzer.gate.comparison import gather_evidence
-from hearthlog.analyzer.gate.promotion_check import find_champion
-from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.promotion.comparison import gather_evidence
+from hearthlog.analyzer.promotion.promotion_check import find_champion
+from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.analyzer.review.spans import labelling_model
 from hearthlog.analyzer.training.pseudo_labels import unreviewed_silence, unreviewed_sounds
 from hearthlog.models.modelfile.modelfile import load_model

@@ -7,7 +7,7 @@ from zipfile import ZipFile
 
 import pytest
 from test_capture import wait_for_frames
-from test_rest import recording
+from test_pauses import recording
 
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs

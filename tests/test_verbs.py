@@ -16,7 +16,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from hearthlog.analyzer.network import free_port
+from hearthlog.analyzer.http import free_port
 from hearthlog.tools.cli.main import make_app
 from hearthlog.tools.home.simulate import write_day, write_training_set
 

@@ -22,7 +22,7 @@ from waiting import wait_for
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.network import free_port
+from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.review.lanes import (
     FEATURES,
     FLOOR,

@@ -32,7 +32,7 @@ from hearthlog.analyzer.bridge.state import (
     secret_path,
 )
 from hearthlog.analyzer.extras import missing, remedy
-from hearthlog.analyzer.network import has_password, ip_of, listen, ping, read_ping_address
+from hearthlog.analyzer.http import has_password, ip_of, listen, ping, read_ping_address
 from hearthlog.recorder.host import give_back, keep_one_heap, notify
 from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError

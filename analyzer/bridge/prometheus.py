@@ -23,8 +23,8 @@ from hearthlog.analyzer.bridge.home import (
 from hearthlog.analyzer.bridge.output import TOTALS, News, Total, Totals
 from hearthlog.analyzer.bridge.settings import PrometheusSettings
 from hearthlog.analyzer.bridge.state import BridgeError, figures_token
+from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, is_asked_in_digits
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY
-from hearthlog.analyzer.network import HOST, HttpHandler, HttpServer, is_asked_in_digits
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import create_file, replaced_file

@@ -18,7 +18,7 @@ from pydantic import (
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRules
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.network import ip_of, is_ping_address
+from hearthlog.analyzer.http import ip_of, is_ping_address
 from hearthlog.recorder.config import (
     BRIDGE,
     MicrophoneSettings,

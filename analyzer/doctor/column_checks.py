@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import Findings, Level
-from hearthlog.models.classifiers.names import MOST_AHEAD_FRAMES
+from hearthlog.models.classifiers.network_names import MOST_AHEAD_FRAMES
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS

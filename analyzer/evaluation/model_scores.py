@@ -38,7 +38,7 @@ from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import Auxiliary
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.names import require_trained
+from hearthlog.models.classifiers.network_names import require_trained
 from hearthlog.models.embedding.projection import (
     HOP_FRAMES,
     NO_EMBEDDINGS,

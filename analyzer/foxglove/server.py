@@ -23,7 +23,7 @@ from foxglove.websocket import (
 )
 
 from hearthlog.analyzer.foxglove.publisher import Playback, Publisher
-from hearthlog.analyzer.network import (
+from hearthlog.analyzer.http import (
     busiest_address,
     has_token,
     hidden_address,

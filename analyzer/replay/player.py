@@ -11,7 +11,7 @@ from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, fea
 from hearthlog.analyzer.replay.recorded import Features, RecordedBatch, ReplayComparison
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.names import is_by_names, without_classes
+from hearthlog.models.classifiers.network_names import is_by_names, without_classes
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, entries_of, feature_set
 from hearthlog.models.modelfile.modelfile import CARD, DESCRIPTION, model_attachments

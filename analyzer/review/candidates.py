@@ -9,13 +9,13 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events, events_of
-from hearthlog.analyzer.gate.paired_labels import ChangedTime, find_changed_time
-from hearthlog.analyzer.gate.promotion_check import find_champion, other_features
-from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.logs.labelling import LabelledFile, Labelling, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, overlay
 from hearthlog.analyzer.marks.marks import RANDOM, read_review
+from hearthlog.analyzer.promotion.paired_labels import ChangedTime, find_changed_time
+from hearthlog.analyzer.promotion.promotion_check import find_champion, other_features
+from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.analyzer.review.ranking import spread
 from hearthlog.analyzer.review.review_list import CHANGE, HINT, ReviewSpan
 from hearthlog.analyzer.review.spans import (
@@ -26,7 +26,7 @@ from hearthlog.analyzer.review.spans import (
 )
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.names import AUDIOSET
+from hearthlog.models.classifiers.network_names import AUDIOSET
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import Embeddings, Projection, read_projection
 from hearthlog.models.embedding.sound_names import SoundName, audioset_names, named_sounds

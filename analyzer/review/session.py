@@ -13,11 +13,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.gate.paired_labels import A_DAY, class_words, time_words
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.spans import NONE, Spans, joined
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark
+from hearthlog.analyzer.promotion.paired_labels import A_DAY, class_words, time_words
 from hearthlog.analyzer.review.candidates import (
     MINUTE,
     ReviewedTime,

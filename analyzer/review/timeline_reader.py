@@ -52,7 +52,7 @@ from hearthlog.analyzer.review.timeline import (
     TimelineGrid,
     no_spans,
 )
-from hearthlog.models.classifiers.names import MOST_AHEAD_FRAMES
+from hearthlog.models.classifiers.network_names import MOST_AHEAD_FRAMES
 from hearthlog.schemas.arrays import Float32, Float64, Int16
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS

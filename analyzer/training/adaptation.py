@@ -54,7 +54,7 @@ from hearthlog.models.classifiers.model import (
     Model,
     NamesHead,
 )
-from hearthlog.models.classifiers.names import require_trained
+from hearthlog.models.classifiers.network_names import require_trained
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int32
 from hearthlog.schemas.errors import ignore_progress

@@ -9,7 +9,12 @@ from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.evidence import EmbeddingHeads, mixed
 from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.classifiers.model import Description, Model
-from hearthlog.models.classifiers.names import BY_NAMES, NAMES, NamesParameters, names_parameters
+from hearthlog.models.classifiers.network_names import (
+    BY_NAMES,
+    NAMES,
+    NamesParameters,
+    names_parameters,
+)
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.embedding.projection import DELAY_FRAMES
 from hearthlog.models.extensions import Extensions

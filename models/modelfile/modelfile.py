@@ -27,7 +27,7 @@ from hearthlog.models.classifiers.model import (
     one_line,
     read_description,
 )
-from hearthlog.models.classifiers.names import AUDIOSET, KEY, audioset_file
+from hearthlog.models.classifiers.network_names import AUDIOSET, KEY, audioset_file
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set

@@ -13,7 +13,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.names import AUDIOSET, is_by_names
+from hearthlog.models.classifiers.network_names import AUDIOSET, is_by_names
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
 from hearthlog.models.starter import GENERAL, STARTERS, starter_file, with_network

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from hearthlog.models.classes import OF_EVERY_SCENARIO, class_name
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.classifiers.names import is_by_names, without_classes
+from hearthlog.models.classifiers.network_names import is_by_names, without_classes
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set

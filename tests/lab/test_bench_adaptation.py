@@ -4,8 +4,8 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
-from hearthlog.analyzer.gate.recent_time import recent_logs
 from hearthlog.analyzer.marks.marks import read_marks
+from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary

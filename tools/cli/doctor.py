@@ -104,7 +104,7 @@ def _write_bundle(bundle: Path, folder: Path) -> None:
 def _examine_live(
     folder: Path, ping_url: str | None, ping_file: Path | None, *, as_json: bool
 ) -> None:
-    from hearthlog.analyzer.network import is_ping_address, ping, read_ping_address
+    from hearthlog.analyzer.http import is_ping_address, ping, read_ping_address
     from hearthlog.analyzer.recorder_status import examine_live
 
     if ping_url is not None and not is_ping_address(ping_url):

@@ -335,7 +335,7 @@ def rollback(folder: _Folder = None) -> None:
 
 def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) -> None:
     """Raise ModelError if a model was judged harmful; judge a model without a verdict first."""
-    from hearthlog.analyzer.gate.promotion_check import judge, judged_against
+    from hearthlog.analyzer.promotion.promotion_check import judge, judged_against
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import first_starter, insist, is_starter, load
     from hearthlog.models.starter import BY_FEATURES, with_network
@@ -400,7 +400,7 @@ def _check_against_champion(folder: Path, name: str) -> None:
 
 
 def _compare_live(logs: Path, *, as_json: bool) -> None:
-    from hearthlog.analyzer.gate.comparison import compare_on_trial
+    from hearthlog.analyzer.promotion.comparison import compare_on_trial
     from hearthlog.tools.cli.promotion import print_trial, trial_as_json
 
     trial = compare_on_trial([logs])
@@ -471,9 +471,9 @@ def _shares_of_segments(comparison: "Comparison") -> list["_ClassShare"]:
 
 def _minutes_in_logs(a: "Model", b: "Model", logs: Path) -> list["_ClassShare"]:
     """Return the minutes per average day of each model and class, from recent logs."""
-    from hearthlog.analyzer.gate.comparison import gather_evidence
-    from hearthlog.analyzer.gate.paired_labels import time_words
-    from hearthlog.analyzer.gate.recent_time import recent_logs
+    from hearthlog.analyzer.promotion.comparison import gather_evidence
+    from hearthlog.analyzer.promotion.paired_labels import time_words
+    from hearthlog.analyzer.promotion.recent_time import recent_logs
     from hearthlog.tools.cli.terminal import share_done
 
     with share_done("listening to the logs with both") as report:

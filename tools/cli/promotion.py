@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hearthlog.analyzer.gate.comparison import Trial, gain_interval
-from hearthlog.analyzer.gate.paired_labels import time_words
+from hearthlog.analyzer.promotion.comparison import Trial, gain_interval
+from hearthlog.analyzer.promotion.paired_labels import time_words
 from hearthlog.schemas.errors import printable
 from hearthlog.tools.cli.terminal import print_notice, print_table
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.gate.comparison import HomeComparison, PairedAccuracy
-    from hearthlog.analyzer.gate.paired_labels import LabelChanges
-    from hearthlog.analyzer.gate.promotion_check import Verdict
+    from hearthlog.analyzer.promotion.comparison import HomeComparison, PairedAccuracy
+    from hearthlog.analyzer.promotion.paired_labels import LabelChanges
+    from hearthlog.analyzer.promotion.promotion_check import Verdict
     from hearthlog.models.modelfile.registry import Judgement
 
 
@@ -22,7 +22,7 @@ _SHOWN = 8  # changes listed
 
 def print_changes(changes: "LabelChanges", before: str, after: str) -> None:
     """Print the longest changes, and the minutes of each class."""
-    from hearthlog.analyzer.gate.paired_labels import time_words
+    from hearthlog.analyzer.promotion.paired_labels import time_words
 
     for change in changes.pairs()[:_SHOWN]:
         print(f"  {change}")
@@ -71,7 +71,7 @@ def refusal(judgement: "Judgement", name: str) -> str:
 
 
 def _print_changes(evidence: "HomeComparison", model: str, champion: str) -> None:
-    from hearthlog.analyzer.gate.paired_labels import time_words
+    from hearthlog.analyzer.promotion.paired_labels import time_words
 
     changes = evidence.changes
     much, end = ("", ":") if changes.pairs() else (f" less than half a minute{changes.each}", "")

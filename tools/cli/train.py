@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections import Counter
 
     from hearthlog.analyzer.collections.manifest_writer import ManifestSummary
-    from hearthlog.analyzer.gate.promotion_check import Verdict
+    from hearthlog.analyzer.promotion.promotion_check import Verdict
     from hearthlog.analyzer.training.dataset import Dataset
     from hearthlog.analyzer.training.manifest import SkippedClip
     from hearthlog.analyzer.training.method import Method
@@ -181,7 +181,7 @@ def _print_json(
 
 
 def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
-    from hearthlog.analyzer.gate.promotion_check import judge
+    from hearthlog.analyzer.promotion.promotion_check import judge
     from hearthlog.models.errors import ModelError
 
     try:

@@ -38,7 +38,7 @@ def show_in_foxglove(
         publish_live,
     )
     from hearthlog.analyzer.foxglove.server import PORT, Admission, serve
-    from hearthlog.analyzer.network import HOST, listen
+    from hearthlog.analyzer.http import HOST, listen
     from hearthlog.schemas.logs.files import find_logs
 
     address = _checked_address(bind or HOST)
@@ -228,7 +228,7 @@ def _show_in_rerun(
 
 
 def _server(port: int | None, bind: str | None, minutes: int, *, web: bool) -> "LiveServer":
-    from hearthlog.analyzer.network import free_port, hidden_address
+    from hearthlog.analyzer.http import free_port, hidden_address
     from hearthlog.analyzer.review.viewer.recording import PORT, LiveServer
 
     if bind is not None:

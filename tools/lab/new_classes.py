@@ -18,11 +18,11 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.gate.promotion_check import judge
-from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
+from hearthlog.analyzer.promotion.promotion_check import judge
+from hearthlog.analyzer.promotion.recent_time import RecentLog, recent_logs
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest, scenario_of

@@ -18,7 +18,7 @@ from hearthlog.analyzer.bridge.home import source_microphone, source_name
 from hearthlog.analyzer.report.values import FEWEST as FEWEST_USUAL
 from hearthlog.analyzer.routine.day_anomaly import FEWEST as FEWEST_ROUTINE
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
-from hearthlog.models.classifiers.names import AUDIOSET
+from hearthlog.models.classifiers.network_names import AUDIOSET
 from hearthlog.models.embedding.sound_names import audioset_names
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model, starter_for

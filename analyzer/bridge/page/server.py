@@ -17,7 +17,7 @@ from time import monotonic
 from typing import NamedTuple, cast
 
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.network import (
+from hearthlog.analyzer.http import (
     SECONDS,
     HttpHandler,
     HttpServer,

@@ -16,7 +16,7 @@ from typing import Self
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.extras import missing
-from hearthlog.analyzer.network import free_port, hidden_address
+from hearthlog.analyzer.http import free_port, hidden_address
 
 _WAIT_SECONDS = 60
 _STOP_SECONDS = 5

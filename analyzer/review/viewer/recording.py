@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.network import free_port
+from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.review.lanes import PLOTS, Checked, StateLane
 from hearthlog.analyzer.review.live_timeline import Update
 from hearthlog.analyzer.review.timeline import LogLines, Plot, Timeline, home_clock

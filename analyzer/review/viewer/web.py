@@ -12,7 +12,7 @@ from http import HTTPStatus
 from importlib.resources import files
 from typing import Any, cast
 
-from hearthlog.analyzer.network import HOST, HttpHandler, HttpServer, free_port
+from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, free_port
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
 

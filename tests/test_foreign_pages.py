@@ -15,7 +15,7 @@ from homelife import at, write_day
 from shortsounds import DAY
 from viewers import browsing, display, free_port, patiently, reviewing
 
-from hearthlog.analyzer.network import HOST
+from hearthlog.analyzer.http import HOST
 
 __all__ = ["display"]  # fixture
 

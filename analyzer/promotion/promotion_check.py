@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.gate.comparison import (
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.promotion.comparison import (
     HomeComparison,
     PairedAccuracy,
     gather_evidence,
     right_at_random,
 )
-from hearthlog.analyzer.gate.paired_labels import class_words, time_words
-from hearthlog.analyzer.gate.recent_time import RecentLog, recent_logs
-from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.promotion.paired_labels import class_words, time_words
+from hearthlog.analyzer.promotion.recent_time import RecentLog, recent_logs
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError

@@ -11,7 +11,9 @@ import numpy as np
 from hearthlog.analyzer.accuracy.event_counts import beta_quantile
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import compare_labellings
-from hearthlog.analyzer.gate.paired_labels import (
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
+from hearthlog.analyzer.logs.spans import Spans, rows_at
+from hearthlog.analyzer.promotion.paired_labels import (
     KnownSounds,
     LabelChanges,
     PairedFrames,
@@ -24,7 +26,7 @@ from hearthlog.analyzer.gate.paired_labels import (
     reference_sounds,
     unlearned_sample,
 )
-from hearthlog.analyzer.gate.recent_time import (
+from hearthlog.analyzer.promotion.recent_time import (
     LogSpan,
     RecentLog,
     ReferenceSound,
@@ -33,8 +35,6 @@ from hearthlog.analyzer.gate.recent_time import (
     reference,
     spans_of,
 )
-from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
-from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Bool, Float64

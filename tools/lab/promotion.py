@@ -1,4 +1,4 @@
-"""`python -m hearthlog.tools.lab.gate HOME --model FILE`: which models a home lets speak.
+"""`python -m hearthlog.tools.lab.promotion HOME --model FILE`: which models a home lets speak.
 
 Of a composed home (`python -m hearthlog.tools.lab.home`, labelled by the model) the first day is
 learned from; minutes of the others are drawn at random and reviewed, all of it as it is true.
@@ -18,18 +18,18 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.gate.paired_labels import TwoModels, joined_frames
-from hearthlog.analyzer.gate.promotion_check import Verdict, judge
-from hearthlog.analyzer.gate.recent_time import (
+from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
+from hearthlog.analyzer.logs.spans import NONE, Spans, one, overlay, pieces, rows_at
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.promotion.paired_labels import TwoModels, joined_frames
+from hearthlog.analyzer.promotion.promotion_check import Verdict, judge
+from hearthlog.analyzer.promotion.recent_time import (
     RecentLog,
     choose,
     recent_logs,
     sounding_time,
     unlearned_time,
 )
-from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
-from hearthlog.analyzer.logs.spans import NONE, Spans, one, overlay, pieces, rows_at
-from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN

@@ -16,7 +16,10 @@ from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import compare_labellings
-from hearthlog.analyzer.gate.comparison import (
+from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
+from hearthlog.analyzer.logs.spans import Spans, common
+from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.promotion.comparison import (
     HomeComparison,
     PairedAccuracy,
     _outcomes,
@@ -24,15 +27,20 @@ from hearthlog.analyzer.gate.comparison import (
     _taught,
     gather_evidence,
 )
-from hearthlog.analyzer.gate.paired_labels import (
+from hearthlog.analyzer.promotion.paired_labels import (
     LabelChanges,
     PairedFrames,
     TwoModels,
     changes_of_frames,
     changes_of_labellings,
 )
-from hearthlog.analyzer.gate.promotion_check import Verdict, clearly_better, damages, find_champion
-from hearthlog.analyzer.gate.recent_time import (
+from hearthlog.analyzer.promotion.promotion_check import (
+    Verdict,
+    clearly_better,
+    damages,
+    find_champion,
+)
+from hearthlog.analyzer.promotion.recent_time import (
     LogSpan,
     RecentLog,
     ReferenceSound,
@@ -41,9 +49,6 @@ from hearthlog.analyzer.gate.recent_time import (
     recent_logs,
     sample,
 )
-from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
-from hearthlog.analyzer.logs.spans import Spans, common
-from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.review_list import ReviewSpan, read_list
 from hearthlog.analyzer.review.session import queue_spans, review_items
 from hearthlog.models.classifiers.model import Amount, Description

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from logs import features, read
 from spliced import run
 from test_capture import wait_for_frames
-from test_swap import wait_for
+from test_model_changes import wait_for
 
 from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.recorder.errors import ConfigurationError

@@ -8,7 +8,9 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events, LabellingDifference
-from hearthlog.analyzer.gate.recent_time import (
+from hearthlog.analyzer.logs.recorder_info import RecorderInfo
+from hearthlog.analyzer.logs.spans import Spans, joined
+from hearthlog.analyzer.promotion.recent_time import (
     LogSpan,
     RecentLog,
     ReferenceSound,
@@ -21,8 +23,6 @@ from hearthlog.analyzer.gate.recent_time import (
     spans_of,
     unlearned_time,
 )
-from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-from hearthlog.analyzer.logs.spans import Spans, joined
 from hearthlog.analyzer.relabel.stream_labeller import infos_for_model, label_span
 from hearthlog.models.classes import SILENCE, find_class, translation
 from hearthlog.models.classifiers.classifier import Classifier
