@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.event_counts import events_of
+from hearthlog.analyzer.activity.event_counts import events_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns

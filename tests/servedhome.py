@@ -12,10 +12,10 @@ from livehome import LiveHome, midday_zone
 from viewers import free_port, patiently
 
 from hearthlog.analyzer.bridge.bridge import Bridge
-from hearthlog.analyzer.bridge.home import RecorderAddress, today
 from hearthlog.analyzer.bridge.page import server
 from hearthlog.analyzer.bridge.page.home_page import HomePage
-from hearthlog.analyzer.bridge.settings import PageSettings
+from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
+from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.schemas.logs.files import find_logs
 

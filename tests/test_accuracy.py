@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from scipy.special import betaincinv
 from spliced import run
 
-from hearthlog.analyzer.accuracy.checked_minutes import ClassCheck, read_checked_minutes
-from hearthlog.analyzer.accuracy.event_counts import (
+from hearthlog.analyzer.activity.checked_minutes import ClassCheck, read_checked_minutes
+from hearthlog.analyzer.activity.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.activity.event_counts import (
     FEWEST,
     MINUTE,
     beta_quantile,
@@ -24,13 +25,12 @@ from hearthlog.analyzer.accuracy.event_counts import (
     strata_of,
     television_minutes,
 )
+from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion.recent_time import reference
-from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
-from hearthlog.analyzer.report.read_home import read_home
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.review.lanes import class_precision
 from hearthlog.analyzer.review.timeline_reader import read_timeline

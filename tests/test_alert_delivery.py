@@ -27,9 +27,8 @@ from hearthlog.analyzer.bridge.alerts.delivery import (
 )
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
 from hearthlog.analyzer.bridge.alerts.rules import Notification
-from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.settings import DeliverySettings
+from hearthlog.analyzer.bridge.settings import DeliverySettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import page_token
 from hearthlog.analyzer.http import free_port
 

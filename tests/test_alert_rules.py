@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from livehome import rule
 from pydantic import TypeAdapter, ValidationError
 
-from hearthlog.analyzer.bridge.alerts.activity import SegmentCollector, read_activity
+from hearthlog.analyzer.activity.events import LONGEST_PAUSE
+from hearthlog.analyzer.activity.segments import SegmentCollector, read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import (
     end_of_quiet,
     home_sound,
@@ -21,7 +22,6 @@ from hearthlog.analyzer.bridge.alerts.evaluation import (
 )
 from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class
 from hearthlog.analyzer.bridge.alerts.rules import (
-    LONGEST_PAUSE,
     AlertRules,
     RuleState,
     duration_words,

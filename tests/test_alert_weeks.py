@@ -9,8 +9,7 @@ from livehome import MINUTE, LiveHome, following, rule
 
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressStore
 from hearthlog.analyzer.bridge.alerts.rules import RuleState
-from hearthlog.analyzer.bridge.home import RecorderAddress
-from hearthlog.analyzer.bridge.settings import DeliverySettings
+from hearthlog.analyzer.bridge.settings import DeliverySettings, RecorderAddress
 from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path

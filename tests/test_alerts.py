@@ -19,19 +19,14 @@ from livehome import following, rule
 from spliced import run
 from waiting import wait_for
 
-from hearthlog.analyzer.bridge.alerts.activity import (
-    LiveActivity,
-    LiveLabel,
-    SegmentCollector,
-    read_activity,
-)
+from hearthlog.analyzer.activity.live import LiveActivity, LiveLabel
+from hearthlog.analyzer.activity.segments import SegmentCollector, read_activity
 from hearthlog.analyzer.bridge.alerts.delivery import Outbox
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressStore, RuleWatch
 from hearthlog.analyzer.bridge.alerts.rules import Notification, RuleState
-from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.settings import DeliverySettings
+from hearthlog.analyzer.bridge.settings import DeliverySettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, state_folder
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.auros21 import FEATURE_NAMES

@@ -9,11 +9,11 @@ from datetime import UTC
 import pytest
 
 from hearthlog.analyzer.bridge.bridge import ProblemReporter, open_outputs, output_problems
-from hearthlog.analyzer.bridge.home import RecorderAddress, today
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.settings import BridgeSettings
+from hearthlog.analyzer.bridge.settings import BridgeSettings, RecorderAddress
 from hearthlog.analyzer.http import free_port, listen
+from hearthlog.analyzer.logs.local_time import today
 from hearthlog.schemas.frames import NANOSECONDS
 
 pytestmark = pytest.mark.fast

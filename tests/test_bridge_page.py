@@ -20,10 +20,9 @@ from servedhome import JSON, PALE_TEXTS, Phone, pages, proxying, serving
 from viewers import address_of, browsing, free_port, patiently
 
 from hearthlog.analyzer import http
+from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.bridge import open_outputs
 from hearthlog.analyzer.bridge.commands import REVIEWER, EventCorrections, class_of
-from hearthlog.analyzer.bridge.events import SoundEvent
-from hearthlog.analyzer.bridge.home import RecorderAddress, length, today, when
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page import server
@@ -34,9 +33,11 @@ from hearthlog.analyzer.bridge.page.home_page import (
     health_list,
 )
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
-from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings
+from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.wording import length, when
 from hearthlog.analyzer.http import HttpServer
+from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS

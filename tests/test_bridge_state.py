@@ -9,16 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hearthlog.analyzer.accuracy.event_counts import events_of
+from hearthlog.analyzer.activity.event_counts import events_of
+from hearthlog.analyzer.activity.events import ANY_SOUND, ActiveClasses, EventRecord
 from hearthlog.analyzer.bridge.bridge import ProblemReporter
-from hearthlog.analyzer.bridge.events import ANY_SOUND, ActiveClasses, EventRecord
-from hearthlog.analyzer.bridge.home import iso_time, today
 from hearthlog.analyzer.bridge.home_state import Health, HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.topics import Place, Topics, identifier
 from hearthlog.analyzer.bridge.output import Total, Totals
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.wording import iso_time
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.local_time import today
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns

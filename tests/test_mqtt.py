@@ -15,12 +15,11 @@ from killed_bridge import ZONE, kill_at_random, start_recorder
 from livehome import LiveHome, following, midday_zone
 from paho.mqtt.client import MQTTMessage
 
-from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.mqtt import publisher
 from hearthlog.analyzer.bridge.mqtt.home_assistant import described, device_id, discovery
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics, Topics
-from hearthlog.analyzer.bridge.settings import MqttSettings
+from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.pause_schedule import paused_until

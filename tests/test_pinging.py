@@ -12,11 +12,11 @@ from pydantic import ValidationError
 
 from hearthlog.analyzer import http
 from hearthlog.analyzer.bridge.bridge import PingOutput
-from hearthlog.analyzer.bridge.home import today
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import PingSettings
 from hearthlog.analyzer.http import free_port
+from hearthlog.analyzer.logs.local_time import today
 from hearthlog.schemas.errors import HearthlogError
 
 pytestmark = pytest.mark.fast

@@ -14,9 +14,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from hearthlog.analyzer import http
 from hearthlog.analyzer.bridge import home_state, prometheus
-from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
-from hearthlog.analyzer.bridge.settings import PrometheusSettings
+from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.http import free_port, listen
 from hearthlog.schemas.frames import NANOSECONDS

@@ -17,18 +17,10 @@ from logs import read
 from PIL import Image
 from spliced import run
 
-from hearthlog.analyzer.accuracy.event_counts import Strata, checked_rates
-from hearthlog.analyzer.colours import colour
-from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
-from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
-from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.relabel.layer import layer_topics
-from hearthlog.analyzer.report.daily_metrics import day_of, whole_home
-from hearthlog.analyzer.report.read_home import read_home
-from hearthlog.analyzer.report.report import Period, make_report
-from hearthlog.analyzer.report.values import (
+from hearthlog.analyzer.activity.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.activity.event_counts import Strata, checked_rates
+from hearthlog.analyzer.activity.home_data import read_home
+from hearthlog.analyzer.activity.values import (
     FEWEST,
     Clock,
     Count,
@@ -37,6 +29,14 @@ from hearthlog.analyzer.report.values import (
     exactly,
     usual_range,
 )
+from hearthlog.analyzer.colours import colour
+from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
+from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
+from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.relabel.layer import layer_topics
+from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages.message_types import nanoseconds

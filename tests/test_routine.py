@@ -14,23 +14,15 @@ from hypothesis.extra import numpy as arrays
 from livehome import rule
 from pydantic import ValidationError
 
-from hearthlog.analyzer.bridge.alerts.activity import read_activity
-from hearthlog.analyzer.bridge.alerts.evaluation import notifications
-from hearthlog.analyzer.bridge.alerts.rules import history
-from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import joined, one, without
-from hearthlog.analyzer.report.report import Period, make_report
-from hearthlog.analyzer.report.wording import difference_text, judgement_text
-from hearthlog.analyzer.routine import day_anomaly as usual
-from hearthlog.analyzer.routine.day_anomaly import (
+from hearthlog.analyzer.activity import day_anomaly as usual
+from hearthlog.analyzer.activity.day_anomaly import (
     FEWEST,
     Routines,
     compare,
     fit_baseline,
     regular_hours,
 )
-from hearthlog.analyzer.routine.day_profile import (
+from hearthlog.analyzer.activity.day_profile import (
     COUNT,
     FIRST,
     LAST,
@@ -39,6 +31,14 @@ from hearthlog.analyzer.routine.day_profile import (
     HomeSegments,
     Profiles,
 )
+from hearthlog.analyzer.activity.segments import read_activity
+from hearthlog.analyzer.bridge.alerts.evaluation import notifications
+from hearthlog.analyzer.bridge.alerts.rules import history
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.spans import joined, one, without
+from hearthlog.analyzer.report.report import Period, make_report
+from hearthlog.analyzer.report.wording import difference_text, judgement_text
 from hearthlog.schemas.frames import NANOSECONDS
 
 MONDAY = date(2026, 2, 2)

@@ -23,22 +23,20 @@ from prometheus_client.parser import text_string_to_metric_families
 from spliced import run
 from test_model_changes import MICROPHONE, block, wait_for
 
-from hearthlog.analyzer.bridge.alerts.activity import (
-    FIELDS,
-    LiveActivity,
-    is_of_alerts,
-    read_activity,
-)
-from hearthlog.analyzer.bridge.home import RecorderAddress, times, today
-from hearthlog.analyzer.bridge.home_state import HomeState, is_of_bridge
+from hearthlog.analyzer.activity.live import FIELDS, LiveActivity, is_of_alerts
+from hearthlog.analyzer.activity.segments import read_activity
+from hearthlog.analyzer.activity.sources import is_of_activity
+from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.mqtt.home_assistant import discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.home_page import scenario_lines
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
-from hearthlog.analyzer.bridge.settings import PrometheusSettings
+from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
+from hearthlog.analyzer.bridge.wording import times
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
+from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.review.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.classifiers.classifier import Classifier
@@ -527,8 +525,8 @@ def test_a_report_has_a_section_for_a_scenario_and_is_the_same_without_it(
 
 
 def test_what_a_bridge_tells_of_a_scenario_is_apart_from_its_microphone(log):
-    assert all(map(is_of_bridge, [*OF_WATER, "/mic/gap", "/mic/label"]))
-    assert not any(map(is_of_bridge, ["/mic/candidate/label", "/mic/scenario/water/gap"]))
+    assert all(map(is_of_activity, [*OF_WATER, "/mic/gap", "/mic/label"]))
+    assert not any(map(is_of_activity, ["/mic/candidate/label", "/mic/scenario/water/gap"]))
     columns = read_columns([log], [*OF_WATER, "/mic/label", "/mic/segment"])
     state, without = HomeState(), HomeState()
     begun = state.push(list(columns.values()))

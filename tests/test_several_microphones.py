@@ -10,7 +10,7 @@ from kept import keep_models
 from spliced import run
 from together import record_together
 
-from hearthlog.analyzer.accuracy.checked_minutes import read_reviewed_labels
+from hearthlog.analyzer.activity.checked_minutes import read_reviewed_labels
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.recorder_info import model_of

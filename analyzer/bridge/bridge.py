@@ -13,8 +13,7 @@ from threading import Event as Flag
 from threading import Lock, Thread
 from typing import Any
 
-from hearthlog.analyzer.bridge.events import SoundEvent
-from hearthlog.analyzer.bridge.home import RecorderAddress, today
+from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, follow_home
 from hearthlog.analyzer.bridge.output import RECENT, TOTALS, News, Output, kept_until
 from hearthlog.analyzer.bridge.settings import (
@@ -23,6 +22,7 @@ from hearthlog.analyzer.bridge.settings import (
     MqttSettings,
     PageSettings,
     PingSettings,
+    RecorderAddress,
 )
 from hearthlog.analyzer.bridge.state import (
     BridgeError,
@@ -33,6 +33,7 @@ from hearthlog.analyzer.bridge.state import (
 )
 from hearthlog.analyzer.extras import missing, remedy
 from hearthlog.analyzer.http import has_password, ip_of, listen, ping, read_ping_address
+from hearthlog.analyzer.logs.local_time import today
 from hearthlog.recorder.host import give_back, keep_one_heap, notify
 from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError

@@ -13,9 +13,9 @@ from typing import Annotated, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from hearthlog.analyzer.bridge.events import SoundEvent
-from hearthlog.analyzer.bridge.home import class_words
+from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.wording import class_words
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.models.classes import CLASS_NAME, CLASSES, SILENCE, class_name
 from hearthlog.recorder import pause_schedule

@@ -11,8 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.bridge.events import ActiveClasses, EventRecord, SoundEvent
-from hearthlog.analyzer.bridge.home import RecorderAddress, Today, is_of_scenario, labelling_source
+from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, SoundEvent
+from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
+from hearthlog.analyzer.bridge.settings import RecorderAddress
+from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE
 from hearthlog.schemas.errors import LogError
@@ -25,7 +27,7 @@ from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, LIVE, TopicName, is_scenario, parse_topic
+from hearthlog.schemas.messages.topics import DIAGNOSTICS, TopicName, parse_topic
 
 FIELDS = {
     message_types.LABEL: ("label", "confidence"),
@@ -323,17 +325,6 @@ _WAIT_SECONDS = 1.0
 _TICK_SECONDS = 0.5
 
 
-def is_of_bridge(topic: str) -> bool:
-    """Whether the bridge subscribes to a topic."""
-    if topic == DIAGNOSTICS:
-        return True
-    name = parse_topic(topic)
-    if name is None:
-        return False
-    kinds = {"label", "segment", "gap"} if name.labelling == LIVE else {"label", "segment"}
-    return (name.labelling == LIVE or is_scenario(name.labelling)) and name.kind in kinds
-
-
 def follow_home(
     home: RecorderAddress, start: int, stop: Flag, say: Callable[[str], None]
 ) -> Iterator[tuple[HomeState, list[SoundEvent]]]:
@@ -362,7 +353,7 @@ def follow_home(
             return
     state.caught_up = False
     messages = follow_messages(
-        folder, is_of_bridge, start, stop, lambda error: say(str(error)), ticks=True
+        folder, is_of_activity, start, stop, lambda error: say(str(error)), ticks=True
     )
     yielded, current, described = -math.inf, folder, folder
     for path, batch in messages:

@@ -8,10 +8,10 @@ from typing import NamedTuple, Protocol
 
 from pydantic import BaseModel, Field
 
-from hearthlog.analyzer.bridge.events import SoundEvent
-from hearthlog.analyzer.bridge.home import Today
+from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.state import BridgeError, StateFile
+from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import NANOSECONDS

@@ -15,13 +15,9 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from hearthlog.analyzer.bridge.home import (
-    RecorderAddress,
-    is_of_scenario,
-    source_parts,
-)
+from hearthlog.analyzer.activity.sources import is_of_scenario, source_parts
 from hearthlog.analyzer.bridge.output import TOTALS, News, Total, Totals
-from hearthlog.analyzer.bridge.settings import PrometheusSettings
+from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, figures_token
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, is_asked_in_digits
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY

@@ -3,8 +3,9 @@
 import json
 import os
 import re
+from datetime import tzinfo
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import (
     AfterValidator,
@@ -29,6 +30,15 @@ from hearthlog.recorder.config import (
 from hearthlog.recorder.config_problems import Origins, configuration_error, key_lines
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.files import read_toml
+
+
+class RecorderAddress(NamedTuple):
+    """The recorder that a bridge follows: log folder, node name and time zone."""
+
+    folder: Path
+    node: str
+    zone: tzinfo
+
 
 NO_RECIPIENT = (
     "bridge.alert: alerts have no target; set urls_file in [bridge.delivery], or a broker in "

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from datetime import UTC, date, datetime, timedelta, tzinfo
+from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.recorder.pause_schedule import DEFAULT, time_zone
@@ -79,3 +80,28 @@ def local_time(nanoseconds: int, zone: tzinfo) -> datetime:
         In `zone`, without fractions of a second.
     """
     return datetime.fromtimestamp(nanoseconds // NANOSECONDS, UTC).astimezone(zone)
+
+
+class Today(NamedTuple):
+    """The current local day and the last night, in nanoseconds of UTC.
+
+    Attributes
+    ----------
+    midnight : int
+        Start of the day.
+    night, morning : int
+        Start of the last night, at 22:00 of this day or the day before, and its end at 7:00.
+    """
+
+    now: int
+    midnight: int
+    night: int
+    morning: int
+
+
+def today(now: int, zone: tzinfo) -> Today:
+    """Return the local day and the last night at a time, in nanoseconds of UTC."""
+    day = local_time(now, zone).date()
+    last = day if at_hour(day, EVENING, zone) <= now else day - timedelta(days=1)
+    night = at_hour(last, EVENING, zone), at_hour(last + timedelta(days=1), MORNING, zone)
+    return Today(now, midnight(day, zone), *night)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.event_counts import beta_quantile
+from hearthlog.analyzer.activity.event_counts import beta_quantile
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified

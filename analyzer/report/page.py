@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import jinja2
 
+from hearthlog.analyzer.activity.daily_metrics import MOST, DayMetrics
+from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
 from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.analyzer.report.daily_metrics import MOST, DayMetrics
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
     ASSESSED_ITEMS,
@@ -29,7 +30,6 @@ from hearthlog.analyzer.report.summary_text import (
     percent,
     plain,
 )
-from hearthlog.analyzer.report.values import BASELINE_DAYS, Count, Duration, Value
 from hearthlog.analyzer.report.wording import (
     clock_text,
     date_in_words,

@@ -6,26 +6,26 @@ from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.accuracy.checked_minutes import read_checked_minutes
-from hearthlog.analyzer.logs.home_logs import HomeLogs, check_day, network_changes
-from hearthlog.analyzer.logs.layers import latest_records
-from hearthlog.analyzer.logs.local_time import day_span, midnight
-from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import common, joined, one
-from hearthlog.analyzer.report.daily_metrics import HOUR, day_of, home_sound, whole_home
-from hearthlog.analyzer.report.page import day_page, week_page
-from hearthlog.analyzer.report.read_home import (
+from hearthlog.analyzer.activity.checked_minutes import read_checked_minutes
+from hearthlog.analyzer.activity.daily_metrics import HOUR, day_of, home_sound, whole_home
+from hearthlog.analyzer.activity.day_anomaly import Routines
+from hearthlog.analyzer.activity.day_profile import Profiles
+from hearthlog.analyzer.activity.home_data import (
     HomeData,
     ScenarioMinutes,
     read_home,
     read_scenario_minutes,
 )
+from hearthlog.analyzer.activity.values import BASELINE_DAYS
+from hearthlog.analyzer.logs.home_logs import HomeLogs, check_day, network_changes
+from hearthlog.analyzer.logs.layers import latest_records
+from hearthlog.analyzer.logs.local_time import day_span, midnight
+from hearthlog.analyzer.logs.recorder_info import Trouble
+from hearthlog.analyzer.logs.spans import common, joined, one
+from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.timeline_plot import save_day, save_week
-from hearthlog.analyzer.report.values import BASELINE_DAYS
-from hearthlog.analyzer.routine.day_anomaly import Routines
-from hearthlog.analyzer.routine.day_profile import Profiles
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.new_files import check_new, new_file

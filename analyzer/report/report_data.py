@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from datetime import date, tzinfo
 from typing import NamedTuple
 
-from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.accuracy.event_counts import FEWEST as FEWEST_CHECKED
-from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.report.daily_metrics import DayMetrics
-from hearthlog.analyzer.report.read_home import ScenarioMinutes
-from hearthlog.analyzer.report.values import (
+from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
+from hearthlog.analyzer.activity.daily_metrics import DayMetrics
+from hearthlog.analyzer.activity.day_anomaly import DayAnomaly
+from hearthlog.analyzer.activity.event_counts import FEWEST as FEWEST_CHECKED
+from hearthlog.analyzer.activity.home_data import ScenarioMinutes
+from hearthlog.analyzer.activity.values import (
     BASELINE_DAYS,
     FEWEST,
     Clock,
@@ -21,8 +21,8 @@ from hearthlog.analyzer.report.values import (
     compared,
     usual_range,
 )
+from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.report.wording import several_in_words
-from hearthlog.analyzer.routine.day_anomaly import DayAnomaly
 from hearthlog.models.classes import (
     COUGHING,
     CRYING,

@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
+from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
+from hearthlog.analyzer.activity.day_anomaly import FEWEST
+from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import joined, without
-from hearthlog.analyzer.report.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.report.report_data import Account
-from hearthlog.analyzer.report.values import Duration
 from hearthlog.analyzer.report.wording import (
     WEEK,
     clock_text,
@@ -18,7 +19,6 @@ from hearthlog.analyzer.report.wording import (
     short_day,
     too_few_text,
 )
-from hearthlog.analyzer.routine.day_anomaly import FEWEST
 from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SILENCE, in_words
 from hearthlog.schemas.errors import listed
 

@@ -9,11 +9,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics
+from hearthlog.analyzer.activity.values import Duration, UsualRange, usual_range
 from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
 from hearthlog.analyzer.logs.spans import Spans, lengths, without
-from hearthlog.analyzer.report.daily_metrics import HOUR, DayMetrics
-from hearthlog.analyzer.report.values import Duration, UsualRange, usual_range
 from hearthlog.analyzer.report.wording import short_day
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.schemas.arrays import Int64

@@ -5,10 +5,8 @@ from datetime import date, tzinfo
 
 import numpy as np
 
-from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.report.values import Clock, Count, Duration, whole
-from hearthlog.analyzer.routine.day_anomaly import FEWEST, LONGEST, DayAnomaly, FigureDifference
-from hearthlog.analyzer.routine.day_profile import (
+from hearthlog.analyzer.activity.day_anomaly import FEWEST, LONGEST, DayAnomaly, FigureDifference
+from hearthlog.analyzer.activity.day_profile import (
     CLOCK,
     COUNT,
     FIRST,
@@ -18,6 +16,8 @@ from hearthlog.analyzer.routine.day_profile import (
     STRETCHES,
     DayFigure,
 )
+from hearthlog.analyzer.activity.values import Clock, Count, Duration, whole
+from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import find_class, in_words
 from hearthlog.schemas.arrays import Int64
 

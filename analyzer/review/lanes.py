@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.accuracy.checked_minutes import (
+from hearthlog.analyzer.activity.checked_minutes import (
     ClassCheck,
     checked_minutes,
     read_reviewed_labels,

@@ -54,8 +54,11 @@ def bridge(
         needed_modules,
         open_outputs,
     )
-    from hearthlog.analyzer.bridge.home import RecorderAddress
-    from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
+    from hearthlog.analyzer.bridge.settings import (
+        RecorderAddress,
+        configured_microphones,
+        load_bridge_settings,
+    )
     from hearthlog.analyzer.bridge.state import state_folder
     from hearthlog.analyzer.extras import require
     from hearthlog.recorder.config import exposed_passwords
@@ -120,11 +123,11 @@ def replay(
 
     Exit status 3: a log is damaged or unfinished; its readable part was used.
     """
-    from hearthlog.analyzer.bridge.alerts.activity import read_activity
+    from hearthlog.analyzer.activity.segments import read_activity
+    from hearthlog.analyzer.activity.sources import source_microphone
     from hearthlog.analyzer.bridge.alerts.evaluation import notifications
     from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class, unknown_microphone
     from hearthlog.analyzer.bridge.alerts.rules import history
-    from hearthlog.analyzer.bridge.home import source_microphone
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
@@ -157,7 +160,7 @@ def replay(
 
 
 def _check_node(home: "HomeLogs", node: str) -> None:
-    from hearthlog.analyzer.bridge.alerts.activity import nodes_of
+    from hearthlog.analyzer.activity.segments import nodes_of
     from hearthlog.analyzer.errors import DataError
     from hearthlog.schemas.errors import listed
 
@@ -169,7 +172,7 @@ def _check_node(home: "HomeLogs", node: str) -> None:
 
 def _span(home: "HomeLogs", node: str, first: int | None, last: int | None) -> tuple[int, int]:
     """Return the requested span, clipped to the logs."""
-    from hearthlog.analyzer.bridge.alerts.activity import span_of
+    from hearthlog.analyzer.activity.segments import span_of
 
     begin, until = span_of(home, node)
     first = begin if first is None else first
@@ -235,7 +238,7 @@ def _unknown(notifications: "Sequence[Notification]") -> int:
 def _as_json(
     found: "dict[str, list[Notification]]", span: tuple[int, int], zone: tzinfo
 ) -> dict[str, Any]:
-    from hearthlog.analyzer.bridge.home import iso_time
+    from hearthlog.analyzer.bridge.wording import iso_time
 
     return {
         "start": iso_time(span[0], zone),

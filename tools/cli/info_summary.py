@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from hearthlog.analyzer.accuracy.checked_minutes import (
+from hearthlog.analyzer.activity.checked_minutes import (
     CheckedMinutes,
     ClassCheck,
     checked_minutes,
@@ -13,7 +13,7 @@ from hearthlog.analyzer.accuracy.checked_minutes import (
     quiet_weight,
     read_reviewed_labels,
 )
-from hearthlog.analyzer.accuracy.event_counts import FEWEST, SET_APART
+from hearthlog.analyzer.activity.event_counts import FEWEST, SET_APART
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.summary import LogSummary
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, in_words

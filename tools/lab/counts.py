@@ -13,8 +13,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.accuracy.event_counts import (
+from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
+from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
     SET_APART,
     events_by_minute,

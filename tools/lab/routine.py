@@ -13,7 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import typer
 
-from hearthlog.analyzer.routine.day_anomaly import (
+from hearthlog.analyzer.activity.day_anomaly import (
     DAYS,
     FEWEST,
     SPAN,
@@ -22,7 +22,7 @@ from hearthlog.analyzer.routine.day_anomaly import (
     judge,
     rarity,
 )
-from hearthlog.analyzer.routine.day_profile import DayProfile, Profiles
+from hearthlog.analyzer.activity.day_profile import DayProfile, Profiles
 from hearthlog.schemas.arrays import Float64
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.lab.command import run

@@ -11,9 +11,9 @@ from functools import partial
 
 import numpy as np
 
+from hearthlog.analyzer.activity.day_profile import HomeSegments
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import Spans, joined, without
-from hearthlog.analyzer.routine.day_profile import HomeSegments
 from hearthlog.models.classes import (
     COUGHING,
     FLUSHING_WATER,

@@ -7,7 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.bridge.alerts.activity import HomeActivity, Sounds
+from hearthlog.analyzer.activity.day_anomaly import Routines
+from hearthlog.analyzer.activity.day_profile import HomeSegments, Profiles
+from hearthlog.analyzer.activity.events import ANY_SOUND
+from hearthlog.analyzer.activity.segments import HomeActivity, Sounds
+from hearthlog.analyzer.activity.sources import is_of_scenario
+from hearthlog.analyzer.activity.values import (
+    BASELINE_DAYS,
+    Count,
+    Duration,
+    UsualRange,
+    usual_range,
+)
 from hearthlog.analyzer.bridge.alerts.rules import (
     MINUTE,
     AlertRule,
@@ -25,8 +36,6 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     duration_words,
     pause_of,
 )
-from hearthlog.analyzer.bridge.events import ANY_SOUND
-from hearthlog.analyzer.bridge.home import is_of_scenario
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import (
@@ -38,10 +47,7 @@ from hearthlog.analyzer.logs.spans import (
     lengths,
     rows_at,
 )
-from hearthlog.analyzer.report.values import BASELINE_DAYS, Count, Duration, UsualRange, usual_range
 from hearthlog.analyzer.report.wording import differences_text, rarity_text, short_day
-from hearthlog.analyzer.routine.day_anomaly import Routines
-from hearthlog.analyzer.routine.day_profile import HomeSegments, Profiles
 from hearthlog.models.classes import SILENCE
 from hearthlog.recorder.pause_schedule import QuietHours
 from hearthlog.schemas.arrays import Int64

@@ -12,15 +12,8 @@ from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
-from hearthlog.analyzer.bridge.alerts.activity import (
-    FIELDS,
-    HomeActivity,
-    LiveActivity,
-    LiveLabel,
-    SegmentCollector,
-    is_of_alerts,
-    read_activity,
-)
+from hearthlog.analyzer.activity.live import FIELDS, LiveActivity, LiveLabel, is_of_alerts
+from hearthlog.analyzer.activity.segments import HomeActivity, SegmentCollector, read_activity
 from hearthlog.analyzer.bridge.alerts.delivery import (
     UNREAD,
     Delivery,
@@ -42,10 +35,9 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     history,
     live_history,
 )
-from hearthlog.analyzer.bridge.home import RecorderAddress
 from hearthlog.analyzer.bridge.home_state import decode_fields
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings
+from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, StateFile, secret_path
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import LogError

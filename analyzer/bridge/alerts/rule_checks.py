@@ -3,6 +3,10 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from hearthlog.analyzer.activity.day_anomaly import FEWEST as FEWEST_ROUTINE
+from hearthlog.analyzer.activity.events import ANY_SOUND
+from hearthlog.analyzer.activity.sources import source_microphone, source_name
+from hearthlog.analyzer.activity.values import FEWEST as FEWEST_USUAL
 from hearthlog.analyzer.bridge.alerts.rules import (
     MINUTE,
     AlertRule,
@@ -13,10 +17,6 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     duration_words,
     pause_of,
 )
-from hearthlog.analyzer.bridge.events import ANY_SOUND
-from hearthlog.analyzer.bridge.home import source_microphone, source_name
-from hearthlog.analyzer.report.values import FEWEST as FEWEST_USUAL
-from hearthlog.analyzer.routine.day_anomaly import FEWEST as FEWEST_ROUTINE
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.models.classifiers.network_names import AUDIOSET
 from hearthlog.models.embedding.sound_names import audioset_names

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from hearthlog.analyzer.bridge.events import ANY_SOUND
+from hearthlog.analyzer.activity.day_anomaly import LONGEST
+from hearthlog.analyzer.activity.events import ANY_SOUND, LONGEST_PAUSE
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NEVER
-from hearthlog.analyzer.routine.day_anomaly import LONGEST
 from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.recorder.pause_schedule import QuietHours, check_quiet_hours, quiet_hours
 from hearthlog.schemas.errors import HearthlogError
@@ -49,7 +49,6 @@ def duration_words(nanoseconds: int) -> str:
 
 
 _LONGEST_WINDOW = 7 * DAY
-LONGEST_PAUSE = 10 * MINUTE  # longest pause of an event that a rule may set
 _MARGIN = 5 * MINUTE
 _NIGHT_ENDS = 7 * 60
 _LONGEST_NAME = 60  # characters

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 from paho.mqtt.client import MQTTMessage
 
-from hearthlog.analyzer.bridge.events import ANY_SOUND, SoundEvent
-from hearthlog.analyzer.bridge.home import RecorderAddress, iso_time
+from hearthlog.analyzer.activity.events import ANY_SOUND, SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.connection import Connection, place_of
 from hearthlog.analyzer.bridge.mqtt.home_assistant import (
@@ -25,7 +24,8 @@ from hearthlog.analyzer.bridge.mqtt.home_assistant import (
 )
 from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, RetainedTopics, Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
-from hearthlog.analyzer.bridge.settings import MqttSettings
+from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
+from hearthlog.analyzer.bridge.wording import iso_time
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.recorder.log.folder_lock import node_locks
 from hearthlog.schemas.errors import shortened

@@ -12,7 +12,7 @@ from urllib.parse import quote, unquote
 
 from pydantic import BaseModel
 
-from hearthlog.analyzer.bridge.events import SoundEvent
+from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.state import StateFile
 from hearthlog.schemas.new_files import open_lock, private_folder
 

@@ -12,32 +12,36 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.activity.events import ANY_SOUND, HOLD_SECONDS, SoundEvent
+from hearthlog.analyzer.activity.sources import source_microphone, source_parts
 from hearthlog.analyzer.bridge.commands import EventCorrections
-from hearthlog.analyzer.bridge.events import ANY_SOUND, HOLD_SECONDS, SoundEvent
-from hearthlog.analyzer.bridge.home import (
-    RecorderAddress,
-    Today,
+from hearthlog.analyzer.bridge.home_state import HomeState, ListeningThreshold, LiveMicrophone
+from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
+from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
+from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
+from hearthlog.analyzer.bridge.state import BridgeError, cookie_key, keep_address, page_token
+from hearthlog.analyzer.bridge.wording import (
     class_words,
     clock,
     length,
     long_date,
     reason,
     room,
-    source_microphone,
-    source_parts,
     sureness,
     times,
     told,
     when,
 )
-from hearthlog.analyzer.bridge.home_state import HomeState, ListeningThreshold, LiveMicrophone
-from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
-from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
-from hearthlog.analyzer.bridge.settings import PageSettings
-from hearthlog.analyzer.bridge.state import BridgeError, cookie_key, keep_address, page_token
 from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
+from hearthlog.analyzer.logs.local_time import (
+    EVENING,
+    MORNING,
+    Today,
+    at_hour,
+    day_span,
+    local_time,
+)
 from hearthlog.analyzer.logs.spans import joined
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.recorder.host import writes_to_journal

@@ -10,8 +10,8 @@ from threading import Lock, Thread, Timer
 from typing import IO, Any, NamedTuple, cast
 
 from hearthlog.analyzer.bridge.commands import READ_ONLY, REVIEWER, class_of
-from hearthlog.analyzer.bridge.home import class_words, length, room, times, told, when
 from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.wording import class_words, length, room, times, told, when
 from hearthlog.analyzer.discover.summary import (
     SUMMARY,
     GroupsSummary,

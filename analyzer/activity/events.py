@@ -13,6 +13,7 @@ from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
+LONGEST_PAUSE = 600 * NANOSECONDS  # longest pause within an event that may be configured
 _START = attrgetter("start")
 _MOST_AGAIN = 50  # segments that a recorder may write twice after its disk was full
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.checked_minutes import labelling_of_marks
+from hearthlog.analyzer.activity.checked_minutes import labelling_of_marks
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.labelling import (

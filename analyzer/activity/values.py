@@ -8,7 +8,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.event_counts import NO_MINUTES, CheckedRates, Strata
+from hearthlog.analyzer.activity.event_counts import NO_MINUTES, CheckedRates, Strata
 
 _MIN = " min"
 

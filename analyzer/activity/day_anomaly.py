@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from hearthlog.analyzer.routine.day_profile import (
+from hearthlog.analyzer.activity.day_profile import (
     BINS,
     CLOCK,
     COUNT,

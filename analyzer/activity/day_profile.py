@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.event_counts import (
+from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
     SET_APART,
     events_of,

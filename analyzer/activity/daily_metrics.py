@@ -10,8 +10,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.accuracy.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.accuracy.event_counts import (
+from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
+from hearthlog.analyzer.activity.day_profile import HomeSegments, longest_quiet, stretches
+from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
     SET_APART,
     CheckedRates,
@@ -20,6 +21,8 @@ from hearthlog.analyzer.accuracy.event_counts import (
     strata_of,
     television_minutes,
 )
+from hearthlog.analyzer.activity.home_data import HomeData
+from hearthlog.analyzer.activity.values import Clock, Count, Duration, exactly
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import (
@@ -33,9 +36,6 @@ from hearthlog.analyzer.logs.spans import (
     rows_at,
     without,
 )
-from hearthlog.analyzer.report.read_home import HomeData
-from hearthlog.analyzer.report.values import Clock, Count, Duration, exactly
-from hearthlog.analyzer.routine.day_profile import HomeSegments, longest_quiet, stretches
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.schemas.arrays import Bool, Int64
 

@@ -1,47 +1,11 @@
 """Addresses, labelling sources, days and texts for the home that a bridge follows."""
 
 from datetime import timedelta, tzinfo
-from pathlib import Path
-from typing import NamedTuple
 
-from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, local_time, midnight
+from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import in_words
 from hearthlog.schemas.errors import printable, shortened
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.messages.topics import LIVE, SCENARIO, TopicName, is_scenario
-
-
-class RecorderAddress(NamedTuple):
-    """The recorder that a bridge follows: log folder, node name and time zone."""
-
-    folder: Path
-    node: str
-    zone: tzinfo
-
-
-class Today(NamedTuple):
-    """The current local day and the last night, in nanoseconds of UTC.
-
-    Attributes
-    ----------
-    midnight : int
-        Start of the day.
-    night, morning : int
-        Start of the last night, at 22:00 of this day or the day before, and its end at 7:00.
-    """
-
-    now: int
-    midnight: int
-    night: int
-    morning: int
-
-
-def today(now: int, zone: tzinfo) -> Today:
-    """Return the local day and the last night at a time, in nanoseconds of UTC."""
-    day = local_time(now, zone).date()
-    last = day if at_hour(day, EVENING, zone) <= now else day - timedelta(days=1)
-    night = at_hour(last, EVENING, zone), at_hour(last + timedelta(days=1), MORNING, zone)
-    return Today(now, midnight(day, zone), *night)
 
 
 def iso_time(nanoseconds: int, zone: tzinfo) -> str:
@@ -49,39 +13,6 @@ def iso_time(nanoseconds: int, zone: tzinfo) -> str:
     moment = local_time(nanoseconds, zone)
     milliseconds = nanoseconds % NANOSECONDS // 1_000_000
     return moment.replace(microsecond=1000 * milliseconds).isoformat(timespec="milliseconds")
-
-
-_BETWEEN = "-"
-
-
-def labelling_source(topic: TopicName) -> str | None:
-    """Return the labelling source of a topic; None if the topic is not labelled live."""
-    if topic.labelling == LIVE:
-        return topic.microphone
-    if is_scenario(topic.labelling):
-        return source_name(topic.microphone, topic.labelling.removeprefix(f"{SCENARIO}/"))
-    return None
-
-
-def source_name(microphone: str, scenario: str) -> str:
-    """Return the labelling source of a scenario: `<microphone>-<scenario>`."""
-    return f"{microphone}{_BETWEEN}{scenario}"
-
-
-def source_parts(source: str) -> tuple[str, str]:
-    """Return microphone and scenario of a labelling source; no scenario for the home's model."""
-    microphone, _, scenario = source.partition(_BETWEEN)
-    return microphone, scenario
-
-
-def source_microphone(source: str) -> str:
-    """Return the microphone of a labelling source."""
-    return source_parts(source)[0]
-
-
-def is_of_scenario(source: str) -> bool:
-    """Whether a labelling source is the model of a scenario."""
-    return _BETWEEN in source
 
 
 _LONGEST = 200  # characters of a text from a log

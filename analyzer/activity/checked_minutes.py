@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.accuracy.event_counts import (
+from hearthlog.analyzer.activity.event_counts import (
     AROUND,
     FEWEST,
     MINUTE,

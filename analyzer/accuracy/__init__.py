@@ -1,1 +1,0 @@
-"""Accuracy of the labels in a home, estimated from minutes drawn at random."""

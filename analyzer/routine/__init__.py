@@ -1,1 +1,0 @@
-"""Weekly routines of a home, and the anomaly of a day."""
