@@ -24,9 +24,9 @@ from hearthlog.analyzer.training.train import (
     LAG_SECONDS,
     REACH_SECONDS,
     SHORTEST_SECONDS,
+    default_transitions,
     train_model,
 )
-from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model

@@ -33,8 +33,7 @@ from hearthlog.analyzer.training.manifest import (
 )
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.svm_method import BANDS, SVM
-from hearthlog.analyzer.training.train import train_model
-from hearthlog.analyzer.training.transitions import default_transitions
+from hearthlog.analyzer.training.train import default_transitions, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError

@@ -11,7 +11,10 @@ from hypothesis import strategies as st
 from hearthlog.analyzer.colours import colour, colour_on_paper
 from hearthlog.analyzer.report.wording import several_in_words
 from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, Scenario
-from hearthlog.analyzer.training.transitions import default_transitions, expected_durations
+from hearthlog.analyzer.training.train import (
+    default_transitions,
+    expected_durations,
+)
 from hearthlog.models.classes import (
     CLASS_NAME,
     CLASSES,

@@ -34,8 +34,7 @@ from hearthlog.analyzer.training.scores import (
     score,
 )
 from hearthlog.analyzer.training.svm_method import PAPER
-from hearthlog.analyzer.training.train import train_model
-from hearthlog.analyzer.training.transitions import default_transitions
+from hearthlog.analyzer.training.train import default_transitions, train_model
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress

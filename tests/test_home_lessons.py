@@ -12,7 +12,7 @@ import pytest
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.dataset import CONFIRMED
 from hearthlog.analyzer.training.home_recordings import (
@@ -30,7 +30,6 @@ from hearthlog.analyzer.training.pseudo_labels import (
     labelled_segments,
     unreviewed_sounds,
 )
-from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.model import Description
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
@@ -162,42 +161,10 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
     assert "2 of 2 marks are not learned from" in lessons.notes[0]
 
 
-def test_what_a_person_went_through_teaches_which_class_follows_which(home, hmm_file):
-    model = load_model(hmm_file)
-    loud = [one for one in segments(home) if one[2] not in {"silence", "yelling"}]
-    marked, other = loud[:2]
-    drawn = ReviewedSpan("mic", other[0], other[1], chosen=RANDOM)
-    write(home, [(*marked[:2], "yelling")], [whole(home), drawn])
-    lessons, heard = home_lessons([home], model), sound(home)
-    classes, paths = lessons.segments.classes, lessons.paths
-    left_out = heard.inside(heard.drawn).sum()
-    assert left_out > 20
-    assert 0 <= len(heard.stamps) - left_out - sum(map(len, paths)) < 20, "the end has no label"
-    yelled = sum((path == classes.index("yelling")).sum() for path in paths)
-    labelled = sum(end - start for start, end, label in segments(home) if label == "yelling")
-    assert 50_000_000 * yelled == pytest.approx(labelled + marked[1] - marked[0], abs=SECOND)
-
-    counts = 500 * default_transitions(classes)
-    for path in paths:
-        np.add.at(counts, (path[:-1], path[1:]), 1)
-    adapted = adapt_model(model, lessons.segments, paths)
-    expected = counts / counts.sum(axis=1, keepdims=True)
-    np.testing.assert_allclose(adapted.transitions, expected, rtol=1e-8)
-    assert adapted.description.training_data.home_frames == sum(map(len, paths))
-    unlearned = adapt_model(adapted, lessons.segments)
-    np.testing.assert_array_equal(unlearned.transitions, default_transitions(classes))
-
-
-def test_spans_of_the_queue_teach_nothing_of_which_class_follows_which(home, model_file):
-    marked = next(one for one in segments(home) if one[2] != "silence")
-    write(home, [marked], [whole(home, chosen=QUEUE)])
-    assert home_lessons([home], load_model(model_file)).paths == []
-
-
 def test_time_without_a_review_teaches_silence_and_what_a_model_is_very_sure_of(home, model_file):
     model = load_model(model_file)
     write(home, [next(one for one in segments(home) if one[2] != "silence")])
-    segments_, notes, nothing, _ = home_lessons([home], model)
+    segments_, notes, nothing = home_lessons([home], model)
     assert not nothing
     assert any(note.startswith("no time of this home was looked at") for note in notes)
     kept = segments_.collection == segments_.collection_names.index(CONFIRMED)
@@ -277,7 +244,7 @@ def test_pauses_that_are_marked_as_silence_and_teach_nothing_are_counted(home, m
     begin = segments(home)[0][0]
     loud = next(one for one in segments(home) if one[2] != "silence" and one[0] > begin)
     write(home, [(begin, begin + SECOND // 2, "silence"), loud])
-    notes = home_lessons([home], load_model(model_file)).notes
+    _, notes, _ = home_lessons([home], load_model(model_file))
     pauses = "1 of 2 marks are of silence for less than a second: not learned from"
     assert any(note.startswith(pauses) for note in notes)
 

@@ -14,11 +14,12 @@ from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.replay.player import ReplayOptions
 from hearthlog.analyzer.replay.replay import LogSet
 from hearthlog.analyzer.replay.replay import replay as replay_logs
+from hearthlog.analyzer.training.hidden_markov import viterbi
 from hearthlog.analyzer.training.train import (
     FRAME_SECONDS,
     LAG_SECONDS,
+    default_transitions,
 )
-from hearthlog.analyzer.training.transitions import default_transitions
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.errors import ModelError
@@ -47,7 +48,6 @@ from hearthlog.schemas.messages.message_types import (
     nanoseconds,
     time_message,
 )
-from hearthlog.tools.lab.hidden_markov import viterbi
 
 SECOND = 1_000_000_000
 START = 1_772_350_200 * SECOND

@@ -25,8 +25,7 @@ from hearthlog.analyzer.training.landmark_method import (
 from hearthlog.analyzer.training.learned_inputs import balanced, kept_inputs
 from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.analyzer.training.method import Examples, Method, prepare
-from hearthlog.analyzer.training.train import merged_spans
-from hearthlog.analyzer.training.transitions import learned_transitions
+from hearthlog.analyzer.training.train import default_transitions, merged_spans
 from hearthlog.analyzer.training.window_method import LearnedMachine
 from hearthlog.analyzer.workers.workers import single_thread
 from hearthlog.models.classes import SILENCE, UNKNOWN
@@ -321,8 +320,8 @@ def base_classes(model: Model) -> tuple[str, ...]:
     return model.classes[: int(kept[1].max()) + 1]
 
 
-def adapt_model(base: Model, home: Dataset, paths: Sequence[Indices] = ()) -> Model:
-    """Adapt the weights of a model to a home, and its transitions where a person reviewed.
+def adapt_model(base: Model, home: Dataset) -> Model:
+    """Adapt the weights of a model to a home.
 
     Parameters
     ----------
@@ -332,14 +331,11 @@ def adapt_model(base: Model, home: Dataset, paths: Sequence[Indices] = ()) -> Mo
     home : Dataset
         Segments of the model's `base_classes`, which may be empty, followed by new classes, which
         must have segments.
-    paths : sequence of np.ndarray [shape=(n,)], intp, optional
-        True classes of successive frames, as `learned_transitions` takes them.
 
     Returns
     -------
     Model
-        Parameters and metrics are those of `base`, measured in other homes, and so are transitions
-        without `paths`. The
+        Parameters, transitions and metrics are those of `base`, measured in other homes. The
         temperature before the first adaptation is adjusted by cross-validation over parts of the
         home. The model can be adapted again to more of the home.
 
@@ -372,7 +368,7 @@ def adapt_model(base: Model, home: Dataset, paths: Sequence[Indices] = ()) -> Mo
             "home": home.amounts,
             "home_confirmed": _confirmed(home),
             "home_spans": merged_spans(home.spans),
-            "home_frames": sum(map(len, paths)) if len(base.transitions) else 0,
+            "home_frames": 0,
             "base_sha256": base.sha256,
         }
     )
@@ -383,9 +379,9 @@ def adapt_model(base: Model, home: Dataset, paths: Sequence[Indices] = ()) -> Mo
         "smoothing": smoothing.model_copy(update={"weight": weight}),
     }
     transitions = base.transitions
-    was_learned = base.description.training_data.home_frames > 0
-    if len(transitions) and (paths or was_learned or home.classes != base.classes):
-        transitions = learned_transitions(home.classes, paths)
+    was_learned = base.description.training_data.home_frames > 0  # by an earlier version
+    if len(transitions) and (was_learned or home.classes != base.classes):
+        transitions = default_transitions(home.classes)
     plain = {"format": FORMAT, "direction_microphones": []}
     adapted = Model(
         description.model_copy(update=update | plain),

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.adaptation import base_classes
 from hearthlog.analyzer.training.dataset import CONFIRMED, Dataset, Recording, cut_recordings
@@ -24,10 +22,8 @@ from hearthlog.analyzer.training.pseudo_labels import (
     FEWEST,
     MOST_CONFIRMED,
     Candidates,
-    LabelRuns,
     chosen,
     confirmed_segments,
-    reviewed_runs,
     unreviewed_silence,
     unreviewed_sounds,
 )
@@ -42,7 +38,6 @@ from hearthlog.models.classes import (
 from hearthlog.models.classifiers.model import MOST_CLASSES, Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import feature_set
-from hearthlog.schemas.arrays import Indices
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 
 _FEWEST_DAYS = 2  # of a new class
@@ -67,15 +62,11 @@ class HomeTrainingSet(NamedTuple):
         be used for training.
     nothing : str
         Reason for an empty training set; empty if there is one.
-    paths : list of np.ndarray [shape=(n,)], intp
-        Classes of successive frames that a person went through, as `learned_transitions` takes
-        them.
     """
 
     segments: Dataset
     notes: list[str]
     nothing: str
-    paths: list[Indices]
 
 
 def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> HomeTrainingSet:
@@ -98,7 +89,6 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
     features = feature_set(model.description.feature_set)
     marked: list[Recording] = []
     candidates: list[Candidates] = []
-    runs: list[LabelRuns] = []
     counts, window = _Counts(), features.window_frames
     for folder in folders:
         space = model.description.embedding_space
@@ -106,7 +96,6 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
         taught = [counts.add(sound, features) for sound in sounds]
         marked += marked_recordings(taught, folder, features, model.description.gate)
         candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
-        runs += [run for sound in sounds for run in reviewed_runs(sound, model.classes)]
     learned, notes, unlearned = _with_new_classes(marked, model, features)
     marked = [one for one in marked if one.label not in unlearned]
     notes += counts.notes()
@@ -128,17 +117,7 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
     if CONFIRMED in segments.collection_names and HOME not in segments.collection_names:
         segments = cut_recordings([], learned, features)
     nothing = "none of the marks can be learned from" if counts.marks else "nothing is marked"
-    paths = [path for run in runs for path in _paths(run, learned)]
-    return HomeTrainingSet(segments, notes, "" if len(segments) else nothing, paths)
-
-
-def _paths(runs: LabelRuns, scenario: Scenario) -> list[Indices]:
-    """Return the classes of successive frames, split where a label is of no class."""
-    numbers = {name: number for number, name in enumerate(scenario.classes)}
-    names = (scenario.find(label, marked=True) for label in runs.labels)
-    path = np.repeat([-1 if name is None else numbers[name] for name in names], runs.frames)
-    pieces = np.split(path, np.flatnonzero(np.diff(path < 0)) + 1)
-    return [piece for piece in pieces if piece[0] >= 0]
+    return HomeTrainingSet(segments, notes, "" if len(segments) else nothing)
 
 
 class _Counts:

@@ -10,7 +10,6 @@ import numpy as np
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, labelling_of
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
-from hearthlog.analyzer.marks.marks import PERSON
 from hearthlog.analyzer.training.dataset import CONFIRMED, HOP_FRAMES, Recording, spread
 from hearthlog.analyzer.training.direction_samples import evidence_of
 from hearthlog.analyzer.training.home_recordings import (
@@ -26,7 +25,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import is_quiet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.features.window_inputs import of_segments, window_places
-from hearthlog.schemas.arrays import Bool, Float64, Indices, Int64
+from hearthlog.schemas.arrays import Bool, Float64, Indices
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -79,46 +78,6 @@ def confirmed_segments(
             target = np.where(sound.inside(spans), target, -1)
             confirmed.append(_cut(sound, target, classes, segment_frames))
     return _joined(confirmed)
-
-
-class LabelRuns(NamedTuple):
-    """Labels of successive frames without a gap: of each run of frames, label and length."""
-
-    labels: list[str]
-    frames: Int64
-
-
-def reviewed_runs(sound: HomeSound, classes: Sequence[str]) -> list[LabelRuns]:
-    """Return the labels of the spans that a person went through, with marks as corrections.
-
-    Spans from the queue are left out: they are chosen where the model is in doubt, where sounds
-    change more often than elsewhere.
-
-    Raise `LogError` if the reviewed labelling cannot be read.
-    """
-    found: list[LabelRuns] = []
-    spans = [span for span in sound.confirmed if span.chosen == PERSON]
-    for name in sorted({span.corrects or LIVE for span in spans}):
-        labelling = _labelling(sound, name)
-        if labelling is None:
-            continue
-        own = [(span.start, span.end) for span in spans if (span.corrects or LIVE) == name]
-        known = sound.inside(own) & ~sound.inside(sound.drawn)
-        labels, target = [*classes], _classes_of(sound, labelling, classes)
-        for mark in sound.marks:
-            first, last = np.searchsorted(sound.stamps, [mark.start, mark.end])
-            target[first:last] = len(labels)
-            labels.append(mark.label)
-        target[~known] = -1
-        gap = np.diff(sound.frames, prepend=-2) != 1
-        edges = np.flatnonzero(gap | (np.diff(target, prepend=-2) != 0))
-        lengths, of_runs = np.diff(np.append(edges, len(target))), target[edges]
-        begins = np.flatnonzero(gap[edges] | (np.append(-1, of_runs[:-1]) < 0))
-        for piece in np.split(np.arange(len(edges)), begins[1:]):
-            rows = piece[of_runs[piece] >= 0]
-            if len(rows):
-                found.append(LabelRuns([labels[of_runs[row]] for row in rows], lengths[rows]))
-    return found
 
 
 def labelled_segments(

@@ -39,8 +39,7 @@ from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.analyzer.training.method import Learned, Method, prepare
 from hearthlog.analyzer.training.scores import calibration_error
 from hearthlog.analyzer.training.svm_method import BANDS, PAPER, SVM, network_method
-from hearthlog.analyzer.training.transitions import default_transitions
-from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, find_class
 from hearthlog.models.classifiers.model import (
     FORMAT,
     FORMAT_OF_EMBEDDINGS,
@@ -110,6 +109,52 @@ def method_named(name: str) -> Method:
 LAG_SECONDS = 2.0  # equals the offline path on 90 minutes of real clips; 1 s does not
 REACH_SECONDS = 0.3
 SHORTEST_SECONDS = 0.25
+
+_SOUND_AFTER_SOUND = 0.007  # relative to equally likely classes
+_DURATION_SECONDS = 10.0  # of a class outside the table of classes
+
+
+def default_transitions(classes: Sequence[str]) -> Float64:
+    """Return transition probabilities of classes from their expected durations.
+
+    A sound is mostly followed by silence, if that is a class, and seldom by another sound: most
+    changes from one sound to another are errors within one of them.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Names of the C classes, at least two; a class outside `hearthlog.models.classes` lasts 10 s.
+
+    Returns
+    -------
+    np.ndarray [shape=(C, C)], float64
+        Probability of the column's class in the frame after a frame of the row's class.
+    """
+    leave = 1.0 / np.maximum(expected_durations(classes) / FRAME_SECONDS, 1.0)
+    is_sound = np.array([class_name(name) != SILENCE for name in classes])
+    following = np.where(np.outer(is_sound, is_sound), _SOUND_AFTER_SOUND, 1.0)
+    np.fill_diagonal(following, 0.0)
+    transitions: Float64 = following * (leave / following.sum(axis=1))[:, np.newaxis]
+    np.fill_diagonal(transitions, 1.0 - leave)
+    return transitions
+
+
+def expected_durations(classes: Sequence[str]) -> Float64:
+    """Return the expected durations of classes.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Names of the C classes; a class outside `hearthlog.models.classes` lasts 10 s.
+
+    Returns
+    -------
+    np.ndarray [shape=(C,)], float64
+        In seconds.
+    """
+    rows = map(find_class, classes)
+    return np.array([_DURATION_SECONDS if row is None else row.seconds for row in rows])
+
 
 _MERGED_WITHIN = 60 * NANOSECONDS
 

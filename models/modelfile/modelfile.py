@@ -505,10 +505,7 @@ def model_card(model: Model) -> str:
         ]
     if frames := description.training_data.home_frames:
         minutes = frames * FRAME_SECONDS / 60
-        lines += [
-            "",
-            f"Knows from {minutes:.0f} minutes of a home which class follows which.",
-        ]
+        lines += ["", f"What follows what is from {minutes:.0f} minutes of a home without marks."]
     if arrays := description.direction_microphones:
         named = ", ".join(arrays)
         lines += ["", f"Takes the directions of {named}; other microphones are labelled without."]

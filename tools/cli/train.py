@@ -371,7 +371,7 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
     from hearthlog.models.modelfile.modelfile import load_model
 
     model = load_model(base)
-    segments, notes, nothing, paths = home_lessons(home, model, scenario)
+    segments, notes, nothing = home_lessons(home, model, scenario)
     for note in notes:
         print_notice(note)
     if not len(segments):
@@ -385,7 +385,7 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
         )
     what = f"learning from {len(segments)} segments of the home besides"
     with share_done(what, announce=True):
-        adapted = adapt_model(model, segments, paths)
+        adapted = adapt_model(model, segments)
     return adapted, segments
 
 

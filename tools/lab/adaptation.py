@@ -151,8 +151,7 @@ def _learned(base: Model, logs: Sequence[RecentLog], marks: Sequence[Mark]) -> M
             name = marks[0].microphone
             looked_at = ReviewedSpan(name, logs[0].start, marks[-1].end)
             write_review(find_coverage(folder)[name], marks, looked_at)
-        lessons = home_lessons([folder], base)
-        return adapt_model(base, lessons.segments, lessons.paths)
+        return adapt_model(base, home_lessons([folder], base).segments)
 
 
 def line_of(outcome: Outcome) -> str:

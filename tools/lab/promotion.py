@@ -227,8 +227,7 @@ def _learned(base: Model, marks: Sequence[Mark], logs: Path) -> Model:
                 copy = Path(place) / log.path.name
                 shutil.copy(log.path, copy)
                 write_marks(copy, own)
-        lessons = home_lessons([Path(place)], base)
-        return adapt_model(base, lessons.segments, lessons.paths)
+        return adapt_model(base, home_lessons([Path(place)], base).segments)
 
 
 def _microphone(log: RecentLog) -> str:

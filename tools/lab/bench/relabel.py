@@ -12,6 +12,7 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from hearthlog.analyzer.training.dataset import Dataset
+from hearthlog.analyzer.training.hidden_markov import viterbi
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.classifiers.model import Model
@@ -28,7 +29,6 @@ from hearthlog.tools.lab.bench.inference import fit_scikit_learn, inputs_above_f
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.bench.timing import HEARTHLOG, BenchError, Seconds
 from hearthlog.tools.lab.bench.workload import Workload
-from hearthlog.tools.lab.hidden_markov import viterbi
 
 _CALL = 1000  # rows
 _WORKERS = 2
