@@ -71,6 +71,13 @@ CLASSES = (
 )
 # fmt: on
 
+# From what a person must hear of to what says least; other classes come before the last four.
+_FIRST = (
+    *(COUGHING, CRYING, YELLING, PHONE_RING, SPEECH, LAUGHING, MUSIC, OBJECTS_ACTIVITY),
+    *(FLUSHING_WATER, SHOWER, TAP_WATER, BATHROOM_OTHER),
+)
+_LAST = OTHER_NEGATIVE, OTHER, UNKNOWN, SILENCE
+
 _BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
 
 
@@ -107,6 +114,19 @@ def class_name(label: str) -> str:
     """Return the class name of a label; the label itself if there is none."""
     row = find_class(label)
     return label if row is None else row.name
+
+
+def ordered(labels: Iterable[str]) -> list[str]:
+    """Return labels without duplicates in the order of all displays, the most important first."""
+
+    def place(label: str) -> tuple[int, int]:
+        name = class_name(label)
+        for number, names in ((0, _FIRST), (2, _LAST)):
+            if name in names:
+                return number, names.index(name)
+        return 1, 0
+
+    return sorted(dict.fromkeys(labels), key=place)
 
 
 def meant_by(label: str, names: Collection[str]) -> list[str]:

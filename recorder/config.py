@@ -237,6 +237,11 @@ class Settings(BaseModel):
         description='Classes whose features are logged coarsely, such as ["speech"]: over a '
         "second.",
     )
+    never_tell: list[str] = Field(
+        default=[],
+        examples=[["music"]],
+        description='Classes that no page, alert, report or metric shows, such as ["music"].',
+    )
     keep_audio: Keep = Field(default="off", description="Sound to keep as clips.")
     never_keep: list[str] = Field(
         default=["speech"],

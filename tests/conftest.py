@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from brokers import broker
-from command_server import HEARTHLOG, CommandPopen
+from command_server import FRESH_HEARTHLOG, HEARTHLOG, CommandPopen
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
 from realday import write_real_day
 from spliced import record_logs
@@ -35,6 +35,8 @@ from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 __all__ = [
+    "FRESH_HEARTHLOG",
+    "HEARTHLOG",
     "broker",
     "bucket",
     "camera",

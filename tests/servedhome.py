@@ -57,10 +57,11 @@ PALE_TEXTS = """
 class Served:
     """A home whose log is being written, and its page."""
 
-    def __init__(self, folder, settings=None, **options):
+    def __init__(self, folder, settings=None, never_tell=(), **options):
         self.settings = settings or {}
         self.log = LiveHome(folder / "logs", **options)
-        self.home = RecorderAddress(folder / "logs", "home", midday_zone())
+        hidden = frozenset(never_tell)
+        self.home = RecorderAddress(folder / "logs", "home", midday_zone(), hidden)
         self.state, self.said, self.port = folder / "state", [], free_port()
         self._start()
 

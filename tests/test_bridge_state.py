@@ -17,9 +17,8 @@ from hearthlog.analyzer.bridge.mqtt.topics import Place, Topics, identifier
 from hearthlog.analyzer.bridge.output import Total, Totals
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import iso_time
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.local_time import today
+from hearthlog.analyzer.logs.local_time import iso_time, today
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns

@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from conftest import HEARTHLOG
+from conftest import FRESH_HEARTHLOG, HEARTHLOG
 from hypothesis import given
 from hypothesis import strategies as st
 from logs import features, read
@@ -38,7 +38,7 @@ def recording(labmic, logs, **configured):
     file.write_text("".join(f"{key} = {value!r}\n" for key, value in lines.items()))
     with file.open("a") as more:
         more.write("[[microphone]]\ndevice = 'labmic'\n")
-    command = [*HEARTHLOG, "record", "--config", str(file)]
+    command = [*FRESH_HEARTHLOG, "record", "--config", str(file)]
     with subprocess.Popen(command, env=labmic.env, stderr=subprocess.PIPE, text=True) as process:
         try:
             yield process

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from conftest import HEARTHLOG
+from conftest import FRESH_HEARTHLOG
 from test_capture import recording
 from test_disk import small_disk
 
@@ -124,7 +124,7 @@ def test_each_of_several_microphones_is_in_the_status(labmic, systemd, tmp_path)
         f"output = '{tmp_path / 'logs'}'\n"
         + "\n".join(f"[[microphone]]\nname='{name}'\ndevice='{device}'" for name, device in tables)
     )
-    command = [*HEARTHLOG, "record", "--config", str(about)]
+    command = [*FRESH_HEARTHLOG, "record", "--config", str(about)]
     env = watched(labmic, systemd).env
     with subprocess.Popen(command, env=env, stderr=subprocess.DEVNULL) as process:
         try:
@@ -206,7 +206,7 @@ def test_a_recorder_that_starts_again_by_itself_does_not_say_that_it_ends(
 ):
     file = tmp_path / "home.toml"
     file.write_text('model = "none"\n[[microphone]]\ndevice = "labmic"\n')
-    command = [*HEARTHLOG, "record", "--config", str(file), "-o", str(tmp_path / "logs")]
+    command = [*FRESH_HEARTHLOG, "record", "--config", str(file), "-o", str(tmp_path / "logs")]
     env = labmic.env | systemd.env
     with subprocess.Popen(command, env=env, stderr=subprocess.PIPE) as process:
         try:

@@ -36,7 +36,7 @@ from hearthlog.analyzer.logs.spans import (
     rows_at,
     without,
 )
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, ordered
 from hearthlog.schemas.arrays import Bool, Int64
 
 
@@ -231,7 +231,7 @@ def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetr
     everything = joined(labels.starts, labels.ends)
     loud = labels.labels != SILENCE
     sound = joined(labels.starts[loud], labels.ends[loud])
-    classes = list(dict.fromkeys(chain.from_iterable(data.classes.values())))
+    classes = ordered(chain.from_iterable(data.classes.values()))
     listened, spans, events = {}, {}, {}
     for name in classes:
         own = labels.labels == name

@@ -1,7 +1,7 @@
 """Log data of a home for a report: reviewed segments, gaps, troubles, and scenario minutes."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -42,6 +42,7 @@ from hearthlog.schemas.messages.topics import (
 )
 
 _FIELDS = {"header.stamp", "duration", "label"}
+_SEGMENT_FIELDS = {*_FIELDS, "confidence"}
 _OF_GAPS = {"header.stamp", "duration", "reason"}
 Source = tuple[str, str]  # node, microphone
 
@@ -60,6 +61,7 @@ class HomeData:
     gaps: list[Trouble] = field(default_factory=list)
     troubles: list[Trouble] = field(default_factory=list)
     nodes: list[str] = field(default_factory=list)
+    never_told: frozenset[str] = frozenset()  # classes that are not in `classes` for that
     losses: list[str] = field(default_factory=list)  # read errors with reasons
 
     def lose(self, line: str) -> None:
@@ -119,6 +121,14 @@ def read_home(
         home.gone_through[source] = joined(starts, ends)
     _check(home, logs, labelling, close)
     _name_classes(home, logs.between(*close, layer), name)
+    try:
+        home.never_told = logs.never_tell()
+    except LogError as error:
+        home.lose(str(error))
+    home.classes = {
+        source: [each for each in classes if each not in home.never_told]
+        for source, classes in home.classes.items()
+    }
     return home
 
 
@@ -192,7 +202,7 @@ def _segments(
                 "" if schema is None else schema.name for _, schema in selection.channels[topic]
             }
             home.lose(f"{entry.path}: {topic} is of type {', '.join(sorted(kinds))}")
-        yield from read_columns([entry.path], segments, *limits, fields=_FIELDS).values()
+        yield from read_columns([entry.path], segments, *limits, fields=_SEGMENT_FIELDS).values()
     except LogError as error:
         home.lose(str(error))
 
@@ -285,7 +295,10 @@ ScenarioMinutes = Mapping[str, Sequence[Mapping[str, float]]]
 
 
 def read_scenario_minutes(
-    logs: HomeLogs, days: Sequence[tuple[int, int]], lose: Callable[[str], None]
+    logs: HomeLogs,
+    days: Sequence[tuple[int, int]],
+    lose: Callable[[str], None],
+    never_told: Collection[str] = (),
 ) -> ScenarioMinutes:
     """Read the duration of each scenario class, over all microphones.
 
@@ -295,6 +308,7 @@ def read_scenario_minutes(
         Starts and ends, in nanoseconds of UTC, in time order.
     """
     found: dict[str, list[Counter[str]]] = {}
+    left_out = OF_EVERY_SCENARIO.union(never_told)
     start, end = days[0][0], days[-1][1]
     for entry in logs.between(start, end + SEGMENT_DELAY):
         try:
@@ -312,11 +326,16 @@ def read_scenario_minutes(
             scenario = topic.partition(f"/{SCENARIO}/")[2].partition("/")[0]
             own = found.setdefault(scenario, [Counter() for _ in days])
             if topic in columns:
-                _add(own, columns[topic], days)
+                _add(own, columns[topic], days, left_out)
     return {name: found[name] for name in sorted(found)}
 
 
-def _add(minutes: list[Counter[str]], columns: Columns, days: Sequence[tuple[int, int]]) -> None:
+def _add(
+    minutes: list[Counter[str]],
+    columns: Columns,
+    days: Sequence[tuple[int, int]],
+    left_out: Collection[str],
+) -> None:
     starts, ends = columns["header.stamp"], columns["header.stamp"] + columns["duration"]
     names, numbers = np.unique(columns["label"], return_inverse=True)
     for counted, (begin, end) in zip(minutes, days, strict=True):
@@ -324,5 +343,5 @@ def _add(minutes: list[Counter[str]], columns: Columns, days: Sequence[tuple[int
         sums = np.bincount(numbers, lengths, len(names)) / _MINUTE
         for name, length in zip(names.tolist(), sums.tolist(), strict=True):
             is_known = name in counted or len(counted) < _MOST_CLASSES
-            if length and is_known and class_name(name) not in OF_EVERY_SCENARIO:
+            if length and is_known and class_name(name) not in left_out:
                 counted[name] += length

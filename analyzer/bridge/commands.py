@@ -142,7 +142,7 @@ class EventCorrections:
             try:
                 correct_event(self._folder, self._node, event, label, REVIEWER)
             except BridgeError as error:
-                raise _explained(error) from error
+                raise explained(error) from error
             self._own[event.id] = label
             while len(self._own) > 1000:
                 del self._own[next(iter(self._own))]
@@ -168,7 +168,7 @@ def _in_words(label: str) -> str:
     return "nothing" if label == SILENCE else class_words(label)
 
 
-def _explained(error: BridgeError) -> HearthlogError:
+def explained(error: Exception) -> HearthlogError:
     """Convert an error to one with a message for people at home."""
     cause: BaseException | None = error
     while cause is not None:

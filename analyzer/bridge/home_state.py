@@ -15,8 +15,9 @@ from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, Sound
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.logs.local_time import Today
+from hearthlog.analyzer.logs.never_tell import current_list
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined
-from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE
+from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
@@ -78,8 +79,8 @@ class LiveMicrophone:
     def __init__(self, name: str, unnamed: Collection[str] = (SILENCE,)) -> None:
         self.name = name
         self._unnamed = unnamed
+        self.never_tell: frozenset[str] = frozenset()  # classes that no output shows
         self._names: list[str] = []
-        self.classes: list[str] = []
         self.heard = ActiveClasses([])
         self.label, self.confidence = "", 0.0
         self.level_dbfs = math.nan
@@ -91,6 +92,17 @@ class LiveMicrophone:
         self._latest = 0  # end of the last segment, in nanoseconds of UTC
         self._replaced: list[SoundEvent] = []  # ended by the start of another event of the class
 
+    @property
+    def classes(self) -> list[str]:
+        """Classes of the model that outputs show, silence among them."""
+        left_out = {*self._unnamed, *self.never_tell} - {SILENCE}
+        return [name for name in self._names if name not in left_out]
+
+    @property
+    def shown_label(self) -> str:
+        """The newest label; `unknown` in place of a class that no output shows."""
+        return UNKNOWN if self.label in self.never_tell else self.label
+
     def is_listening(self) -> bool:
         """Whether labels have arrived in the last fifteen seconds."""
         return time.monotonic() - self.seen <= _AWAY_SECONDS
@@ -101,7 +113,11 @@ class LiveMicrophone:
         return [] if record is None else record.since(since)
 
     def labels(self) -> list[str]:
-        """Return the classes with recorded events."""
+        """Return the classes with recorded events that outputs show."""
+        return [label for label in self._records if label not in self.never_tell]
+
+    def all_labels(self) -> list[str]:
+        """Return the classes with recorded events, shown or not."""
         return list(self._records)
 
     def last_event(self, label: str) -> SoundEvent | None:
@@ -114,7 +130,6 @@ class LiveMicrophone:
         classes = _class_names(columns)
         if classes and classes != self._names:
             self._names = classes
-            self.classes = [c for c in classes if c == SILENCE or c not in self._unnamed]
             self.heard = ActiveClasses(classes)
         self.heard.push(columns["label"].tolist(), columns.log_times)
         self.since = self.since or int(columns.log_times[0])
@@ -137,7 +152,8 @@ class LiveMicrophone:
             record = self._records.setdefault(label, EventRecord(self.name, label))
             before = record.current
             if record.push(start, start + max(duration, 0), confidence) and record.current:
-                begun.append(record.current)
+                if label not in self.never_tell:
+                    begun.append(record.current)
                 if before is not None and label in self._unended:
                     self._replaced.append(before)
             if record.current is not before:
@@ -191,7 +207,7 @@ class LiveMicrophone:
             if not self.is_listening() or (is_quiet and not self.heard.is_heard(label)):
                 self._unended.remove(label)
                 ended += [] if event is None else [event]
-        return ended
+        return [event for event in ended if event.label not in self.never_tell]
 
     def forget(self, before: int, after: int) -> None:
         """Drop events before `before`, except the last of each class, and events after `after`."""
@@ -220,12 +236,25 @@ class HomeState:
         self.health: dict[str, Health] = {}
         self.caught_up = False
         self.sources: Collection[str] | None = None
+        self._never_tell: frozenset[str] = frozenset()
         self._seen = -math.inf  # time of the last message, by CLOCK_MONOTONIC
         self._said: set[str] = set()  # subjects with diagnostics in the current log
 
     def is_recording(self) -> bool:
         """Whether anything was written in the last fifteen seconds."""
         return time.monotonic() - self._seen <= _AWAY_SECONDS
+
+    @property
+    def never_tell(self) -> frozenset[str]:
+        """Classes that no output shows."""
+        return self._never_tell
+
+    @never_tell.setter
+    def never_tell(self, names: frozenset[str]) -> None:
+        if names != self._never_tell:
+            self._never_tell = names
+            for microphone in self.every():
+                microphone.never_tell = names
 
     def every(self) -> list[LiveMicrophone]:
         """Return the states of all microphones and scenarios."""
@@ -277,9 +306,15 @@ class HomeState:
     def _state_of(self, topic: TopicName) -> LiveMicrophone:
         name = labelling_source(topic)
         assert name is not None
-        if is_of_scenario(name):
-            return self.scenarios.setdefault(name, LiveMicrophone(name, OF_EVERY_SCENARIO))
-        return self.microphones.setdefault(name, LiveMicrophone(name))
+        own, unnamed = (
+            (self.scenarios, OF_EVERY_SCENARIO)
+            if is_of_scenario(name)
+            else (self.microphones, {SILENCE})
+        )
+        if name not in own:
+            own[name] = LiveMicrophone(name, unnamed)
+            own[name].never_tell = self._never_tell
+        return own[name]
 
     def _time_seen(self, columns: Columns) -> float:
         """Return when messages were written, by CLOCK_MONOTONIC.
@@ -345,6 +380,7 @@ def follow_home(
         Events that began with the batch.
     """
     state, folder = HomeState(), home.folder
+    state.never_tell = current_list(folder, home.never_tell)
     while not folder.is_dir():
         say(f"{folder}: no such folder yet; waiting for a recorder")
         state.caught_up = True
@@ -361,6 +397,7 @@ def follow_home(
             if current != described and (names := _labelling_sources(current)) is not None:
                 state.sources, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
+                state.never_tell = current_list(folder, home.never_tell)
                 state.caught_up = True
                 yielded = time.monotonic()
                 yield state, []

@@ -109,7 +109,7 @@ class Totals:
         sums = {total[:2]: total for total in self._kept.totals}
         for microphone in state.every():
             known = (label for label in microphone.classes if label != SILENCE)
-            for label in dict.fromkeys([*known, *microphone.labels()]):
+            for label in dict.fromkeys([*known, *microphone.all_labels()]):
                 events = [
                     event
                     for event in microphone.events(label, self.time)

@@ -79,7 +79,9 @@ class PrometheusOutput:
         self._open_port()
         self.totals.keep(news.state, min(news.today.midnight, news.today.night) - SEGMENT_DELAY)
         registry = CollectorRegistry()
-        registry.register(_Figures(news, self._home, self.totals.count(news.state)))
+        totals = self.totals.count(news.state)
+        shown = [total for total in totals if total.label not in news.state.never_tell]
+        registry.register(_Figures(news, self._home, shown))
         text = generate_latest(registry)
         self._made = text, time.monotonic()
         if self._settings.text_file is not None:

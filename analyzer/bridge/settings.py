@@ -33,11 +33,18 @@ from hearthlog.schemas.files import read_toml
 
 
 class RecorderAddress(NamedTuple):
-    """The recorder that a bridge follows: log folder, node name and time zone."""
+    """The recorder that a bridge follows.
+
+    Attributes
+    ----------
+    never_tell : frozenset of str
+        Classes of the configuration that no output shows.
+    """
 
     folder: Path
     node: str
     zone: tzinfo
+    never_tell: frozenset[str] = frozenset()
 
 
 NO_RECIPIENT = (

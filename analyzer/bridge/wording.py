@@ -5,15 +5,6 @@ from datetime import timedelta, tzinfo
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import in_words
 from hearthlog.schemas.errors import printable, shortened
-from hearthlog.schemas.frames import NANOSECONDS
-
-
-def iso_time(nanoseconds: int, zone: tzinfo) -> str:
-    """Format nanoseconds of UTC as ISO 8601 in local time, with offset and milliseconds."""
-    moment = local_time(nanoseconds, zone)
-    milliseconds = nanoseconds % NANOSECONDS // 1_000_000
-    return moment.replace(microsecond=1000 * milliseconds).isoformat(timespec="milliseconds")
-
 
 _LONGEST = 200  # characters of a text from a log
 _LONGEST_NAME = 60

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
 from hearthlog.analyzer.logs.local_time import day_span, local_time
+from hearthlog.analyzer.logs.never_tell import list_beside, recorded_list
 from hearthlog.analyzer.logs.recorder_info import (
     NO_MODEL,
     LabelledBy,
@@ -104,6 +105,15 @@ class HomeLogs:
         """Names of the models with relabel layers."""
         layers = {entry.layer for entry in self.entries if entry.layer.startswith(RELABEL_LAYER)}
         return sorted(layer.removeprefix(RELABEL_LAYER) for layer in layers)
+
+    def never_tell(self) -> frozenset[str]:
+        """Return the classes that nobody is told of, by the last log and the list beside it.
+
+        Raise `LogError` if the list is damaged.
+        """
+        logs = self.between()
+        last = next(self.records(), {})
+        return recorded_list(last) | (list_beside(logs[-1].path) if logs else frozenset())
 
     def records(self) -> Iterator[Mapping[str, str]]:
         """Yield the `hearthlog` records of the logs, latest log first."""

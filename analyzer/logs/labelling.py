@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.layers import find_with_layers
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
 from hearthlog.analyzer.logs.spans import NEVER, joined, one, pieces, remains
 from hearthlog.models.classes import CLASS_NAME, class_name, translation
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
@@ -42,11 +42,18 @@ class Labelling:
     starts, ends : np.ndarray [shape=(n,)], int64
         Nanoseconds of UTC; every end is after its start.
     labels : np.ndarray [shape=(n,)] of str
+    confidences : np.ndarray [shape=(n,)], float32
+        0 to 1; 1 where none is known, such as of marks.
     """
 
     starts: Int64
     ends: Int64
     labels: NDArray[np.object_]
+    confidences: Float32 = field(default_factory=lambda: np.empty(0, np.float32))
+
+    def __post_init__(self) -> None:
+        if len(self.confidences) != len(self.starts):
+            object.__setattr__(self, "confidences", np.ones(len(self.starts), np.float32))
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -72,6 +79,7 @@ def overlaid(labels: Labelling, above: Labelling) -> Labelling:
         starts[order],
         np.concatenate([left.ends, above.ends])[order],
         np.concatenate([labels.labels[rows], above.labels])[order],
+        np.concatenate([labels.confidences[rows], above.confidences])[order],
     )
 
 
@@ -95,7 +103,9 @@ def labelling_of(segments: Columns) -> Labelling:
             f"{segments.topic}: segments overlap; is a log there twice, or those of two homes? "
             "name the folder of one"
         )
-    return Labelling(starts, ends, segments["label"])
+    known = "confidence" in segments.fields
+    confidences = segments["confidence"] if known else np.ones(len(starts), np.float32)
+    return Labelling(starts, ends, segments["label"], confidences)
 
 
 def all_classes(

@@ -105,3 +105,10 @@ def today(now: int, zone: tzinfo) -> Today:
     last = day if at_hour(day, EVENING, zone) <= now else day - timedelta(days=1)
     night = at_hour(last, EVENING, zone), at_hour(last + timedelta(days=1), MORNING, zone)
     return Today(now, midnight(day, zone), *night)
+
+
+def iso_time(nanoseconds: int, zone: tzinfo) -> str:
+    """Format nanoseconds of UTC as ISO 8601 in local time, with offset and milliseconds."""
+    moment = local_time(nanoseconds, zone)
+    milliseconds = nanoseconds % NANOSECONDS // 1_000_000
+    return moment.replace(microsecond=1000 * milliseconds).isoformat(timespec="milliseconds")

@@ -131,7 +131,8 @@ def _model(logs: HomeLogs, close: tuple[int, int]) -> str:
 def _scenarios(
     logs: HomeLogs, days: Sequence[date], zone: tzinfo, data: HomeData
 ) -> ScenarioMinutes:
-    return read_scenario_minutes(logs, [day_span(day, zone) for day in days], data.lose)
+    spans = [day_span(day, zone) for day in days]
+    return read_scenario_minutes(logs, spans, data.lose, data.never_told)
 
 
 def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:

@@ -33,7 +33,14 @@ from hearthlog.analyzer.review.timeline import (
     Timeline,
     no_spans,
 )
-from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name, in_words, translation
+from hearthlog.models.classes import (
+    OF_EVERY_SCENARIO,
+    SILENCE,
+    class_name,
+    in_words,
+    ordered,
+    translation,
+)
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -228,16 +235,20 @@ def reviewed_lane(
 def _classes(
     microphone: MicrophoneTimeline, labellings: list[LabellingTimeline]
 ) -> dict[str, Colour]:
-    """Return the displayed names of classes, the one heard for the shortest time first."""
+    """Return the displayed names of classes with their colours, the most important first.
+
+    Classes that were heard come first, then others, up to the number of lanes.
+    """
     known = {name for one in labellings for name in (*one.classes, *one.spans.texts)}
-    names = [name for name in microphone.classes if name in known and class_name(name) != SILENCE]
+    own = [name for name in microphone.classes if name in known and class_name(name) != SILENCE]
+    names = ordered(own)
     seconds: Counter[str] = Counter()
     for one in labellings:
         for name in names:
-            own = one.spans.texts == name
-            seconds[in_words(name)] += int((one.spans.ends - one.spans.starts)[own].sum())
+            rows = one.spans.texts == name
+            seconds[in_words(name)] += int((one.spans.ends - one.spans.starts)[rows].sum())
     shades = {in_words(name): colour(name) for name in reversed(names)}
-    heard = sorted((name for name in shades if seconds[name]), key=lambda name: seconds[name])
+    heard = [name for name in map(in_words, names) if seconds[name]]
     silent = [in_words(name) for name in names if not seconds[in_words(name)]]
     room = max(_MOST_LANES - len(heard), 0)
     return {name: shades[name] for name in dict.fromkeys([*heard, *silent[:room]])}

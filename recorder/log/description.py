@@ -12,6 +12,7 @@ from hearthlog.models.features.installed import entries_of
 from hearthlog.models.modelfile.modelfile import attachment_of, model_attachments
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.logs.metadata import (
+    NEVER_TELL,
     RecordedScenario,
     other_features,
     provenance,
@@ -75,6 +76,8 @@ def describe_log(  # noqa: PLR0913, PLR0917
         model_sha256=info.model_sha256,
         timezone=settings.timezone,
     )
+    if settings.never_tell:
+        metadata[NEVER_TELL] = ",".join(settings.never_tell)
     if (candidate := secondary.get(CANDIDATE)) is not None:
         metadata |= {"candidate": candidate.name, "candidate_sha256": candidate.sha256}
     if model is not None:

@@ -32,6 +32,9 @@ _KNOWN = {str(number): number for number in range(1, SCHEMA_VERSION + 1)}
 _LARGEST, _MOST = 1 << 20, 64 << 20  # bytes per record and in total; hearthlog's have below 1000
 
 
+NEVER_TELL = "never_tell"  # key of the classes that nobody is told of, with commas between them
+
+
 def provenance(node: str, **more: str) -> dict[str, str]:
     """Return the `hearthlog` record of a file written by this version."""
     return {"version": __version__, _VERSION_KEY: str(SCHEMA_VERSION), "node": node, **more}

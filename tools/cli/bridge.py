@@ -61,6 +61,7 @@ def bridge(
     )
     from hearthlog.analyzer.bridge.state import state_folder
     from hearthlog.analyzer.extras import require
+    from hearthlog.models.classes import class_name
     from hearthlog.recorder.config import exposed_passwords
     from hearthlog.recorder.pause_schedule import time_zone
 
@@ -78,7 +79,10 @@ def bridge(
     stop = Event()
     for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(each, lambda *_: stop.set())
-    home = RecorderAddress(logs or settings.output, settings.node, time_zone(settings.timezone))
+    never_tell = frozenset(map(class_name, settings.never_tell))
+    home = RecorderAddress(
+        logs or settings.output, settings.node, time_zone(settings.timezone), never_tell
+    )
     say = ProblemReporter(print_notice)
     state = state_folder(own.state, home.folder)
     for line in [*exposed_files(own, config, state), *exposed_passwords(settings, config)]:
@@ -126,11 +130,16 @@ def replay(
     from hearthlog.analyzer.activity.segments import read_activity
     from hearthlog.analyzer.activity.sources import source_microphone
     from hearthlog.analyzer.bridge.alerts.evaluation import notifications
-    from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class, unknown_microphone
-    from hearthlog.analyzer.bridge.alerts.rules import history
+    from hearthlog.analyzer.bridge.alerts.rule_checks import (
+        hidden_class,
+        unknown_class,
+        unknown_microphone,
+    )
+    from hearthlog.analyzer.bridge.alerts.rules import history, is_hidden
     from hearthlog.analyzer.bridge.settings import load_bridge_settings
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
+    from hearthlog.models.classes import class_name
 
     first, last = parse_span(start, end)
     settings, own = load_bridge_settings(config)
@@ -146,11 +155,13 @@ def replay(
     longest = max(history(rule) for rule in own.alert)
     with share_done("reading the labels") as progress:
         heard = read_activity(home, settings.node, first - longest, last, losses.append, progress)
+    hidden = home.never_tell().union(map(class_name, settings.never_tell))
     found = {rule.name: notifications(rule, heard, first, last, zone)[0] for rule in own.alert}
+    found |= {rule.name: [] for rule in own.alert if is_hidden(rule, hidden)}
     microphones = {source_microphone(name) for name in heard.coverage}
     for rule in own.alert:
         unheard = unknown_microphone(rule, microphones, recorded=True)
-        if text := unheard or unknown_class(rule, heard.classes):
+        if text := hidden_class(rule, hidden) or unheard or unknown_class(rule, heard.classes):
             print_notice(text)
     if as_json:
         print_json(_as_json(found, (first, last), zone))
@@ -238,7 +249,7 @@ def _unknown(notifications: "Sequence[Notification]") -> int:
 def _as_json(
     found: "dict[str, list[Notification]]", span: tuple[int, int], zone: tzinfo
 ) -> dict[str, Any]:
-    from hearthlog.analyzer.bridge.wording import iso_time
+    from hearthlog.analyzer.logs.local_time import iso_time
 
     return {
         "start": iso_time(span[0], zone),

@@ -29,7 +29,9 @@ from hearthlog.tools.cli.terminal import OutputClosedError, checked_output, prin
 
 # In help order; each is a function, or an app of its own, in the module of its name.
 PANELS = {
-    "Every day": ("record", "devices", "info", "watch", "report", "pause", "resume", "demo"),
+    "Every day": (
+        *("record", "devices", "info", "watch", "events", "report", "pause", "resume", "demo"),
+    ),
     "A model of the home": (
         *("review", "train", "enrol", "discover", "voices", "relabel", "models", "annotate"),
     ),

@@ -2,6 +2,7 @@
 
 import getpass
 from contextlib import suppress
+from datetime import date, datetime, timedelta, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -255,6 +256,30 @@ def parse_span(start: str | None, end: str | None) -> tuple[int | None, int | No
     if first is not None and last is not None and first >= last:
         wrong_use(f"--end {end} is not after --start {start}")
     return first, last
+
+
+_YEARS = range(1970, 2200)
+NEAR = {"today": 0, "yesterday": 1}  # days before today
+
+
+def read_day(option: str, text: str, zone: tzinfo) -> date:
+    """Parse a day of a home; invalid text ends with wrong use."""
+    if text in NEAR:
+        return datetime.now(zone).date() - timedelta(days=NEAR[text])
+    return read_date(option, text)
+
+
+def read_date(option: str, text: str) -> date:
+    """Parse a date, or a week as its Monday; invalid text ends with wrong use."""
+    try:
+        found = date.fromisoformat(text)
+    except ValueError:
+        found = date.min
+    if found.year not in _YEARS:
+        of_week = option == "--week"
+        example = "2026-W09, or a day in it" if of_week else "2026-03-01, today or yesterday"
+        wrong_use(f"{option} {text}: not a {option[2:]} such as {example}")
+    return found
 
 
 def scenario_files(given: list[str] | None) -> dict[str, Path]:

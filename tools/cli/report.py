@@ -1,19 +1,16 @@
 """`hearthlog report`: a day or a week of a home, for a carer."""
 
-from datetime import date, datetime, timedelta
+from datetime import date, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.options import Logs, Timezone
+from hearthlog.tools.cli.options import NEAR, Logs, Timezone, read_date, read_day
 from hearthlog.tools.cli.terminal import end_with_warnings, share_done, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.home_logs import HomeLogs
-
-_YEARS = range(1970, 2200)
-_NEAR = {"today": 0, "yesterday": 1}  # days before today
 
 
 def report(
@@ -54,18 +51,20 @@ def report(
     from hearthlog.analyzer.extras import require
 
     require("jinja2", "matplotlib")
-    first = None if day in {None, *_NEAR} and week is None else _first_day(day, week)
-
+    if week is not None:
+        first: date | None = read_date("--week", week)
+        assert first is not None
+        first -= timedelta(days=first.weekday())
+    else:
+        first = None if day in {None, *NEAR} else read_date("--day", day or "")
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.report.report import WEEK, Period, make_report
 
     home_logs = find_home_logs(logs)
     zone = home_zone(timezone, home_logs.records())
-    if first is None and day is None:
-        first = home_logs.last_complete_day(zone)
-    elif first is None:
-        first = datetime.now(zone).date() - timedelta(days=_NEAR[day or ""])
+    if first is None:
+        first = home_logs.last_complete_day(zone) if day is None else read_day("--day", day, zone)
     count = 1 if week is None else WEEK
     page = output or Path(_name(home_logs, first, count))
     with share_done("reading the labels") as progress:
@@ -73,19 +72,6 @@ def report(
     print(result.page)
     print(result.picture)
     end_with_warnings(result.losses)
-
-
-def _first_day(day: str | None, week: str | None) -> date:
-    """Parse a day, or return the Monday of a week."""
-    option, text = ("--day", day) if week is None else ("--week", week)
-    try:
-        start = date.fromisoformat(text or "")
-    except ValueError:
-        start = None
-    if start is None or start.year not in _YEARS:
-        example = "2026-03-01, today or yesterday" if week is None else "2026-W09, or a day in it"
-        wrong_use(f"{option} {text}: not a {option[2:]} such as {example}")
-    return start if week is None else start - timedelta(days=start.weekday())
 
 
 def _name(home_logs: "HomeLogs", first: date, count: int) -> str:

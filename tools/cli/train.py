@@ -418,13 +418,13 @@ def _print(model: "Model", segments: "Dataset") -> None:
 
 def print_figures(model: "Model") -> None:
     """Print the training data of a model, and its scores on unseen sources."""
-    from hearthlog.models.classes import UNKNOWN
+    from hearthlog.models.classes import UNKNOWN, ordered
     from hearthlog.models.classifiers.classifier import classifier_kind
 
     description, metrics = model.description, model.description.metrics
     data = description.training_data
     rows = []
-    for name in description.classes:
+    for name in ordered(description.classes):
         amount, result = data.classes[name], metrics.classes[name]
         if not amount.segments:  # taken from another model only
             continue

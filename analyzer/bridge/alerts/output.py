@@ -33,6 +33,7 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     Notification,
     RuleState,
     history,
+    is_hidden,
     live_history,
 )
 from hearthlog.analyzer.bridge.home_state import decode_fields
@@ -90,6 +91,7 @@ class RuleWatch:
         self._say = say
         self._progress = memory.load(rules)
         self._saved = now
+        self.never_tell: frozenset[str] = frozenset()  # classes whose rules never notify
         self.set_right(now)
 
     def set_right(self, now: int) -> None:
@@ -132,6 +134,9 @@ class RuleWatch:
         for rule in self._rules:
             own = self._progress[rule.name]
             if until - own.until < _EVERY:
+                continue
+            if is_hidden(rule, self.never_tell):
+                self._progress[rule.name] = replace(own, until=until, has_rung=False)
                 continue
             if isinstance(rule, DailyRule):
                 if not judged_days(rule, own.until, until, self._zone):
@@ -238,6 +243,7 @@ class AlertsOutput:
             if microphone.label:
                 label = LiveLabel(microphone.heard.time, microphone.label, microphone.confidence)
                 self._labels.append((microphone.name, label, microphone.classes))
+        self._watch.never_tell = news.state.never_tell
         self._has_news.set()
         if self._on_notification is not None:
             while self._publish_ring(self._on_notification):

@@ -15,6 +15,7 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     UnlikeUsual,
     UnusualDay,
     duration_words,
+    is_hidden,
     pause_of,
 )
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
@@ -76,6 +77,16 @@ def unknown_microphone(
     return f"{rule.name}: {lacks}; there is {listed(sorted(microphones))}"
 
 
+def hidden_class(rule: AlertRule, never_tell: Collection[str]) -> str:
+    """Report that nobody is told of the class of a rule; empty if it is not hidden."""
+    if not is_hidden(rule, never_tell):
+        return ""
+    return (
+        f"{rule.name}: {rule.words.lower()} is hidden (never_tell, or the page of the home), so it "
+        "never notifies"
+    )
+
+
 _JUDGED_AND_TODAY = 2  # days, in addition to the baseline
 
 
@@ -89,8 +100,13 @@ def rule_doubts(
     microphones : sequence of str
         Names of configured microphones; empty to skip the checks of names.
     """
+    never_tell = set(map(class_name, settings.never_tell))
     for rule in rules:
-        lines = unknown_microphone(rule, microphones), impossible_amount(rule)
+        lines = (
+            hidden_class(rule, never_tell),
+            unknown_microphone(rule, microphones),
+            impossible_amount(rule),
+        )
         yield from filter(None, (*lines, unkept_days(rule, settings)))
 
 

@@ -2,9 +2,9 @@
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeGuard
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -265,6 +265,11 @@ def _check_names(rules: list[AlertRule]) -> list[AlertRule]:
 
 
 AlertRules = Annotated[list[AlertRule], AfterValidator(_check_names), Field(max_length=100)]
+
+
+def is_hidden(rule: AlertRule, never_tell: Collection[str]) -> TypeGuard[SoundRule]:
+    """Whether a rule is of a class that nobody is told of, so that the rule never notifies."""
+    return isinstance(rule, SoundRule) and rule.label in never_tell
 
 
 def pause_of(rule: SoundRule) -> int:

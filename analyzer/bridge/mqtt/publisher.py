@@ -25,7 +25,7 @@ from hearthlog.analyzer.bridge.mqtt.home_assistant import (
 from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, RetainedTopics, Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
-from hearthlog.analyzer.bridge.wording import iso_time
+from hearthlog.analyzer.logs.local_time import iso_time
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.recorder.log.folder_lock import node_locks
 from hearthlog.schemas.errors import shortened
@@ -313,7 +313,8 @@ class MqttPublisher:
         if not microphone.label:
             return
         confidence = round(microphone.confidence, 3)
-        label = microphone.label if self._announced.is_told(microphone.label) else UNKNOWN
+        label = microphone.shown_label
+        label = label if self._announced.is_told(label) else UNKNOWN
         say("heard", json.dumps({"label": label, "confidence": confidence}))
         say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):

@@ -14,7 +14,7 @@ import numpy as np
 
 from hearthlog.analyzer.activity.events import ANY_SOUND, HOLD_SECONDS, SoundEvent
 from hearthlog.analyzer.activity.sources import source_microphone, source_parts
-from hearthlog.analyzer.bridge.commands import EventCorrections
+from hearthlog.analyzer.bridge.commands import EventCorrections, class_of, explained
 from hearthlog.analyzer.bridge.home_state import HomeState, ListeningThreshold, LiveMicrophone
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
@@ -42,8 +42,9 @@ from hearthlog.analyzer.logs.local_time import (
     day_span,
     local_time,
 )
+from hearthlog.analyzer.logs.never_tell import read_list, write_list
 from hearthlog.analyzer.logs.spans import joined
-from hearthlog.models.classes import SILENCE, in_words
+from hearthlog.models.classes import SILENCE, in_words, ordered
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError, listed
 from hearthlog.schemas.frames import NANOSECONDS
@@ -103,10 +104,10 @@ def _sentence(microphone: LiveMicrophone) -> str:
 
 
 def active_classes(microphone: LiveMicrophone) -> list[str]:
-    """Return the active classes except silence, in the order of the model."""
+    """Return the active classes except silence, the most important first."""
     return [
         label
-        for label in microphone.classes
+        for label in ordered(microphone.classes)
         if is_sound(label) and microphone.heard.is_heard(label)
     ]
 
@@ -155,15 +156,14 @@ def last_events(
         for label in microphone.labels():
             found += microphone.events(label, news.today.midnight - _DAY)[-_SHOWN:]
     found = sorted(found, key=lambda event: (event.start, event.id), reverse=True)[:_SHOWN]
-    names = dict.fromkeys(
-        label for each in microphones for label in [*each.classes, *each.labels()]
-    )
+    names = ordered(label for each in microphones for label in [*each.classes, *each.labels()])
     shown = {
         "events": [
             _described(event, news, said_of(event), is_alone=len(microphones) == 1)
             for event in found
         ],
         "classes": [(label, class_words(label)) for label in names if is_sound(label)],
+        "hidden": [(label, class_words(label)) for label in ordered(news.state.never_tell)],
     }
     return {event.id: event for event in found}, shown
 
@@ -317,7 +317,7 @@ def _room(microphone: LiveMicrophone, day: DaySpan, today: Today) -> Any:
         "gaps": [(day.place(a), day.place(b)) for a, b in _unheard(microphone, day, today)],
         "lanes": [
             _lane(microphone, label, day, today, known)
-            for label in dict.fromkeys([*microphone.classes, *microphone.labels()])
+            for label in ordered([*microphone.classes, *microphone.labels()])
             if label != SILENCE
         ],
     }
@@ -334,6 +334,7 @@ def _lane(
     summary = f"{words}: {how_often} today" + (f", last at {last_heard}" if count else "")
     events = microphone.events(label, day.start - 24 * _HOUR)
     return {
+        "label": label,
         "words": words,
         "colour": colour_on_paper(label),
         "bars": bars((event for event in events if event.end > day.start), day),
@@ -377,6 +378,7 @@ def _unheard(microphone: LiveMicrophone, day: DaySpan, today: Today) -> list[tup
 
 
 _EVERY_SECONDS = 1.0
+_SHOW = {"yes": True, "no": False}
 
 
 class HomePage:
@@ -402,7 +404,8 @@ class HomePage:
         names = frozenset(settings.names)
         admission = PageAdmission(settings.bind, settings.port, token, cookie_key(state), names)
         self._board = Board()
-        actions = {"/mark": self._mark, "/group": self._recurring.name}
+        self._home = home
+        actions = {"/mark": self._mark, "/group": self._recurring.name, "/show": self._show}
         self._server = PageServer(admission, self._board, actions, settings.frames)
         host = f"[{settings.bind}]" if bind.version == 6 else settings.bind
         address = f"http://{host}:{settings.port}/"
@@ -456,6 +459,22 @@ class HomePage:
         if found is None:
             raise BridgeError("This event is too long ago for the page: `hearthlog review` has it.")
         return self._corrections.add(found, label)
+
+    def _show(self, choice: str, label: str) -> str:
+        """Hide a class from all outputs and reports, or show it again."""
+        name = class_of(label)
+        if name == SILENCE or choice not in _SHOW:
+            raise BridgeError("Only a sound can be hidden.")
+        if name in self._home.never_tell:
+            raise BridgeError("The configuration of the box hides this sound: never_tell.")
+        folder = self._home.folder
+        try:
+            names = read_list(folder)
+            write_list(folder, names - {name} if _SHOW[choice] else names | {name})
+        except (HearthlogError, OSError) as error:
+            raise explained(error) from error
+        self._day_key = None
+        return f"{class_words(name)} is {'shown again' if _SHOW[choice] else 'shown nowhere now'}."
 
     def _read_back(self) -> None:
         try:

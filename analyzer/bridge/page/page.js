@@ -108,7 +108,11 @@ function beginLane(it) {
     path({ fill: "url(#unheard)" }), path({ class: "marks", fill: `rgb(${it.colour.join(" ")})` }),
     path({ class: "moment" }));
   const cells = [make("td"), make("td"), make("td")];
-  const row = make("tr", {}, make("th", { scope: "row" }, swatch(it.colour), it.words), ...cells);
+  const hide = make("button", { type: "button", class: "hide", title: `Show ${it.words} nowhere` }, "Hide");
+  hide.append(make("span", { class: "hidden" }, ` ${it.words}`));
+  hide.addEventListener("click", () => showClass(it.label, "no"));
+  const row = make("tr", {}, make("th", { scope: "row" }, swatch(it.colour), it.words), ...cells,
+    make("td", {}, hide));
   return { name: make("div", { class: "name", "aria-hidden": "true" }, it.words), svg, row, cells };
 }
 
@@ -138,7 +142,7 @@ function showHours(svg, day, width) {
 function beginRoom({ room, lanes }, isAlone) {
   const begun = lanes.map(beginLane);
   const hours = draw("svg", { class: "hours", "aria-hidden": "true" });
-  const heads = ["Sound", "Today", "Last night", "Last heard"];
+  const heads = ["Sound", "Today", "Last night", "Last heard", ""];
   const table = make("table", {},
     make("caption", { class: "hidden" }, `How often each sound was heard${isAlone ? "" : `: ${room}`}`),
     make("thead", {}, make("tr", {}, ...heads.map((text) => make("th", { scope: "col" }, text)))),
@@ -256,6 +260,26 @@ function arrange(list, items, entries, begun, show) {
   }
 }
 
+// Hides a class from all that the box tells, or shows it again.
+async function showClass(label, show) {
+  const answer = await send("show", { show, label });
+  write(place("hidden-said"), answer.error ?? answer.said);
+}
+
+function showHidden(hidden) {
+  keep(place("hidden-classes"), hidden, () => {
+    const button = make("button", { type: "button", class: "back" });
+    const child = make("li", {}, make("span"), " ", button);
+    button.addEventListener("click", () => showClass(child.dataset.label, "yes"));
+    return child;
+  }, (child, [label, words]) => {
+    child.dataset.label = label;
+    write(child.firstElementChild, words);
+    write(child.lastElementChild, `Show ${words.toLowerCase()} again`);
+  });
+  place("hidden-sounds").hidden = !hidden.length;
+}
+
 function beginEvent({ id, words, colour, time }) {
   const item = begin(() => ({
     legend: `${words} at ${time}: that was …`,
@@ -266,8 +290,9 @@ function beginEvent({ id, words, colour, time }) {
   return item;
 }
 
-function showEvents({ events, classes: known }) {
+function showEvents({ events, classes: known, hidden }) {
   classes = known;
+  showHidden(hidden);
   arrange(place("events"), shownEvents, events, beginEvent, (item, event) => {
     write(item.about, [event.time, event.length, event.sure, event.room].filter(Boolean).join(" · "));
     write(item.said, event.said);

@@ -218,7 +218,8 @@ _FILES = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
 }
-_SUBJECTS = {"/mark": "event", "/group": "group"}  # JSON field of the labelled subject
+# JSON field beside the label: a subject, or whether the class is shown.
+_SUBJECTS = {"/mark": "event", "/group": "group", "/show": "show"}
 _JSON = "application/json"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
@@ -315,7 +316,7 @@ class _Handler(HttpHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
 
     def do_POST(self) -> None:
-        """Accept a label for an event or for the sounds of a group."""
+        """Accept a label for an event or the sounds of a group, or whether a class is shown."""
         if not self._is_admitted(changes=True):
             return
         if self._path not in _SUBJECTS:

@@ -1,0 +1,116 @@
+"""Events of a home in a time span: what a report counts, one by one."""
+
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.activity.daily_metrics import HomeMetrics
+from hearthlog.analyzer.activity.home_data import HomeData
+from hearthlog.analyzer.logs.spans import (
+    EVENT_PAUSE,
+    NONE,
+    Spans,
+    common,
+    first_of_groups,
+    joined,
+    lengths,
+    rows_at,
+)
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.frames import NANOSECONDS
+
+
+class HomeEvent(NamedTuple):
+    """Segments of one class, from any microphones, with at most ten seconds between them.
+
+    Attributes
+    ----------
+    start, end : int
+        In nanoseconds of UTC.
+    seconds : float
+        Total length of the segments.
+    confidence : float
+        Highest of the segments; 1 for a class that a person marked.
+    microphones : tuple of str
+        Names of those with a segment, sorted.
+    reviewed : bool
+        Whether a person has gone through the start of the event, at all microphones.
+    television : bool
+        Whether something like a television sounded: a report does not count the event.
+    """
+
+    label: str
+    start: int
+    end: int
+    seconds: float
+    confidence: float
+    microphones: tuple[str, ...]
+    reviewed: bool
+    television: bool
+
+
+def home_events(
+    data: HomeData, metrics: HomeMetrics, classes: Sequence[str], start: int, end: int
+) -> list[HomeEvent]:
+    """List the events of some classes that begin in a time span.
+
+    Parameters
+    ----------
+    classes : sequence of str
+        Silence has no events.
+    start, end : int
+        In nanoseconds of UTC, the end exclusive.
+
+    Returns
+    -------
+    list of HomeEvent
+        Sorted by start. Of each class, as many as the count of a report and those beside a
+        television together.
+    """
+    found = [
+        event
+        for name in classes
+        if name != SILENCE
+        for event in _events_of(data, metrics, name, start, end)
+    ]
+    return sorted(found, key=lambda event: (event.start, event.label))
+
+
+def _events_of(
+    data: HomeData, metrics: HomeMetrics, name: str, start: int, end: int
+) -> Iterator[HomeEvent]:
+    sources = list(data.segments)
+    parts = [np.flatnonzero(data.segments[source].labels == name) for source in sources]
+    pairs = [*zip(data.segments.values(), parts, strict=True)]
+    starts = np.concatenate([own.starts[rows] for own, rows in pairs])
+    ends = np.concatenate([own.ends[rows] for own, rows in pairs])
+    confidences = np.concatenate([own.confidences[rows] for own, rows in pairs])
+    owners = np.repeat(np.arange(len(sources)), [len(rows) for rows in parts])
+    order = np.argsort(starts, kind="stable")
+    starts, ends, confidences, owners = (
+        column[order] for column in (starts, ends, confidences, owners)
+    )
+    firsts = first_of_groups(starts, ends, EVENT_PAUSE)
+    begin, stop = np.searchsorted(starts[firsts], [start, end])
+    if begin == stop:
+        return
+    events = Spans(starts[firsts], np.maximum.reduceat(ends, firsts))
+    seconds = lengths(joined(starts, ends), np.append(events.starts, events.ends[-1])) / NANOSECONDS
+    highest = np.maximum.reduceat(confidences, firsts)
+    counted = np.isin(events.starts, metrics.minutes.counted(name, events.starts))
+    through = reduce(common, [data.gone_through.get(source, NONE) for source in sources])
+    reviewed = rows_at(through, events.starts) >= 0
+    of_events = np.split(owners, firsts[1:])
+    for row in range(begin, stop):
+        yield HomeEvent(
+            name,
+            int(events.starts[row]),
+            int(events.ends[row]),
+            float(seconds[row]),
+            float(highest[row]),
+            tuple(sorted({sources[owner][1] for owner in of_events[row].tolist()})),
+            bool(reviewed[row]),
+            not counted[row],
+        )

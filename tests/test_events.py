@@ -1,0 +1,159 @@
+"""`hearthlog events`: one line a sound, as many as the report counts."""
+
+import json
+import re
+from collections import Counter
+from datetime import date, timedelta
+from functools import partial
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+from homelife import GENERAL, at, midnight, write_day
+from spliced import run
+
+from hearthlog.analyzer.activity.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.activity.home_data import read_home
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.local_time import day_span
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.files import find_logs, is_layer
+
+DAY = date(2026, 3, 2)
+ZONE = ZoneInfo("Europe/Vienna")
+
+
+@pytest.fixture
+def hearthlog(capfd):
+    """Run the command in this process and return what came of it."""
+    return partial(run, capfd)
+
+
+def found(hearthlog, *words):
+    result = hearthlog("events", *words, "--json")
+    assert result.returncode in {0, 3}, result.stderr
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def home(tmp_path):
+    """Two days of two rooms: coughs at night, a television, gaps, a review."""
+    logs = tmp_path / "logs"
+    rng = np.random.default_rng(5)
+    for day in (DAY - timedelta(days=1), DAY):
+        evening = [
+            (at("18:00") + 11 * n + rng.uniform(0, 3), rng.uniform(2, 6), label, 0.8)
+            for n, label in enumerate(rng.choice(["speech", "music", "laughing", "yelling"], 300))
+        ]
+        kitchen = [
+            (at("02:10:09"), 1.5, "coughing", 0.7),
+            (at("02:10:20"), 2.0, "coughing", 0.9),
+            (at("06:13"), 1.0, "coughing", 0.6),
+            (at("09:00"), 40.0, "speech", 0.95),
+            *evening,
+            (at("23:59:58"), 4.0, "crying", 0.8),
+        ]
+        hall = [(at("09:00:30"), 30.0, "speech", 0.5), (at("12:00"), 3.0, "phone_ring", 0.99)]
+        gaps = [(at("14:00"), 1800, "quiet hours")]
+        write_day(logs, day, kitchen, microphone="kitchen", gaps=gaps, timezone="Europe/Vienna")
+        write_day(logs, day, hall, node="hall", microphone="hall", timezone="Europe/Vienna")
+    (log,) = [
+        path for path in find_logs(logs) if not is_layer(path) and "home_20260302T06" in path.name
+    ]
+    begin = midnight(DAY) + int(at("06:00")) * NANOSECONDS
+    cough = begin + 13 * 60 * NANOSECONDS
+    mark = Mark("kitchen", cough, cough + NANOSECONDS, "crying")
+    write_marks(log, [mark], reviewed=[ReviewedSpan("kitchen", begin, begin + 1800 * NANOSECONDS)])
+    return logs
+
+
+def day_metrics(logs, day=DAY):
+    start, end = day_span(day, ZONE)
+    before = day_span(day - timedelta(days=1), ZONE)[0]
+    return day_of(
+        whole_home(read_home(find_home_logs([logs]), "live", before, (start, end))), day, ZONE
+    )
+
+
+def test_each_sound_that_the_report_counts_is_a_line(home, hearthlog):
+    day = day_metrics(home)
+    listed = found(hearthlog, home, "--day", DAY)
+    lines = Counter((event["label"], event["television"]) for event in listed["events"])
+    assert {"coughing", "crying", "speech", "music", "phone_ring"} <= {name for name, _ in lines}
+    assert lines["yelling", True] > 50
+    for name in day.home.classes:
+        if name != SILENCE:
+            counts = listed["counts"].get(name, {"counted": 0, "television": 0})
+            assert counts == {"counted": lines[name, False], "television": lines[name, True]}
+            assert counts["counted"] == day.count(name).labelled, name
+            assert counts["television"] == day.beside_television(name), name
+            seconds = sum(e["seconds"] for e in listed["events"] if e["label"] == name)
+            assert seconds == pytest.approx(60 * day.minutes(name).minutes, abs=10), name
+    assert listed["listened"] == pytest.approx(1, abs=1e-4), "the hall was listened to"
+
+
+def test_a_night_is_that_of_the_report(home, hearthlog):
+    day = day_metrics(home)
+    night = found(hearthlog, home, "--night", "--day", DAY)
+    for name in day.home.classes:
+        if name != SILENCE:
+            assert (
+                night["counts"].get(name, {"counted": 0})["counted"]
+                == day.night_count(name).labelled
+            )
+    coughs = [event for event in night["events"] if event["label"] == "coughing"]
+    assert [event["start"][11:16] for event in coughs] == ["03:10"]
+    assert coughs[0]["confidence"] == 0.9
+    assert coughs[0]["seconds"] == 3.5
+    (text,) = hearthlog("events", home, "--night", "--label", "cough").stdout.splitlines()[-1:]
+    assert re.fullmatch(r"Coughing in the night to Monday, 2026-03-02: 1", text)
+
+
+def test_a_review_corrects_what_is_listed(home, hearthlog):
+    listed = found(hearthlog, home, "--day", DAY, "--label", "crying", "--label", "coughing")
+    corrected = [event for event in listed["events"] if event["start"][11:16] == "07:13"]
+    assert [(e["label"], e["confidence"], e["reviewed"]) for e in corrected] == [
+        ("crying", 1.0, False)  # only the kitchen was gone through
+    ]
+
+
+def test_a_sound_that_two_rooms_hear_is_one_and_names_both(home, hearthlog):
+    words = "--start", "2026-03-02T08:00", "--end", "2026-03-02T10:00"
+    (speech,) = found(hearthlog, home, *words, "--label", "speech")["events"]
+    assert speech["microphones"] == ["hall", "kitchen"]
+    assert (speech["seconds"], speech["confidence"]) == (60.0, 0.95)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--label", "cugh"], "no class 'cugh' here; there are "),
+        (["--day", "2026-04-01"], "no logs of 2026-04-01"),
+        (["--day", "soon"], "--day soon: not a day such as 2026-03-01"),
+        (["--labels", "none"], "no labelling 'none' beside these logs"),
+        (["--night", "--start", "2026-03-02T00:00"], "--start and --end exclude --day and --night"),
+        (["--start", "2027-01-01"], "no log has a message after 2027-01-01"),
+        (["--play", "--json"], "--play and --json exclude each other"),
+    ],
+)
+def test_bad_input_is_one_line(home, hearthlog, words, said):
+    result = hearthlog("events", home, *words)
+    assert result.returncode in {1, 2}
+    assert said in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert not result.stdout
+
+
+def test_sound_that_was_not_kept_cannot_be_played_and_is_said_so(home, hearthlog):
+    result = hearthlog("events", home, "--day", DAY, "--label", "phone_ring", "--play")
+    assert result.returncode == 0
+    assert "no sound was kept of 1 of these: keep_audio" in result.stderr
+
+
+def test_time_that_nobody_listened_to_is_said(tmp_path, hearthlog):
+    write_day(tmp_path, DAY, [(at("03:00"), 2, "coughing", 0.8)], hours=range(6), classes=GENERAL)
+    result = hearthlog("events", tmp_path, "--day", DAY, "--label", "coughing")
+    assert "only 25 % of that time was listened to" in result.stderr
+    assert result.stdout.splitlines()[-1] == "Coughing on Monday, 2026-03-02: 1"

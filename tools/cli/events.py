@@ -1,0 +1,292 @@
+"""`hearthlog events`: the sounds of a home one by one, as a report counts them."""
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from datetime import date, timedelta, tzinfo
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from hearthlog.tools.cli.options import End, Json, Logs, Start, Timezone, parse_span, read_day
+from hearthlog.tools.cli.terminal import (
+    end_with_warnings,
+    print_json,
+    print_notice,
+    print_table,
+    share_done,
+    wrong_use,
+)
+
+if TYPE_CHECKING:
+    from hearthlog.analyzer.activity.daily_metrics import HomeMetrics
+    from hearthlog.analyzer.activity.home_events import HomeEvent
+    from hearthlog.analyzer.logs.home_logs import HomeLogs
+
+
+class Span(NamedTuple):
+    """A span of time in nanoseconds of UTC, and its name."""
+
+    start: int
+    end: int
+    words: str
+
+
+def events(
+    logs: Logs,
+    *,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="Class, such as coughing; may be repeated. By default all sounds."),
+    ] = None,
+    day: Annotated[
+        str | None,
+        typer.Option(
+            help="Such as 2026-03-01, today or yesterday; by default the last complete day in "
+            "the logs."
+        ),
+    ] = None,
+    night: Annotated[
+        bool,
+        typer.Option(
+            "--night", help="The night from 22:00 to 07:00 that ends on the day; else the last one."
+        ),
+    ] = False,
+    start: Start = None,
+    end: End = None,
+    labels: Annotated[
+        str, typer.Option(help="Labelling: live, or the model of a relabel layer.")
+    ] = "live",
+    timezone: Timezone = None,
+    play: Annotated[
+        bool, typer.Option("--play", help="Play the kept sound of each, one after the other.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """List sounds: when, how long, how sure, and whether a person has reviewed them.
+
+    Sounds of one class with at most ten seconds between them are one line, as in the report.
+    Exit status 3: a log is damaged or unfinished, and its time is missing.
+    """
+    limits = parse_span(start, end)
+    if limits != (None, None) and (day is not None or night):
+        wrong_use("--start and --end exclude --day and --night")
+    if play and as_json:
+        wrong_use("--play and --json exclude each other")
+    from hearthlog.analyzer.activity.daily_metrics import whole_home
+    from hearthlog.analyzer.activity.home_data import read_home
+    from hearthlog.analyzer.activity.home_events import home_events
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.logs.local_time import home_zone, midnight
+
+    home_logs = find_home_logs(logs)
+    zone = home_zone(timezone, home_logs.records())
+    span = _chosen_span(home_logs, zone, day, limits, night=night)
+    before = midnight(_date(span.start, zone) - timedelta(days=1), zone)  # of an event that goes on
+    with share_done("reading the labels") as progress:
+        data = read_home(home_logs, labels, before, span[:2], progress)
+    metrics = whole_home(data)
+    classes = _chosen_classes(metrics.classes, label or (), data.never_told)
+    found = home_events(data, metrics, classes, *span[:2])
+    share = _listened_share(metrics, classes, span)
+    if as_json:
+        print_json(
+            {
+                "start": _time(span.start, zone),
+                "end": _time(span.end, zone),
+                "labelling": labels,
+                "listened": round(share, 4),
+                "events": [_fields(event, labels, zone) for event in found],
+                "counts": _counts(found),
+            }
+        )
+    else:
+        _print(found, span, classes, share, zone)
+    if play:
+        _play(found, home_logs)
+    end_with_warnings(data.losses)
+
+
+def _date(time: int, zone: tzinfo) -> date:
+    from hearthlog.analyzer.logs.local_time import local_time
+
+    return local_time(time, zone).date()
+
+
+def _chosen_span(
+    logs: "HomeLogs",
+    zone: tzinfo,
+    day: str | None,
+    limits: tuple[int | None, int | None],
+    *,
+    night: bool,
+) -> Span:
+    """Return the chosen span of time; by default the last complete day, or the last night."""
+    from hearthlog.analyzer.logs.home_logs import check_day
+    from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
+    from hearthlog.analyzer.logs.local_time import today as today_at
+    from hearthlog.schemas.errors import LogError
+
+    ends = logs.end()
+    if ends is None:
+        raise LogError(logs.losses[0] if logs.losses else "there is no message in these logs")
+    if limits != (None, None):
+        first, last = limits
+        begin = _first(logs) if first is None else first
+        stop = ends if last is None else last
+        words = [f"{local_time(time, zone):%Y-%m-%d %H:%M}" for time in (begin, stop)]
+        if begin >= stop:
+            wrong_use(f"no log has a message after {words[0]}")
+        return Span(begin, stop, f"from {words[0]} to {words[1]}")
+    if night:
+        if day is None:
+            moment = today_at(ends, zone)
+            before = today_at(moment.night - 1, zone)  # the last complete night, if recorded
+            if moment.morning > ends and before.morning > _first(logs):
+                moment = before
+            begin, stop = moment.night, moment.morning
+        else:
+            own = read_day("--day", day, zone)
+            begin = at_hour(own - timedelta(days=1), EVENING, zone)
+            stop = at_hour(own, MORNING, zone)
+        morning = _date(stop, zone)
+        check_day(logs, morning - timedelta(days=1), morning, zone)
+        return Span(begin, stop, f"in the night to {morning:%A, %Y-%m-%d}")
+    own = logs.last_complete_day(zone) if day is None else read_day("--day", day, zone)
+    check_day(logs, own, own, zone)
+    return Span(*day_span(own, zone), f"on {own:%A, %Y-%m-%d}")
+
+
+def _first(logs: "HomeLogs") -> int:
+    return min(entry.start for entry in logs.between())
+
+
+def _chosen_classes(
+    known: Sequence[str], labels: Sequence[str], hidden: Collection[str]
+) -> list[str]:
+    """Return the classes of labels; all sounds without labels."""
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.models.classes import SILENCE, class_name, meant_by
+
+    sounds = [name for name in known if name != SILENCE]
+    if not labels:
+        return sounds
+    chosen = []
+    for label in labels:
+        if class_name(label) in hidden:
+            raise DataError(f"{label} is hidden: never_tell, or the page of the home, says so")
+        meant = meant_by(label, sounds)
+        if len(meant) != 1:
+            raise DataError(f"no class {label[:64]!r} here; there are {', '.join(sounds)}")
+        chosen += meant
+    return list(dict.fromkeys(chosen))
+
+
+def _listened_share(metrics: "HomeMetrics", classes: Sequence[str], span: Span) -> float:
+    """Return the least share of a span in which the classes could be labelled, 0 to 1."""
+    from hearthlog.analyzer.logs.spans import cut
+
+    parts = [cut(metrics.listened[name], span.start, span.end).length for name in classes]
+    return min(parts, default=0) / (span.end - span.start)
+
+
+def _time(time: int, zone: tzinfo) -> str:
+    from hearthlog.analyzer.logs.local_time import iso_time
+
+    return iso_time(time, zone)
+
+
+def _fields(event: "HomeEvent", labelling: str, zone: tzinfo) -> dict[str, object]:
+    times = {"start": _time(event.start, zone), "end": _time(event.end, zone)}
+    values = {"seconds": round(event.seconds, 2), "confidence": round(event.confidence, 3)}
+    return event._asdict() | times | values | {"labelling": labelling}
+
+
+def _counts(found: Sequence["HomeEvent"]) -> dict[str, dict[str, int]]:
+    """Count the events of each class: those of a report, and those beside a television."""
+    counted = Counter(event.label for event in found if not event.television)
+    beside = Counter(event.label for event in found if event.television)
+    return {
+        name: {"counted": counted[name], "television": beside[name]}
+        for name in sorted(counted | beside)
+    }
+
+
+_MINUTE = 60  # seconds
+_MOST = 0.75  # listened share below which a count says so
+
+
+def _print(
+    found: Sequence["HomeEvent"], span: Span, classes: Sequence[str], share: float, zone: tzinfo
+) -> None:
+    from hearthlog.analyzer.logs.local_time import local_time
+    from hearthlog.models.classes import in_words
+
+    several = len({name for event in found for name in event.microphones}) > 1
+    days = len({_date(event.start, zone) for event in found}) > 1
+    form = "%a %H:%M:%S" if days else "%H:%M:%S"
+    head = ("when", "sound", "length", "sure", *(["where"] if several else []), "")
+    print_table(
+        head,
+        [
+            (
+                f"{local_time(event.start, zone):{form}}",
+                in_words(event.label),
+                _length(event.seconds),
+                f"{100 * event.confidence:.0f} %",
+                *([", ".join(event.microphones)] if several else []),
+                ", ".join(
+                    ["reviewed"] * event.reviewed + ["beside a television"] * event.television
+                ),
+            )
+            for event in found
+        ],
+        words=len(head),
+    )
+    for name in classes:
+        own = [event for event in found if event.label == name]
+        if not own and len(classes) > 1:
+            continue
+        apart = sum(event.television for event in own)
+        beside = f", and {apart} while something like a television sounded" if apart else ""
+        print(f"{in_words(name)} {span.words}: {len(own) - apart or 'none'}{beside}")
+    if share < _MOST:
+        print_notice(f"only {100 * share:.0f} % of that time was listened to")
+
+
+def _length(seconds: float) -> str:
+    from hearthlog.analyzer.activity.values import Duration
+
+    return f"{seconds:.1f} s" if seconds < _MINUTE else Duration.show(seconds / _MINUTE)
+
+
+def _play(found: Sequence["HomeEvent"], logs: "HomeLogs") -> None:
+    """Play the kept sound of events; say of each that has none."""
+    from hearthlog.analyzer.logs.clips import kept_sound
+    from hearthlog.schemas.logs.files import audio_path
+    from hearthlog.schemas.messages.topics import LIVE, labelling_topic
+
+    unkept = 0
+    for event in found:
+        layers = [audio_path(entry.path) for entry in logs.between(event.start, event.end)]
+        layers = [path for path in layers if Path(path).exists()]
+        sounds = (
+            kept_sound(layers, labelling_topic(name, LIVE, "audio"), event.start, event.end)
+            for name in event.microphones
+        )
+        rate, samples = next((each for each in sounds if len(each[1])), (0, None))
+        if samples is None:
+            unkept += 1
+            continue
+        try:
+            import sounddevice
+
+            sounddevice.play(samples, rate)
+            sounddevice.wait()
+        except (OSError, ValueError, RuntimeError) as error:
+            print_notice(f"the sound cannot be played here ({error})")
+            return
+    if unkept:
+        print_notice(
+            f"no sound was kept of {unkept} of these: keep_audio in the configuration keeps some"
+        )
