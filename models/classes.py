@@ -12,7 +12,10 @@ COUGHING, CRYING, YELLING, LAUGHING = "coughing", "crying", "yelling", "laughing
 FLUSHING_WATER, SHOWER, TAP_WATER = "flushing_water", "shower", "tap_water"
 OBJECTS_ACTIVITY, BATHROOM_OTHER = "objects_activity", "bathroom_other"
 OTHER_NEGATIVE = "other_negative"  # rain, a dog, sirens …: in no built-in scenario
+TELEVISION = "television"  # a person's answer: the sound was of no person here; never trained
 OTHER, UNKNOWN = "other", topics.UNKNOWN  # for models and people; never trained
+# Answers of a person that are neither right nor wrong for a model, and teach nothing.
+UNDECIDED = frozenset({UNKNOWN, TELEVISION})
 OF_EVERY_SCENARIO = frozenset({SILENCE, UNKNOWN, OTHER})  # classes without a name in the scenario
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
@@ -40,9 +43,9 @@ class SoundClass(NamedTuple):
 
 
 # Aliases are the names of AudioSet, and of FSD50K, which has "and" for their commas. The colours,
-# except that of `other`, were optimised together: any two differ by at least 19 (CIE 1976, in
-# L*a*b*) in normal vision and in protanopia, deuteranopia and tritanopia (simulated as by Machado
-# et al., 2009), and by 3 in lightness, which remains on a grey print.
+# except those of `other` and `television`, were optimised together: any two differ by at least 19
+# (CIE 1976, in L*a*b*) in normal vision and in protanopia, deuteranopia and tritanopia (simulated
+# as by Machado et al., 2009), and by 3 in lightness, which remains on a grey print.
 # fmt: off
 CLASSES = (
     SoundClass(SILENCE,          (112, 120, 130),   2.5, "Quiet"),
@@ -66,17 +69,19 @@ CLASSES = (
                "Water taps", ("water_tap", "water_tap_faucet", "water_tap_and_faucet")),
     SoundClass(BATHROOM_OTHER,   ( 93,  83,  63),  10.0, "Bathroom other"),
     SoundClass(OTHER_NEGATIVE,   (195, 202, 199),  10.0, "Other negative"),
+    SoundClass(TELEVISION,       (164, 140, 134),  10.0, "Television",
+               "", ("tv", "radio", "from_the_television")),
     SoundClass(OTHER,            (101, 111, 208),  10.0, "Other sounds"),
     SoundClass(UNKNOWN,          (255, 255, 255),  10.0, "Not sure"),
 )
 # fmt: on
 
-# From what a person must hear of to what says least; other classes come before the last four.
+# From what a person must hear of to what says least; other classes come before the last five.
 _FIRST = (
     *(COUGHING, CRYING, YELLING, PHONE_RING, SPEECH, LAUGHING, MUSIC, OBJECTS_ACTIVITY),
     *(FLUSHING_WATER, SHOWER, TAP_WATER, BATHROOM_OTHER),
 )
-_LAST = OTHER_NEGATIVE, OTHER, UNKNOWN, SILENCE
+_LAST = TELEVISION, OTHER_NEGATIVE, OTHER, UNKNOWN, SILENCE
 
 _BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
 

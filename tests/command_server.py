@@ -3,7 +3,8 @@
 A start of the command costs half a second of a core, most of it imports, and tests start it a few
 thousand times. `tests/conftest.py` replaces `subprocess.Popen`: a command line that begins with
 `HEARTHLOG` becomes a child of the test's process as before, forked from a server that has imported
-everything. `FRESH_HEARTHLOG` starts an interpreter of its own, for what measures one, or replaces itself.
+everything. `FRESH_HEARTHLOG` starts an interpreter of its own, for what measures one, or replaces
+itself.
 """
 
 import atexit

@@ -119,6 +119,17 @@ def test_a_review_corrects_what_is_listed(home, hearthlog):
     ]
 
 
+def test_a_cough_from_the_television_is_counted_no_more(home, hearthlog):
+    (log,) = [
+        path for path in find_logs(home) if not is_layer(path) and "home_20260302T02" in path.name
+    ]
+    begin = midnight(DAY) + int(at("02:10")) * NANOSECONDS
+    write_marks(log, [Mark("kitchen", begin, begin + 60 * NANOSECONDS, "Television")])
+    night = found(hearthlog, home, "--night", "--day", DAY)
+    assert "coughing" not in night["counts"]
+    assert "television" not in night["counts"], "no model has it"
+
+
 def test_a_sound_that_two_rooms_hear_is_one_and_names_both(home, hearthlog):
     words = "--start", "2026-03-02T08:00", "--end", "2026-03-02T10:00"
     (speech,) = found(hearthlog, home, *words, "--label", "speech")["events"]

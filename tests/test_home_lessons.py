@@ -212,9 +212,12 @@ def test_the_floor_begins_anew_behind_a_gap_as_that_of_the_recorder_did(tmp_path
     np.testing.assert_array_equal(found, np.concatenate(floors)[: len(found)])
 
 
-def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(home, model_file):
+@pytest.mark.parametrize("answer", ["unknown", "television", "TV"])
+def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(
+    home, model_file, answer
+):
     one, other = [each for each in segments(home) if each[2] != "silence"][:2]
-    write(home, [(*one[:2], "unknown"), other], [whole(home)])
+    write(home, [(*one[:2], answer), other], [whole(home)])
     assert [each.label for each in lesson_recordings(home)] == [other[2]]
     found = confirmed_segments(sound(home), load_model(model_file).classes)
     assert all(b <= one[0] or a >= one[1] for a, b in (each.span for each in found.recordings))

@@ -34,7 +34,7 @@ from hearthlog.analyzer.marks.marks import (
     read_marks,
     read_reviewed,
 )
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.classes import SILENCE, TELEVISION, UNKNOWN, class_name
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import REVIEW_LAYER, log_of_layer
@@ -329,7 +329,7 @@ def checked_minutes(reviewed: Iterable[ReviewedLabels]) -> CheckedMinutes:
     }
     counts = {
         name: np.array([_events(minute, name) for minute in minutes], np.int64).T
-        for name in sorted(names - {SILENCE})
+        for name in sorted(names - {SILENCE, TELEVISION})
     }
     labelled, right, true, missed = (
         {name: rows[i] for name, rows in counts.items()} for i in range(4)

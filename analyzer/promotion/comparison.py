@@ -35,7 +35,14 @@ from hearthlog.analyzer.promotion.recent_time import (
     reference,
     spans_of,
 )
-from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name, translation
+from hearthlog.models.classes import (
+    OTHER_NEGATIVE,
+    SILENCE,
+    UNDECIDED,
+    UNKNOWN,
+    class_name,
+    translation,
+)
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.arrays import Bool, Float64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -368,7 +375,7 @@ def _right_on_trial(
     sounds: Iterable[ReferenceSound], before: Labelling, after: Labelling
 ) -> PairedAccuracy:
     """Count the sounds that a model labels correctly for most of the time that it labelled."""
-    decided = [sound for sound in sounds if class_name(sound.label) != UNKNOWN]
+    decided = [sound for sound in sounds if class_name(sound.label) not in UNDECIDED]
     shares = [[_mostly(sound, labels) for labels in (before, after)] for sound in decided]
     labelled, right = np.array(shares, bool).reshape(-1, 2, 2).transpose(2, 0, 1)
     return _counted(*right[labelled.all(axis=1)].T)

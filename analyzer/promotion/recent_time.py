@@ -15,7 +15,7 @@ from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labellings, find_l
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, remains, without
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.classes import SILENCE, UNDECIDED, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -211,7 +211,7 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[ReferenceSound]
     others = [
         ReferenceSound(mark.start, mark.end, mark.label, random=False, microphone=mark.microphone)
         for mark in marks
-        if class_name(mark.label) != UNKNOWN  # the reviewer could not decide
+        if class_name(mark.label) not in UNDECIDED
         and not any(_inside(mark, span) for span in drawn)
     ]
     return [sound for sound in [*inside, *others] if sound.end - sound.start >= _SHORTEST_SOUND]
@@ -270,7 +270,7 @@ def _parts(
     known = partial(ReferenceSound, random=True, microphone=span.microphone)
     own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
     for mark in own:
-        if class_name(mark.label) != UNKNOWN:
+        if class_name(mark.label) not in UNDECIDED:
             yield known(max(mark.start, span.start), min(mark.end, span.end), mark.label)
     corrects = LIVE if span.corrects == LIVE else relabelling(span.corrects)
     name = labellings.find(span.microphone, corrects)

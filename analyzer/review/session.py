@@ -41,7 +41,7 @@ from hearthlog.analyzer.review.review_list import (
     read_list,
 )
 from hearthlog.analyzer.review.timeline import LabelledSpans, SoundClip
-from hearthlog.models.classes import UNKNOWN, in_words
+from hearthlog.models.classes import TELEVISION, UNKNOWN, in_words
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, load
@@ -54,7 +54,7 @@ _POLL_SECONDS = 0.3
 _LEAST_MARGIN = 20 * NANOSECONDS
 _AROUND = 600 * NANOSECONDS
 _RIGHT = "."
-_CLASS_KEYS = "1234567890eghijklmorstvwxy"
+_CLASS_KEYS = "1234567890eghijklmorsvwxy"
 _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time cursor; then"
 
 
@@ -166,8 +166,8 @@ class ReviewSession:
         else:
             actions["c"] = "correct as labelled", lambda: self._mark(self.marking.confirm)
         actions[_RIGHT] = "or Enter: all else in the span is right", self._rest_is_right
-        classes = [name for name in self.classes if name != UNKNOWN]
-        labels = dict(zip(_CLASS_KEYS, classes, strict=False)) | {"u": UNKNOWN}
+        classes = [name for name in self.classes if name not in {UNKNOWN, TELEVISION}]
+        labels = dict(zip(_CLASS_KEYS, classes, strict=False)) | {"t": TELEVISION, "u": UNKNOWN}
         for key, label in labels.items():
             actions[key] = _words(label), partial(self._mark_as, label)
         actions |= {

@@ -23,7 +23,7 @@ from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_revi
 from hearthlog.analyzer.training.clips import AS_IT_IS, ClipEmbeddings
 from hearthlog.analyzer.training.dataset import Recording, spread
 from hearthlog.analyzer.training.direction_samples import sighting_of
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.classes import SILENCE, UNDECIDED, UNKNOWN, class_name
 from hearthlog.models.classifiers.evidence import NOWHERE, Directions
 from hearthlog.models.embedding.projection import (
     HOP_FRAMES,
@@ -399,15 +399,17 @@ def lesson_recordings(
     yield from marked_recordings(sounds, folder, features, gate)
 
 
-def teaching(sound: HomeSound) -> HomeSound:
+def teaching(sound: HomeSound, classes: Collection[str] = ()) -> HomeSound:
     """Drop marks that are excluded from training.
 
-    These are marks that a reviewer could not decide, and marks that touch a span drawn at random.
+    These are marks that a reviewer could not decide, marks that touch a span drawn at random, and
+    marks of a television, which sounds like people, unless that is one of the model's `classes`.
     """
+    untaught = UNDECIDED.difference({*classes} - {UNKNOWN})
     marks = [
         mark
         for mark in sound.marks
-        if class_name(mark.label) != UNKNOWN
+        if class_name(mark.label) not in untaught
         and not any(mark.start < end and start < mark.end for start, end in sound.drawn)
     ]
     return replace(sound, marks=marks)

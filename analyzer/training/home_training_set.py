@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -93,7 +93,7 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
     for folder in folders:
         space = model.description.embedding_space
         sounds = list(read_reviewed_sound(folder, features, scenario, space))
-        taught = [counts.add(sound, features) for sound in sounds]
+        taught = [counts.add(sound, features, model.classes) for sound in sounds]
         marked += marked_recordings(taught, folder, features, model.description.gate)
         candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
     learned, notes, unlearned = _with_new_classes(marked, model, features)
@@ -130,9 +130,9 @@ class _Counts:
         self.looked_at = False
         self.by_embedding: Counter[EmbeddingSpace | None] = Counter()  # marks
 
-    def add(self, sound: HomeSound, features: FeatureSet) -> HomeSound:
+    def add(self, sound: HomeSound, features: FeatureSet, classes: Collection[str]) -> HomeSound:
         """Count the marks of a sound; return it with those that are used for training."""
-        taught = teaching(sound)
+        taught = teaching(sound, classes)
         self.marks += len(sound.marks)
         self.by_embedding[sound.embedding] += len(sound.marks)
         self.left_out += len(sound.marks) - len(taught.marks)
@@ -145,8 +145,9 @@ class _Counts:
         notes = []
         if self.left_out:
             notes.append(
-                f"{self.left_out} of {self.marks} marks are not learned from: they say `unknown`, "
-                "or lie in time that was drawn at random to measure how right the labels are"
+                f"{self.left_out} of {self.marks} marks are not learned from: they say `unknown` "
+                "or `television`, or lie in time that was drawn at random to measure how right the "
+                "labels are"
             )
         if self.short:
             notes.append(

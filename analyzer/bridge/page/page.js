@@ -283,7 +283,7 @@ function showHidden(hidden) {
 function beginEvent({ id, words, colour, time }) {
   const item = begin(() => ({
     legend: `${words} at ${time}: that was …`,
-    choices: [...classes, ["silence", "Nothing"]],
+    choices: [...classes, ["television", "From the television or radio"], ["silence", "Nothing"]],
     save: (label) => send("mark", { event: id, label }),
   }));
   item.what.append(swatch(colour), words);
