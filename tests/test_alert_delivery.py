@@ -318,7 +318,7 @@ def test_addresses_are_read_again_when_the_package_that_was_missing_is_there(tmp
 
 
 def _is_told(own, broker):
-    own.update(SimpleNamespace(state=HomeState()))
+    own.update(SimpleNamespace(state=HomeState(), columns=()))
     return len(broker) == 1
 
 
@@ -351,7 +351,7 @@ def test_without_an_address_the_broker_is_told_all_the_same(tmp_path, content):
         [], settings, home, tmp_path, said.append, lambda *given: told.append(given) or True
     )
     own._outbox.put([ring(1)])
-    own.update(SimpleNamespace(state=HomeState()))
+    own.update(SimpleNamespace(state=HomeState(), columns=()))
     own.close()
     assert len(told) == 1
     assert said[0].startswith(f"alerts: {file}: no ")

@@ -351,7 +351,17 @@ def test_a_bridge_tells_of_a_sound_that_goes_on_and_after_a_restart_not_again(tm
     assert said == []
 
 
-def news_of_water(time):
+def new_columns(logs, seen):
+    """What was written to the logs since the last call."""
+    found = []
+    for columns in read_columns(find_logs(logs), ["/mic/segment", "/mic/gap"]).values():
+        rows = [n for n, time in enumerate(columns.log_times) if (columns.topic, time) not in seen]
+        seen.update((columns.topic, time) for time in columns.log_times)
+        found.append(columns.take(np.array(rows, np.intp)))
+    return found
+
+
+def news_of_water(time, columns=()):
     microphone = SimpleNamespace(
         name="mic",
         label="tap_water",
@@ -361,7 +371,7 @@ def news_of_water(time):
     )
     state = HomeState()
     state.microphones["mic"] = microphone
-    return SimpleNamespace(state=state)
+    return SimpleNamespace(state=state, columns=columns)
 
 
 @pytest.mark.parametrize("starts_ahead", [True, False])
@@ -372,7 +382,7 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
     monkeypatch.setattr(time, "time_ns", lambda: right() + ahead[0])
     recorder = Recorder(tmp_path / "logs")
     home = RecorderAddress(tmp_path / "logs", "home", UTC)
-    newest = recorder.water
+    newest, seen = recorder.water, set()
 
     def tell(name, _text, rung):
         told.append((name, rung))
@@ -381,7 +391,7 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
     def hears(condition):
         nonlocal newest
         newest = min(newest + MINUTE, right())
-        own.update(news_of_water(newest + ahead[0]))
+        own.update(news_of_water(newest + ahead[0], new_columns(home.folder, seen)))
         return condition()
 
     try:
@@ -428,7 +438,7 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
     try:
         for minutes in range(0, 60, 4):
             monkeypatch.setattr(time, "time_ns", lambda m=minutes: right() + m * MINUTE)
-            own.update(SimpleNamespace(state=HomeState()))
+            own.update(SimpleNamespace(state=HomeState(), columns=()))
             if minutes == 4:  # one that rang before those, and is found later
                 own._outbox.put([Notification("coughs", now, "ring 0", is_known=True, due=now)])
     finally:

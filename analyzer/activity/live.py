@@ -1,7 +1,8 @@
 """Activity of a home, followed live: written segments, and the open ones so far."""
 
 from collections import Counter, deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.activity.events import LONGEST_PAUSE
@@ -12,8 +13,12 @@ from hearthlog.analyzer.activity.sources import (
     labelling_source,
     source_microphone,
 )
+from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.selection import select
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.columns import Columns, read_columns
+from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import parse_topic
 
@@ -100,6 +105,7 @@ FIELDS = {
     message_types.GAP: ("header.stamp", "duration"),
     message_types.DIAGNOSTICS: (),
 }
+_READ = {kind: fields for kind, fields in FIELDS.items() if fields}
 _GONE = 600 * NANOSECONDS  # without labels after which a scenario counts as removed
 _CUT = NANOSECONDS  # longer open segments are kept when a gap follows
 
@@ -126,10 +132,44 @@ class LiveActivity:
         self._patience = patience
         self._collector = SegmentCollector()
         self._pending: dict[str, PendingSegment] = {}
+        self._read: dict[str, int] = {}  # log time of the last message read, by topic
+
+    def read(self, logs: HomeLogs, node: str, end: int, lose: Callable[[str], None]) -> None:
+        """Read the activity so far from logs, before any message is pushed.
+
+        Parameters
+        ----------
+        end : int
+            Log time, in nanoseconds of UTC; later messages are skipped.
+        lose : callable
+            Called with a message for each damaged log.
+        """
+        for entry in logs.between(self._start, end):
+            if entry.node == node:
+                try:
+                    self._read_log(entry.path, end)
+                except LogError as error:
+                    lose(str(error))
+
+    def _read_log(self, path: Path, end: int) -> None:
+        with LogFile(path) as file:
+            spans = zip(file.chunks["start"].tolist(), file.chunks["end"].tolist(), strict=True)
+            for first, last in spans:
+                if last < end:
+                    self._collector.add_written_span(first, last)
+        selection = select([path])
+        for kind, fields in _READ.items():
+            topics = filter(is_of_alerts, selection.topics_of(kind, set(fields)))
+            columns = read_columns([path], list(topics), self._start, end, fields)
+            self.push([*columns.values()])
+            for topic, part in columns.items():
+                if len(part):
+                    self._read[topic] = int(part.log_times[-1])
 
     def push(self, columns: Sequence[Columns]) -> None:
-        """Add messages, with the fields of `FIELDS`."""
-        for part in (each for each in columns if len(each)):
+        """Add messages, with the fields of `FIELDS`; those that were read are ignored."""
+        new = (each.between(self._read.get(each.topic, -1) + 1, None) for each in columns)
+        for part in (each for each in new if len(each)):
             self._collector.add_written(part.log_times)
             name = parse_topic(part.topic)
             source = None if name is None else labelling_source(name)

@@ -39,6 +39,8 @@ from hearthlog.recorder.log.folder_lock import check_writable
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import exposed_secret
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages import message_types
 
 _ERROR = 2  # level of diagnostics
 _SOON = 10.0  # seconds from the start to the first ping
@@ -112,14 +114,17 @@ class Bridge:
         keep_one_heap()
         notify(["READY=1"])
         early: deque[SoundEvent] = deque(maxlen=_MOST_EARLY)
+        columns: list[Columns] = []
         had_caught_up = False
         try:
-            for state, begun in follow_home(self.home, self.since, stop, self.say):
+            for state, begun, read in follow_home(self.home, self.since, stop, self.say):
                 self._live()
                 early += begun
+                columns += (part for part in read if part.type != message_types.LABEL)
                 if state.caught_up:
-                    self._tell(state, list(early), is_first=not had_caught_up)
+                    self._tell(state, list(early), columns, is_first=not had_caught_up)
                     early.clear()
+                    columns = []
                 had_caught_up = state.caught_up
         finally:
             notify(["STOPPING=1"])
@@ -132,7 +137,14 @@ class Bridge:
             self._watchdog_due = time.monotonic() + _WATCHDOG_SECONDS
             notify(["WATCHDOG=1"])
 
-    def _tell(self, state: HomeState, begun: Sequence[SoundEvent], *, is_first: bool) -> None:
+    def _tell(
+        self,
+        state: HomeState,
+        begun: Sequence[SoundEvent],
+        columns: Sequence[Columns],
+        *,
+        is_first: bool,
+    ) -> None:
         now = time.time_ns()
         moment = today(now, self.home.zone)
         ended = [event for each in state.every() for event in each.ended_events()]
@@ -140,7 +152,7 @@ class Bridge:
             give_back()  # memory used while reading the log
             ended = [event for event in ended if now - event.end <= RECENT]
         recent = [event for event in begun if now - event.end <= RECENT]
-        news = News(state, recent, ended, moment, self.home.zone)
+        news = News(state, recent, ended, moment, self.home.zone, columns)
         for name, output in self.outputs.items():
             self._try(name, partial(output.update, news))
         for microphone in state.every():

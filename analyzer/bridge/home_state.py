@@ -362,7 +362,7 @@ _TICK_SECONDS = 0.5
 
 def follow_home(
     home: RecorderAddress, start: int, stop: Flag, say: Callable[[str], None]
-) -> Iterator[tuple[HomeState, list[SoundEvent]]]:
+) -> Iterator[tuple[HomeState, list[SoundEvent], list[Columns]]]:
     """Follow the logs of a recorder, and update the state of its home.
 
     Parameters
@@ -378,13 +378,15 @@ def follow_home(
         Always the same object: after each batch of messages, and twice a second without any.
     begun : list of SoundEvent
         Events that began with the batch.
+    columns : list of Columns
+        Messages of the batch, with the fields of `FIELDS`.
     """
     state, folder = HomeState(), home.folder
     state.never_tell = current_list(folder, home.never_tell)
     while not folder.is_dir():
         say(f"{folder}: no such folder yet; waiting for a recorder")
         state.caught_up = True
-        yield state, []
+        yield state, [], []
         if stop.wait(_WAIT_SECONDS):
             return
     state.caught_up = False
@@ -400,27 +402,28 @@ def follow_home(
                 state.never_tell = current_list(folder, home.never_tell)
                 state.caught_up = True
                 yielded = time.monotonic()
-                yield state, []
+                yield state, [], []
         elif log_name(path).node == home.node:
             if path != current and not is_layer(path):
                 current = path
                 state.begin_log()
                 _check_version(path, say)
             yielded = time.monotonic()
-            yield state, _push(state, path, batch, say)
+            yield state, *_push(state, path, batch, say)
         if stop.is_set():
             return
 
 
 def _push(
     state: HomeState, log: Path, batch: list[RawMessages], say: Callable[[str], None]
-) -> list[SoundEvent]:
-    """Add a batch of messages from a log; return the events that they begin."""
+) -> tuple[list[SoundEvent], list[Columns]]:
+    """Add a batch of messages from a log; return the events that they begin, and the messages."""
     try:
-        return state.push(_decode(batch))
+        columns = _decode(batch)
+        return state.push(columns), columns
     except LogError as error:
         say(f"{log}: {error}")
-        return []
+        return [], []
 
 
 def _check_version(log: Path, say: Callable[[str], None]) -> None:

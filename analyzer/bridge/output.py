@@ -15,6 +15,7 @@ from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
 
 RECENT = 60 * NANOSECONDS  # after its end an event is no longer reported
 
@@ -32,6 +33,8 @@ class News(NamedTuple):
         Current day and last night.
     zone : tzinfo
         Time zone of the home.
+    columns : sequence of Columns
+        Messages since the last update, except labels.
     """
 
     state: HomeState
@@ -39,6 +42,7 @@ class News(NamedTuple):
     ended: Sequence[SoundEvent]
     today: Today
     zone: tzinfo
+    columns: Sequence[Columns] = ()
 
 
 class Output(Protocol):

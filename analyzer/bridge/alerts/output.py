@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
 
-from hearthlog.analyzer.activity.live import FIELDS, LiveActivity, LiveLabel, is_of_alerts
+from hearthlog.analyzer.activity.live import LiveActivity, LiveLabel
 from hearthlog.analyzer.activity.segments import HomeActivity, SegmentCollector, read_activity
 from hearthlog.analyzer.bridge.alerts.delivery import (
     UNREAD,
@@ -36,16 +36,13 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     is_hidden,
     live_history,
 )
-from hearthlog.analyzer.bridge.home_state import decode_fields
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, StateFile, secret_path
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.logs.files import log_name
-from hearthlog.schemas.logs.follow import follow_messages
-from hearthlog.schemas.mcap.raw_messages import RawMessages
+from hearthlog.schemas.logs.columns import Columns
 
 
 class RuleProgressStore:
@@ -172,10 +169,10 @@ OnNotification = Callable[[str, str, int], bool]
 BROKER = "mqtt"  # in place of a target name
 _PATIENCE = 30 * NANOSECONDS
 _TO_COME = 60 * NANOSECONDS  # from now: later messages were written while a clock was ahead
-_LOOK_SECONDS = 1.0
+_LOOK_SECONDS, _NEWS_SECONDS = 1.0, 0.2
 _FORGET_SECONDS = 300.0
 _CLOSE_SECONDS = 2.0
-_LABELS = 10_000
+_LABELS, _COLUMNS = 10_000, 100_000
 _LOOK_AT_FILE_SECONDS = 5.0
 _WAIT_SECONDS = 60.0  # for news, without a recorder
 
@@ -230,6 +227,7 @@ class AlertsOutput:
         self._began = time.monotonic()
         self._has_news = Flag()  # set by the first update
         self._labels: deque[tuple[str, LiveLabel, Sequence[str]]] = deque(maxlen=_LABELS)
+        self._columns: deque[Columns] = deque(maxlen=_COLUMNS)
         self._told_now: tuple[Notification, str] | None = None  # being delivered to the broker
         self._stop = Flag()
         self._delivery = Delivery(self._outbox, [], home.node, home.zone, say)
@@ -244,6 +242,7 @@ class AlertsOutput:
                 label = LiveLabel(microphone.heard.time, microphone.label, microphone.confidence)
                 self._labels.append((microphone.name, label, microphone.classes))
         self._watch.never_tell = news.state.never_tell
+        self._columns += news.columns
         self._has_news.set()
         if self._on_notification is not None:
             while self._publish_ring(self._on_notification):
@@ -311,48 +310,36 @@ class AlertsOutput:
         self._delivery.set_targets(targets)
 
     def _follow(self) -> None:
-        """Follow the log, and evaluate the rules whenever reading has caught up.
+        """Read what the rules need of the past, and evaluate the rules as news come.
 
-        Returns when the clock is set back: messages read so far may be from the future.
+        Returns when the clock is set back: messages so far may be from the future.
         """
-        logs, looked, forgot = self._followed.folder, 0.0, time.monotonic()
+        home, looked, forgot = self._followed, -math.inf, time.monotonic()
         now = self._latest = time.time_ns()
         self._watch.set_right(now)
-        start = self._watch.needed_from(now)
-        self._heard = LiveActivity(start, _PATIENCE)
-        while not logs.is_dir():
-            self._find_targets()
-            self._look()
-            if self._stop.wait(_LOOK_SECONDS):
-                return
-        batches = follow_messages(logs, is_of_alerts, start, self._stop, self._damaged, ticks=True)
-        caught_up = False
-        for path, batch in batches:
+        self._heard = LiveActivity(self._watch.needed_from(now), _PATIENCE)
+        with suppress(LogError):  # no log yet
+            self._heard.read(
+                find_home_logs([home.folder]), home.node, now + _TO_COME, self._damaged
+            )
+        while not self._stop.wait(_NEWS_SECONDS):
             if self._now() < self._latest - AHEAD:
                 return
             self._find_targets()
-            if path == logs:
-                caught_up = True
-            elif log_name(path).node == self._followed.node:
-                self._push(path, batch)
-            if caught_up and time.monotonic() - looked >= _LOOK_SECONDS:
+            while self._columns:
+                self._push(self._columns.popleft())
+            if time.monotonic() - looked >= _LOOK_SECONDS:
                 self._look()
                 looked = time.monotonic()
             if time.monotonic() - forgot >= _FORGET_SECONDS:
                 self._heard.forget_before(self._watch.needed_from(time.time_ns()))
                 forgot = time.monotonic()
 
-    def _push(self, path: Path, batch: Sequence[RawMessages]) -> None:
-        try:
-            end = self._now() + _TO_COME
-            known = [raw.between(None, end) for raw in batch]
-            if sum(map(len, known)) < sum(map(len, batch)):
-                self._say(
-                    f"alerts: {path}: was the clock ahead? segments in the future are left out"
-                )
-            self._heard.push(decode_fields(known, FIELDS))
-        except LogError as error:
-            self._damaged(f"{path}: {error}")
+    def _push(self, columns: Columns) -> None:
+        known = columns.between(None, self._now() + _TO_COME)
+        if len(known) < len(columns):
+            self._say("alerts: was the clock ahead? segments in the future are left out")
+        self._heard.push([known])
 
     def _look(self) -> None:
         if not self._has_news.is_set() and time.monotonic() - self._began < _WAIT_SECONDS:
