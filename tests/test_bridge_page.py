@@ -512,7 +512,7 @@ def test_a_0_is_said_only_where_it_was_listened_for(first, gap, today_known, nig
         fields = {"header.stamp": np.array([start]), "duration": np.array([end - start])}
         state.push([Columns("/mic/gap", message_types.GAP, {}, times, times, times, fields)])
     (microphone,) = state.microphones.values()
-    microphone.classes, microphone.seen = ["silence", "coughing"], time.monotonic()
+    microphone.names, microphone.seen = ["silence", "coughing"], time.monotonic()
     now = today(begin + 10 * hour, UTC)
     lanes = {
         each["words"]: each for each in day_picture([microphone], now, UTC)["rooms"][0]["lanes"]

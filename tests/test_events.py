@@ -124,7 +124,7 @@ def test_a_cough_from_the_television_is_counted_no_more(home, hearthlog):
         path for path in find_logs(home) if not is_layer(path) and "home_20260302T02" in path.name
     ]
     begin = midnight(DAY) + int(at("02:10")) * NANOSECONDS
-    write_marks(log, [Mark("kitchen", begin, begin + 60 * NANOSECONDS, "Television")])
+    write_marks(log, [Mark("kitchen", begin, begin + 60 * NANOSECONDS, "television")])
     night = found(hearthlog, home, "--night", "--day", DAY)
     assert "coughing" not in night["counts"]
     assert "television" not in night["counts"], "no model has it"

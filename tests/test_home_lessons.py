@@ -212,7 +212,7 @@ def test_the_floor_begins_anew_behind_a_gap_as_that_of_the_recorder_did(tmp_path
     np.testing.assert_array_equal(found, np.concatenate(floors)[: len(found)])
 
 
-@pytest.mark.parametrize("answer", ["unknown", "television", "TV"])
+@pytest.mark.parametrize("answer", ["unknown", "television", "tv"])
 def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(
     home, model_file, answer
 ):

@@ -66,6 +66,8 @@ class LiveMicrophone:
 
     Attributes
     ----------
+    names : list of str
+        Classes of the model, empty while unknown.
     label, confidence : str, float
         The newest label; empty before the first.
     level_dbfs : float
@@ -80,7 +82,7 @@ class LiveMicrophone:
         self.name = name
         self._unnamed = unnamed
         self.never_tell: frozenset[str] = frozenset()  # classes that no output shows
-        self._names: list[str] = []
+        self.names: list[str] = []
         self.heard = ActiveClasses([])
         self.label, self.confidence = "", 0.0
         self.level_dbfs = math.nan
@@ -96,7 +98,7 @@ class LiveMicrophone:
     def classes(self) -> list[str]:
         """Classes of the model that outputs show, silence among them."""
         left_out = {*self._unnamed, *self.never_tell} - {SILENCE}
-        return [name for name in self._names if name not in left_out]
+        return [name for name in self.names if name not in left_out]
 
     @property
     def shown_label(self) -> str:
@@ -128,8 +130,8 @@ class LiveMicrophone:
     def push_labels(self, columns: Columns) -> None:
         """Add labels, with the fields of `FIELDS`."""
         classes = _class_names(columns)
-        if classes and classes != self._names:
-            self._names = classes
+        if classes and classes != self.names:
+            self.names = classes
             self.heard = ActiveClasses(classes)
         self.heard.push(columns["label"].tolist(), columns.log_times)
         self.since = self.since or int(columns.log_times[0])

@@ -4,7 +4,7 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import tzinfo
 from ipaddress import ip_address
 from pathlib import Path
@@ -275,6 +275,7 @@ def _today(own: LiveMicrophone, midnight: int) -> str:
 BIN = 120 * NANOSECONDS  # as in the picture of the report
 _HOUR = 3600 * NANOSECONDS
 _LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
+_MOST_TIMES = 40  # of a count
 _SILENT = 60 * NANOSECONDS  # shortest gap that is drawn
 _DIGITS = 4  # decimals of a position in the day, 0 to 1
 
@@ -333,6 +334,8 @@ def _lane(
     how_often = "not known" if count is None else times(count)
     summary = f"{words}: {how_often} today" + (f", last at {last_heard}" if count else "")
     events = microphone.events(label, day.start - 24 * _HOUR)
+    of_night = [e for e in events if today.night <= e.start < today.morning]
+    of_day = [e for e in events if e.start >= today.midnight]
     return {
         "label": label,
         "words": words,
@@ -342,7 +345,15 @@ def _lane(
         "today": count,
         "night": night,
         "last": last_heard,
+        "times": [_times(of_day, day.zone), _times(of_night, day.zone)],
     }
+
+
+def _times(events: Sequence[SoundEvent], zone: tzinfo) -> str:
+    """Return when events began, newest first; the oldest of many are counted."""
+    shown = [clock(event.start, zone) for event in reversed(events[-_MOST_TIMES:])]
+    left = len(events) - len(shown)
+    return ", ".join(shown) + (f" and {left} before" if left else "")
 
 
 def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:

@@ -107,16 +107,29 @@ function beginLane(it) {
   const svg = draw("svg", { role: "img", preserveAspectRatio: "none" }, draw("title", {}), path({ class: "shade" }),
     path({ fill: "url(#unheard)" }), path({ class: "marks", fill: `rgb(${it.colour.join(" ")})` }),
     path({ class: "moment" }));
-  const cells = [make("td"), make("td"), make("td")];
-  const hide = make("button", { type: "button", class: "hide", title: `Show ${it.words} nowhere` }, "Hide");
-  hide.append(make("span", { class: "hidden" }, ` ${it.words}`));
+  const counts = ["today", "last night"].map((when) => {
+    const count = make("button", { type: "button", class: "count", "aria-expanded": "false", title: `When, ${when}` });
+    count.addEventListener("click", () => openTimes(times, counts, count));
+    return count;
+  });
+  const hide = make("button", { type: "button", class: "back" }, `Hide ${it.words.toLowerCase()} everywhere`);
   hide.addEventListener("click", () => showClass(it.label, "no"));
-  const row = make("tr", {}, make("th", { scope: "row" }, swatch(it.colour), it.words), ...cells,
-    make("td", {}, hide));
-  return { name: make("div", { class: "name", "aria-hidden": "true" }, it.words), svg, row, cells };
+  const times = make("tr", { class: "times", hidden: "" },
+    make("td", { colspan: 4 }, make("p", { class: "about" }), hide));
+  const cells = [make("td", {}, counts[0]), make("td", {}, counts[1]), make("td")];
+  const row = make("tr", {}, make("th", { scope: "row" }, swatch(it.colour), it.words), ...cells);
+  return { name: make("div", { class: "name", "aria-hidden": "true" }, it.words), svg, row, times, counts, cells };
 }
 
-function showLane({ svg, cells }, it, gaps, day, width) {
+// Shows below a sound when it was heard; a second click hides the times again.
+function openTimes(times, counts, chosen) {
+  const isOpen = chosen.getAttribute("aria-expanded") === "true";
+  counts.forEach((count) => set(count, "aria-expanded", String(count === chosen && !isOpen)));
+  times.hidden = isOpen;
+  if (!isOpen) write(times.querySelector("p"), chosen.dataset.times);
+}
+
+function showLane({ svg, times, counts, cells }, it, gaps, day, width) {
   const [title, night, unheard, heard, moment] = svg.children;
   write(title, it.told);
   set(svg, "aria-label", it.told);
@@ -125,10 +138,15 @@ function showLane({ svg, cells }, it, gaps, day, width) {
   set(unheard, "d", spans(gaps, width));
   set(heard, "d", marks(it.bars, width, day.hours.length));
   set(moment, "d", `M${day.now * width} 0V${LANE}`);
-  [it.today, it.night, it.last].forEach((value, index) => {
+  [it.today, it.night].forEach((value, index) => {
+    const count = counts[index];
     cells[index].className = value ? "" : "none";
-    write(cells[index], String(value ?? "not known") || "not lately");
+    count.dataset.times = it.times[index] || (value === 0 ? "Not once." : "Not known.");
+    write(count, String(value ?? "not known"));
+    if (count.getAttribute("aria-expanded") === "true") write(times.querySelector("p"), count.dataset.times);
   });
+  cells[2].className = it.last ? "" : "none";
+  write(cells[2], it.last || "not lately");
 }
 
 function showHours(svg, day, width) {
@@ -142,11 +160,11 @@ function showHours(svg, day, width) {
 function beginRoom({ room, lanes }, isAlone) {
   const begun = lanes.map(beginLane);
   const hours = draw("svg", { class: "hours", "aria-hidden": "true" });
-  const heads = ["Sound", "Today", "Last night", "Last heard", ""];
+  const heads = ["Sound", "Today", "Last night", "Last heard"];
   const table = make("table", {},
     make("caption", { class: "hidden" }, `How often each sound was heard${isAlone ? "" : `: ${room}`}`),
     make("thead", {}, make("tr", {}, ...heads.map((text) => make("th", { scope: "col" }, text)))),
-    make("tbody", {}, ...begun.map(({ row }) => row)));
+    make("tbody", {}, ...begun.flatMap(({ row, times }) => [row, times])));
   const block = make("div", { class: "lanes" }, ...begun.flatMap(({ name, svg }) => [name, svg]), hours);
   const heading = isAlone ? [] : [make("h3", {}, room)];
   const unheard = make("p", { class: "note" }, "Nothing was heard here today.");

@@ -1,0 +1,170 @@
+"""One day with everything in it has the same numbers on every surface."""
+
+import json
+from datetime import date, timedelta
+from functools import partial
+from threading import Event
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pytest
+from homelife import GENERAL, at, midnight, write_day
+from livehome import rule
+from spliced import run
+
+from hearthlog.analyzer.activity.daily_metrics import day_of, home_sound, whole_home
+from hearthlog.analyzer.activity.day_profile import COUNT, LENGTH, Profiles
+from hearthlog.analyzer.activity.home_data import read_home
+from hearthlog.analyzer.activity.segments import read_activity
+from hearthlog.analyzer.bridge.alerts.evaluation import notifications
+from hearthlog.analyzer.bridge.home_state import follow_home
+from hearthlog.analyzer.bridge.output import Totals
+from hearthlog.analyzer.bridge.page.home_page import day_picture
+from hearthlog.analyzer.bridge.settings import RecorderAddress
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, today
+from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.files import find_logs, is_layer
+
+DAY, ZONE = date(2026, 3, 29), ZoneInfo("Europe/Vienna")  # an hour is missing in this night
+SOUNDS = [name for name in GENERAL if name != SILENCE]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Three days: a cough over midnight, one at the missing hour, a television, a gap."""
+    folder, rng = tmp_path_factory.mktemp("activity") / "logs", np.random.default_rng(8)
+    for day in (DAY - timedelta(days=2), DAY - timedelta(days=1), DAY):
+        television = [
+            (at("17:00") + 12 * n + rng.uniform(0, 4), rng.uniform(1, 7), str(label), 0.7)
+            for n, label in enumerate(rng.choice(SOUNDS, 400))
+        ]
+        events = [
+            (second, rng.uniform(0.5, 3), "coughing", rng.uniform(0.4, 1))
+            for second in (at("00:59:59"), at("01:00:05"), at("01:30"), at("05:10"), at("20:30"))
+        ]
+        events.append((at("07:00"), 900.0, "speech", 0.8))
+        if day < DAY:
+            events.append((at("22:59:57"), 5.0, "crying", 0.9))  # over midnight
+        gaps = [(at("12:00"), 3000, "unplugged")]
+        write_day(folder, day, [*events, *television], gaps=gaps, timezone="Europe/Vienna")
+    return folder
+
+
+def day_metrics(logs, labelling="live"):
+    before = day_span(DAY - timedelta(days=1), ZONE)[0]
+    data = read_home(find_home_logs([logs]), labelling, before, day_span(DAY, ZONE))
+    return data, day_of(whole_home(data), DAY, ZONE)
+
+
+def reported(logs):
+    """Of each sound: counts of the day and its night, those beside a television included."""
+    _, day = day_metrics(logs)
+    counts = {}
+    for name in SOUNDS:
+        night = len(day.home.events_in(name, day.night))
+        counts[name] = day.count(name).labelled + day.beside_television(name), night
+    assert sum(beside for beside, _ in counts.values()) > 100
+    return counts
+
+
+@pytest.fixture(scope="module")
+def followed(logs):
+    """What the bridge knows after it has read the logs."""
+    start = today(day_span(DAY, ZONE)[1] - 1, ZONE).midnight - 12 * 3600 * NANOSECONDS
+    home = RecorderAddress(logs, "home", ZONE)
+    states = follow_home(home, start, stop := Event(), pytest.fail)
+    state = next(state for state, _, _ in states if state.caught_up)
+    stop.set()
+    return state
+
+
+def test_the_bridge_counts_what_the_report_counts(logs, followed):
+    (own,) = followed.microphones.values()
+    start, end = day_span(DAY, ZONE)
+    # In the evening before 22:00 the last night is the one that ended in the morning.
+    moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
+    known = own.known_of(moment)
+    for name, (of_day, of_night) in reported(logs).items():
+        events = [event for event in own.events(name, start) if event.start < end]
+        assert (len(events), own.counts(name, moment, known)[1] or 0) == (of_day, of_night), name
+
+
+def test_the_page_shows_the_counts_of_the_report(logs, followed):
+    moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
+    (room,) = day_picture(followed.microphones.values(), moment, ZONE)["rooms"]
+    (own,) = followed.microphones.values()
+    for lane in room["lanes"]:
+        name = lane["label"]
+        later = [e for e in own.events(name, moment.now) if e.start < day_span(DAY, ZONE)[1]]
+        of_day, of_night = reported(logs)[name]
+        assert ((lane["today"] or 0), lane["night"] or 0) == (of_day, of_night), (name, later)
+
+
+def test_totals_and_alerts_count_what_the_report_counts(logs, followed, tmp_path):
+    start, end = day_span(DAY, ZONE)
+    totals = Totals(tmp_path / "totals.json", start)
+    counted = {total.label: total.events for total in totals.count(followed, end)}
+    hour = 3600 * NANOSECONDS
+    heard = read_activity(find_home_logs([logs]), "home", start - hour, end, pytest.fail)
+    for name, (of_day, _) in reported(logs).items():
+        assert counted.get(name, 0) == of_day, name
+        if of_day:
+            hours = (end - start) // hour
+            for count, rings in ((of_day - 1, True), (of_day, False)):
+                one = rule("more_than", count=count, window=f"{hours}h", **{"class": name})
+                rang, _ = notifications(one, heard, end - NANOSECONDS, end, ZONE)
+                assert bool(rang) == rings, (name, count)
+
+
+def test_the_routine_counts_and_measures_what_the_report_does(logs):
+    data, day = day_metrics(logs)
+    profiles = Profiles(home_sound(data, day.home), ZONE, night_after=False)
+    values = dict(zip(profiles.figures, profiles.of(DAY).values, strict=True))
+    waking = at_hour(DAY, MORNING, ZONE), at_hour(DAY, EVENING, ZONE)
+    for figure, value in values.items():
+        if figure.what in SOUNDS and figure.kind == COUNT:
+            start, end = waking if not figure.night else (day.night.starts[0], day.night.ends[0])
+            starts = day.home.events[figure.what]
+            inside = starts[(starts >= start) & (starts < end)]
+            share = day.home.coverage
+            listened = sum(
+                max(min(b, end) - max(a, start), 0) for a, b in zip(*share, strict=True)
+            ) / (end - start)
+            counted = day.home.minutes.counted(figure.what, inside)
+            assert value == pytest.approx(len(counted) / listened), figure
+    assert {figure.kind for figure in values} >= {COUNT, LENGTH}
+
+
+def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(logs, capfd):
+    hearthlog = partial(run, capfd)
+
+    def listed(*words):
+        result = hearthlog("events", logs, "--day", DAY, "--json", *words)
+        counts = json.loads(result.stdout)["counts"]
+        return {name: counts.get(name, {"counted": 0, "television": 0}) for name in SOUNDS}
+
+    def expected():
+        _, day = day_metrics(logs)
+        return {
+            name: {
+                "counted": day.count(name).labelled,
+                "television": day.beside_television(name),
+            }
+            for name in SOUNDS
+        }
+
+    before = listed()
+    assert before == expected()
+    start = midnight(DAY) + int(at("05:10")) * NANOSECONDS
+    (log,) = [path for path in find_logs(logs) if not is_layer(path) and "20260329T05" in path.name]
+    layer = write_marks(log, [Mark("mic", start, start + 5 * NANOSECONDS, "laughing")])
+    try:
+        after = listed()
+        assert after == expected()
+        assert after["coughing"]["counted"] == before["coughing"]["counted"] - 1
+        assert after["laughing"]["counted"] == before["laughing"]["counted"] + 1
+    finally:
+        layer.unlink()
