@@ -127,6 +127,11 @@ class Served:
     def marks(self):
         return [mark for log in find_logs(self.log.folder) for mark in read_marks(log)]
 
+    def events(self):
+        """The last events as the page shows them."""
+        with self.stream() as part:
+            return part("events")["events"]
+
     def open_stream(self):
         """Ask for the stream of news; return the connection, or None if there are too many."""
         connection = self.connect()

@@ -710,6 +710,25 @@ def test_the_page_says_what_is_heard_now_as_the_log_does(phone, lived):
     assert live == ["heard"]
 
 
+def test_a_tap_on_a_count_shows_when_and_hides_a_sound_everywhere(phone, lived):
+    lived.log.hears("speech", "living_room")
+    phone.open(lived)
+    row = "[...document.querySelectorAll('tbody tr')].find((e) => e.innerText.startsWith('Music'))"
+    phone.until(row)
+    start = next(e for e in lived.events() if e["label"] == "music")["time"]
+    phone.of(f"{row}.querySelector('button').click()")
+    phone.until(f"{row}.nextSibling.innerText.includes({start[:5]!r})")
+    assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+    phone.of(f"{row}.nextSibling.querySelector('button').click()")
+    phone.shows("#hidden-said", "Music is shown nowhere now.")
+    phone.until(f"!{row}")
+    phone.shows("#hidden-classes", "Show music again")
+    assert phone.of(PALE_TEXTS) == []
+    phone.of("document.querySelector('#hidden-classes button').click()")
+    phone.until(row)
+    phone.until("document.querySelector('#hidden-sounds').hidden")
+
+
 def test_what_is_wrong_is_said_at_the_top_and_below(phone, lived):
     phone.open(lived)
     lived.log.hears("speech", "living_room")

@@ -47,7 +47,7 @@ def test_what_is_heard_does_not_depend_on_how_the_labels_came(labels, cuts):
 def ends_of(spans, seconds):
     """When a microphone that heard coughs in some spans was told of which event's end, in s."""
     microphone, ends = LiveMicrophone("mic"), []
-    microphone.classes, microphone.heard = CLASSES, ActiveClasses(CLASSES)
+    microphone.names, microphone.heard = CLASSES, ActiveClasses(CLASSES)
     microphone.seen = math.inf
     for now in range(seconds):
         times = now * NANOSECONDS + FRAME * np.arange(20)
