@@ -43,6 +43,7 @@ RUNS = (
     "models compare general home-1 --logs logs",
     "models promote home-1",
     "alerts replay logs --config rules.toml",
+    "events logs",
     "enrol coughing --home logs --file evening.flac",
     "export logs --format wav --output clips",
     "export logs --topics /mic/label --output labels.npz",

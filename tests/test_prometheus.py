@@ -12,7 +12,7 @@ import pytest
 from livehome import LiveHome, following
 from prometheus_client.parser import text_string_to_metric_families
 
-from hearthlog.analyzer import http
+from hearthlog.analyzer import http as http_server
 from hearthlog.analyzer.bridge import home_state, prometheus
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
@@ -250,7 +250,7 @@ def test_who_asks_slowly_holds_up_neither_the_others_nor_the_end(home, tmp_path,
     with ExitStack() as slow:
         with bridged(home, tmp_path, port=port):
             wait_for(lambda: known(port))
-            for _ in range(2 * http.MOST_ASKING):
+            for _ in range(2 * http_server.MOST_ASKING):
                 own = slow.enter_context(socket.create_connection(("127.0.0.1", port)))
                 own.sendall(request_so_far)
             for _ in range(3):
@@ -260,7 +260,7 @@ def test_who_asks_slowly_holds_up_neither_the_others_nor_the_end(home, tmp_path,
 
 
 def test_a_request_that_does_not_end_is_ended(home, tmp_path, monkeypatch):
-    monkeypatch.setattr(http, "SECONDS", 0.5)
+    monkeypatch.setattr(http_server, "SECONDS", 0.5)
     home.hears("silence")
     port = free_port()
     with (

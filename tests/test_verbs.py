@@ -53,6 +53,7 @@ READING = (
     "discover logs --least 2",
     "voices --help",
     "report logs --day 2026-03-01 --output day.html",
+    "events logs --day 2026-03-01",
     "replay logs --model first.safetensors",
     "models list --folder .",
     "pause logs --for 1h",

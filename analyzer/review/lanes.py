@@ -237,7 +237,7 @@ def _classes(
 ) -> dict[str, Colour]:
     """Return the displayed names of classes with their colours, the most important first.
 
-    Classes that were heard come first, then others, up to the number of lanes.
+    Those that were heard, and as many others as there are lanes left.
     """
     known = {name for one in labellings for name in (*one.classes, *one.spans.texts)}
     own = [name for name in microphone.classes if name in known and class_name(name) != SILENCE]
@@ -248,10 +248,11 @@ def _classes(
             rows = one.spans.texts == name
             seconds[in_words(name)] += int((one.spans.ends - one.spans.starts)[rows].sum())
     shades = {in_words(name): colour(name) for name in reversed(names)}
-    heard = [name for name in map(in_words, names) if seconds[name]]
+    heard = [name for name in shades if seconds[name]]
     silent = [in_words(name) for name in names if not seconds[in_words(name)]]
     room = max(_MOST_LANES - len(heard), 0)
-    return {name: shades[name] for name in dict.fromkeys([*heard, *silent[:room]])}
+    shown = {*heard, *silent[:room]}
+    return {name: shades[name] for name in map(in_words, names) if name in shown}
 
 
 def _of_class(spans: LabelledSpans, name: str) -> LabelledSpans:
