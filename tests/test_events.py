@@ -132,7 +132,7 @@ def test_a_cough_from_the_television_is_counted_no_more(home, hearthlog):
 
 def test_a_sound_that_two_rooms_hear_is_one_and_names_both(home, hearthlog):
     words = "--start", "2026-03-02T08:00", "--end", "2026-03-02T10:00"
-    (speech,) = found(hearthlog, home, *words, "--label", "speech")["events"]
+    (speech,) = found(hearthlog, home, *words, "--label", "Talking")["events"]
     assert speech["microphones"] == ["hall", "kitchen"]
     assert (speech["seconds"], speech["confidence"]) == (60.0, 0.95)
 

@@ -37,7 +37,9 @@ def events(
     *,
     label: Annotated[
         list[str] | None,
-        typer.Option(help="Class, such as coughing; may be repeated. By default all sounds."),
+        typer.Option(
+            help="Class, such as coughing or talking; may be repeated. By default all sounds."
+        ),
     ] = None,
     day: Annotated[
         str | None,
@@ -166,7 +168,7 @@ def _chosen_classes(
 ) -> list[str]:
     """Return the classes of labels; all sounds without labels."""
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.models.classes import SILENCE, class_name, meant_by
+    from hearthlog.models.classes import SILENCE, class_name, in_words, meant_by
 
     sounds = [name for name in known if name != SILENCE]
     if not labels:
@@ -175,7 +177,8 @@ def _chosen_classes(
     for label in labels:
         if class_name(label) in hidden:
             raise DataError(f"{label} is hidden: never_tell, or the page of the home, says so")
-        meant = meant_by(label, sounds)
+        meant = [name for name in sounds if in_words(name).lower() == label.lower()]
+        meant = meant or meant_by(label, sounds)
         if len(meant) != 1:
             raise DataError(f"no class {label[:64]!r} here; there are {', '.join(sounds)}")
         chosen += meant

@@ -276,10 +276,12 @@ def _gap_lines(summary: "LogSummary") -> Iterator[str]:
 
 
 def _label_rows(summary: "LogSummary") -> Iterator[tuple[str, ...]]:
+    from hearthlog.models.classes import ordered
+
     for microphone in dict.fromkeys([*summary.label_seconds, *summary.segments]):
         seconds = summary.label_seconds.get(microphone, Counter())
         segments = summary.segments.get(microphone, Counter())
-        for label in dict.fromkeys([*(name for name, _ in seconds.most_common()), *segments]):
+        for label in ordered([*seconds, *segments]):
             yield microphone, label, f"{seconds[label] / 60:.2f}", str(segments[label])
 
 
