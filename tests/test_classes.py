@@ -63,7 +63,14 @@ def test_every_label_has_a_colour_of_its_own_a_duration_and_words(label):
 def test_how_long_a_sound_is_expected_to_go_on_without_a_pause():
     seconds = {"silence": 2.5, "coughing": 1, "music": 20, "shower": 60}
     others = ("speech", "phone_ring", "crying", "yelling", "laughing", "objects_activity")
-    others += ("flushing_water", "tap_water", "bathroom_other", "other_negative", "television", "other")
+    others += (
+        "flushing_water",
+        "tap_water",
+        "bathroom_other",
+        "other_negative",
+        "television",
+        "other",
+    )
     seconds |= dict.fromkeys((*others, "unknown"), 10)
     assert {row.name: row.seconds for row in CLASSES} == seconds
 
