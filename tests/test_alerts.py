@@ -108,6 +108,36 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
     assert outbox.waiting_for("x", 1 << 62) == sorted(found, key=lambda ring: ring.time)
 
 
+def test_what_was_read_and_the_news_after_it_are_the_activity_of_a_replay(tmp_path):
+    """Also what is among the news although it was read."""
+    rng = np.random.default_rng(6)
+    events = [(second, 2.0, "coughing", 0.9) for second in rng.uniform(0, 4 * HOUR, 80)]
+    gaps = [(5000, 600, "unplugged")]
+    write_day(tmp_path, DAY, events, classes=CLASSES, hours=range(4), gaps=gaps)
+    begin, logs = midnight(DAY), find_home_logs([tmp_path])
+    columns = [
+        part
+        for kind in ("segment", "gap")
+        for part in read_columns(find_logs(tmp_path), [f"/mic/{kind}"]).values()
+    ]
+    live = LiveActivity(begin, 30 * SECOND)
+    live.read(logs, "home", begin + 2 * HOUR * SECOND, pytest.fail)
+    halfway = live.heard().written
+    assert len(halfway.starts) == 1, "the recorder wrote in the gap, too"
+    for number in range(8):
+        edges = [begin + half * HOUR * SECOND // 2 for half in (number, number + 1)]
+        live.push([part.between(*edges) for part in columns])
+    live.push([part.between(begin + 4 * HOUR * SECOND, None) for part in columns])
+    expected = read_activity(logs, "home", begin, 1 << 62, pytest.fail)
+    assert live.heard().sounds.keys() == expected.sounds.keys()
+    for key, own in expected.sounds.items():
+        got = live.heard().sounds[key]
+        np.testing.assert_array_equal(got.starts, own.starts)
+        np.testing.assert_array_equal(got.ends, own.ends)
+    for one, other in zip(live.heard().coverage["mic"], expected.coverage["mic"], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_no_more_is_known_than_labels_have_decided():
     live, begin = LiveActivity(0, 30 * SECOND), 1000
     assert live.known_until(2000 * SECOND) == 1970 * SECOND  # nobody is heard
