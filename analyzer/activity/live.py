@@ -155,8 +155,8 @@ class LiveActivity:
         with LogFile(path) as file:
             spans = zip(file.chunks["start"].tolist(), file.chunks["end"].tolist(), strict=True)
             for first, last in spans:
-                if last < end:
-                    self._collector.add_written_span(first, last)
+                if first < end:
+                    self._collector.add_written_span(first, min(last, end))
         selection = select([path])
         for kind, fields in _READ.items():
             topics = filter(is_of_alerts, selection.topics_of(kind, set(fields)))
