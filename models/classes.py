@@ -70,7 +70,7 @@ CLASSES = (
     SoundClass(BATHROOM_OTHER,   ( 93,  83,  63),  10.0, "Bathroom other"),
     SoundClass(OTHER_NEGATIVE,   (195, 202, 199),  10.0, "Other negative"),
     SoundClass(TELEVISION,       (164, 140, 134),  10.0, "Television",
-               "", ("tv", "radio", "from_the_television")),
+               "", ("tv", "from_the_television")),
     SoundClass(OTHER,            (101, 111, 208),  10.0, "Other sounds"),
     SoundClass(UNKNOWN,          (255, 255, 255),  10.0, "Not sure"),
 )

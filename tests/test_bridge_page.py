@@ -757,7 +757,8 @@ def test_a_screen_reader_is_told_what_everything_is(phone, lived):
     images = [name for role, name in tree if role == "image"]
     assert len(images) == len(GENERAL) - 1
     cells = [name for role, name in tree if role in {"cell", "gridcell"}]
-    assert "not known" in cells  # of the last night, before which nothing was recorded
+    # Nothing was recorded before the last night.
+    assert "Coughing, Living room, last night: not known" in cells
     assert any(name.startswith("Coughing: once today, last at ") for name in images)
     assert "Crying: never today" in images
     buttons = [name for role, name in tree if role == "DisclosureTriangle"]

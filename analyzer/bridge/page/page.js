@@ -102,13 +102,14 @@ function set(element, name, value) {
   if (element.getAttribute(name) !== value) element.setAttribute(name, value);
 }
 
-function beginLane(it) {
+function beginLane(it, room) {
   const path = (attributes) => draw("path", attributes);
   const svg = draw("svg", { role: "img", preserveAspectRatio: "none" }, draw("title", {}), path({ class: "shade" }),
     path({ fill: "url(#unheard)" }), path({ class: "marks", fill: `rgb(${it.colour.join(" ")})` }),
     path({ class: "moment" }));
   const counts = ["today", "last night"].map((when) => {
     const count = make("button", { type: "button", class: "count", "aria-expanded": "false", title: `When, ${when}` });
+    count.dataset.about = [it.words, room, when].filter(Boolean).join(", ");
     count.addEventListener("click", () => openTimes(times, counts, count));
     return count;
   });
@@ -143,6 +144,7 @@ function showLane({ svg, times, counts, cells }, it, gaps, day, width) {
     cells[index].className = value ? "" : "none";
     count.dataset.times = it.times[index] || (value === 0 ? "Not once." : "Not known.");
     write(count, String(value ?? "not known"));
+    set(count, "aria-label", `${count.dataset.about}: ${count.textContent}`);
     if (count.getAttribute("aria-expanded") === "true") write(times.querySelector("p"), count.dataset.times);
   });
   cells[2].className = it.last ? "" : "none";
@@ -158,7 +160,7 @@ function showHours(svg, day, width) {
 }
 
 function beginRoom({ room, lanes }, isAlone) {
-  const begun = lanes.map(beginLane);
+  const begun = lanes.map((lane) => beginLane(lane, isAlone ? "" : room));
   const hours = draw("svg", { class: "hours", "aria-hidden": "true" });
   const heads = ["Sound", "Today", "Last night", "Last heard"];
   const table = make("table", {},
