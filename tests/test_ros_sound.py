@@ -129,11 +129,12 @@ def test_a_topic_that_stops_is_waited_for(ros, sound, tmp_path):
     assert "the microphone went silent" in gap.reason
 
 
+@pytest.mark.timeout(200)
 @pytest.mark.parametrize(
     "case",
     [
         (None, "ros2:///robot/audio", "nobody publishes /robot/audio in domain"),
-        ("std_msgs/msg/String", "ros2:///robot/audio", "is std_msgs/msg/String, which is no sound"),
+        ("std_msgs/msg/String", "ros2:///robot/audio", "is std_msgs/msg/String, which is not audio"),
         (DATA, "ros2:///robot/audio?channels=3", "not int16 samples of 3 channels"),
     ],
 )
