@@ -134,7 +134,11 @@ def test_a_topic_that_stops_is_waited_for(ros, sound, tmp_path):
     "case",
     [
         (None, "ros2:///robot/audio", "nobody publishes /robot/audio in domain"),
-        ("std_msgs/msg/String", "ros2:///robot/audio", "is std_msgs/msg/String, which is not audio"),
+        (
+            "std_msgs/msg/String",
+            "ros2:///robot/audio",
+            "is std_msgs/msg/String, which is not audio",
+        ),
         (DATA, "ros2:///robot/audio?channels=3", "not int16 samples of 3 channels"),
     ],
 )
