@@ -149,6 +149,9 @@ class Catalog:
             self.database.executescript(_SCHEMA)
         self.database.text_factory = os.fsdecode  # file names are bytes
 
+    def __del__(self) -> None:
+        self.database.close()  # or Python 3.13 warns
+
     def _read(self, data: memoryview, tables: Sequence[str]) -> None:
         """Raise ValueError unless the schema is ours, without triggers, and tables are intact."""
         content = data[:-_DIGEST]
