@@ -161,7 +161,8 @@ class Catalog:
         self.database.deserialize(content)
         self.database.execute("PRAGMA trusted_schema = OFF")
         schema = "SELECT type, name, sql FROM sqlite_schema"
-        ours = Catalog(self.folder).database.execute(schema).fetchall()
+        empty = Catalog(self.folder)
+        ours = empty.database.execute(schema).fetchall()
         if self.database.execute(schema).fetchall() != ours:
             raise ValueError("it is of another version of hearthlog")
         checks = [self.database.execute(f"PRAGMA integrity_check({table})") for table in tables]
