@@ -72,7 +72,7 @@ def reported(logs):
 
 @pytest.fixture(scope="module")
 def followed(logs):
-    """What the bridge knows after it has read the logs."""
+    """State of the bridge after it has read all logs."""
     start = today(day_span(DAY, ZONE)[1] - 1, ZONE).midnight - 12 * 3600 * NANOSECONDS
     home = RecorderAddress(logs, "home", ZONE)
     states = follow_home(home, start, stop := Event(), pytest.fail)

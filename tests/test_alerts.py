@@ -382,7 +382,7 @@ def test_a_bridge_tells_of_a_sound_that_goes_on_and_after_a_restart_not_again(tm
 
 
 def new_columns(logs, seen):
-    """What was written to the logs since the last call."""
+    """Segments and gaps that were written to the logs since the last call."""
     found = []
     for columns in read_columns(find_logs(logs), ["/mic/segment", "/mic/gap"]).values():
         rows = [n for n, time in enumerate(columns.log_times) if (columns.topic, time) not in seen]

@@ -54,10 +54,10 @@ def test_a_list_beside_the_logs_hides_a_class_from_report_and_events(logs, heart
     assert "Music" in page.read_text()
     write_list(logs, ["music"])
     assert hearthlog("report", logs, "--day", DAY, "-o", tmp_path / "b.html").returncode == 0
-    told = (tmp_path / "b.html").read_text()
-    assert "usic" not in re.sub(r"base64,[^\"]*", "", told)
-    assert "Coughing" in told
-    assert "Time with sound" in told
+    page = (tmp_path / "b.html").read_text()
+    assert "usic" not in re.sub(r"base64,[^\"]*", "", page)
+    assert "Coughing" in page
+    assert "Time with sound" in page
     listed = json.loads(hearthlog("events", logs, "--day", DAY, "--json").stdout)
     assert {event["label"] for event in listed["events"]} == {"coughing"}
     refused = hearthlog("events", logs, "--day", DAY, "--label", "music")

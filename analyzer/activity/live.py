@@ -111,7 +111,7 @@ _CUT = NANOSECONDS  # longer open segments are kept when a gap follows
 
 
 def is_of_alerts(topic: str) -> bool:
-    """Whether alerts subscribe to a topic."""
+    """Whether alerts are evaluated on the messages of a topic; labels come one by one."""
     name = parse_topic(topic)
     return is_of_activity(topic) and (name is None or name.kind != "label")
 

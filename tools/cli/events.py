@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.logs.home_logs import HomeLogs
 
 
-class Span(NamedTuple):
+class ListedSpan(NamedTuple):
     """A span of time in nanoseconds of UTC, and its name."""
 
     start: int
@@ -122,7 +122,7 @@ def _chosen_span(
     limits: tuple[int | None, int | None],
     *,
     night: bool,
-) -> Span:
+) -> ListedSpan:
     """Return the chosen span of time; by default the last complete day, or the last night."""
     from hearthlog.analyzer.logs.home_logs import check_day
     from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
@@ -139,7 +139,7 @@ def _chosen_span(
         words = [f"{local_time(time, zone):%Y-%m-%d %H:%M}" for time in (begin, stop)]
         if begin >= stop:
             wrong_use(f"no log has a message after {words[0]}")
-        return Span(begin, stop, f"from {words[0]} to {words[1]}")
+        return ListedSpan(begin, stop, f"from {words[0]} to {words[1]}")
     if night:
         if day is None:
             moment = today_at(ends, zone)
@@ -153,10 +153,10 @@ def _chosen_span(
             stop = at_hour(own, MORNING, zone)
         morning = _date(stop, zone)
         check_day(logs, morning - timedelta(days=1), morning, zone)
-        return Span(begin, stop, f"in the night to {morning:%A, %Y-%m-%d}")
+        return ListedSpan(begin, stop, f"in the night to {morning:%A, %Y-%m-%d}")
     own = logs.last_complete_day(zone) if day is None else read_day("--day", day, zone)
     check_day(logs, own, own, zone)
-    return Span(*day_span(own, zone), f"on {own:%A, %Y-%m-%d}")
+    return ListedSpan(*day_span(own, zone), f"on {own:%A, %Y-%m-%d}")
 
 
 def _first(logs: "HomeLogs") -> int:
@@ -185,7 +185,7 @@ def _chosen_classes(
     return list(dict.fromkeys(chosen))
 
 
-def _listened_share(metrics: "HomeMetrics", classes: Sequence[str], span: Span) -> float:
+def _listened_share(metrics: "HomeMetrics", classes: Sequence[str], span: ListedSpan) -> float:
     """Return the least share of a span in which the classes could be labelled, 0 to 1."""
     from hearthlog.analyzer.logs.spans import cut
 
@@ -220,7 +220,11 @@ _MOST = 0.75  # listened share below which a count says so
 
 
 def _print(
-    found: Sequence["HomeEvent"], span: Span, classes: Sequence[str], share: float, zone: tzinfo
+    found: Sequence["HomeEvent"],
+    span: ListedSpan,
+    classes: Sequence[str],
+    share: float,
+    zone: tzinfo,
 ) -> None:
     from hearthlog.analyzer.logs.local_time import local_time
     from hearthlog.models.classes import in_words
