@@ -1,5 +1,6 @@
 """What a bridge has to say of a home, computed anew from its logs: with the report's events."""
 
+from collections import Counter
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -29,6 +30,18 @@ def expected_values(folder: Path, zone, root: str) -> dict[str, str]:
         if f"/{name}/segment" in columns:
             values |= _counts(columns[f"/{name}/segment"], zone, f"{root}/{name}")
     return values
+
+
+def expected_totals(folder: Path) -> dict[str, str]:
+    """Return the number of events of each class in the logs of a home, of all microphones."""
+    columns = read_columns([log for log in find_logs(folder) if not is_layer(log)])
+    totals = Counter()
+    for topic, segments in columns.items():
+        if topic.endswith("/segment"):
+            labelling = _labelling(segments)
+            for label in set(labelling.labels) - {"silence"}:
+                totals[label] += len(events_of(labelling, label).starts)
+    return {f"{label}/total": str(count) for label, count in totals.items()}
 
 
 def is_on(labels, label: str) -> bool:
@@ -61,11 +74,15 @@ def turned_on(folder: Path) -> dict[str, np.ndarray]:
     return turns
 
 
-def _counts(segments, zone, root: str) -> dict[str, str]:
+def _labelling(segments) -> Labelling:
     starts = segments["header.stamp"]
     order = np.argsort(starts, kind="stable")
     ends = starts + segments["duration"]
-    labelling = Labelling(starts[order], ends[order], segments["label"][order])
+    return Labelling(starts[order], ends[order], segments["label"][order])
+
+
+def _counts(segments, zone, root: str) -> dict[str, str]:
+    labelling = _labelling(segments)
     now = datetime.now(zone)
     midnight = now.replace(hour=0, minute=0, second=0, microsecond=0)
     evening = midnight.replace(hour=22)

@@ -177,13 +177,13 @@ def broker(tmp_path):
     broker.kill()
 
 
-def start_bridge(config: Path, said: Path) -> subprocess.Popen:
+def start_bridge(config: Path, said: Path, *options: str) -> subprocess.Popen:
     """Start `hearthlog bridge`; what it says goes to a file."""
     from conftest import HEARTHLOG  # noqa: PLC0415  which imports this module
 
     with said.open("ab") as log:
         return subprocess.Popen(
-            [*DIES_WITH_PARENT, *HEARTHLOG, "bridge", "--config", str(config)],
+            [*DIES_WITH_PARENT, *HEARTHLOG, "bridge", "--config", str(config), *options],
             stdout=log,
             stderr=log,
         )

@@ -1,9 +1,10 @@
-"""Kill broker, recorder and bridge at random moments, and compare what the broker has in the end.
+"""Kill broker, recorder and bridge at random moments, and compare what they count in the end.
 
     python tests/killed_bridge.py SOUND MODEL MINUTES KILLS [SEED]
 
 SOUND is an audio file, at whose end it begins anew. Each of the three is killed KILLS times. Says
-whether states and counts are those computed from the logs.
+whether states and counts at the broker, and the totals for Prometheus, are those computed from the
+logs.
 """
 
 import random
@@ -18,21 +19,22 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
-from bridged import expected_values
+from bridged import expected_totals, expected_values
 from brokers import Broker, settled_values, start_bridge
 from conftest import HEARTHLOG
 from microphones import DIES_WITH_PARENT
+from prometheus_client.parser import text_string_to_metric_families
 
 from hearthlog.schemas.errors import LogError
 
 ZONE = "Europe/Vienna"
 _ROOT = "hearthlog/home"
-_KINDS = "on", "count_today", "count_night", "last_heard"
+_KINDS = "on", "count_today", "count_night", "last_heard", "total"
 _PATIENCE_SECONDS = 90.0  # on a busy machine a recorder or a bridge takes ten to begin
 
 
 class Ending(NamedTuple):
-    """What the broker has of the classes in the end, and what the logs say."""
+    """What the bridge says of the classes in the end, and what the logs say."""
 
     found: dict[str, str]
     expected: dict[str, str]
@@ -60,6 +62,7 @@ def kill_at_random(  # noqa: PLR0913, PLR0917
     config.write_text(
         f'output = "{folder}/logs"\ntimezone = "{ZONE}"\n'
         f'[bridge.mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
+        f'[bridge.prometheus]\ntext_file = "{folder}/home.prom"\nreadable_by = "owner"\n'
     )
     start = {
         "recorder": lambda: start_recorder(config, sounds, model, said),
@@ -91,10 +94,11 @@ def kill_at_random(  # noqa: PLR0913, PLR0917
     _wait(is_heard)
     running["recorder"].terminate()
     running["recorder"].wait()
-    expected = expected_values(logs, zone, _ROOT)
+    expected = expected_values(logs, zone, _ROOT) | expected_totals(logs)
 
     def ending() -> Ending:
-        return Ending(settled_values(broker.port, f"{_ROOT}/#"), expected, said.read_text())
+        found = settled_values(broker.port, f"{_ROOT}/#") | _totals(folder / "home.prom")
+        return Ending(found, expected, said.read_text())
 
     _wait(lambda: not ending().wrong)
     last = ending()
@@ -102,6 +106,18 @@ def kill_at_random(  # noqa: PLR0913, PLR0917
     running["bridge"].wait()
     broker.kill()
     return last
+
+
+def _totals(file: Path) -> dict[str, str]:
+    if not file.exists():  # the bridge was killed, or begins
+        return {}
+    samples = [
+        sample
+        for family in text_string_to_metric_families(file.read_text())
+        for sample in family.samples
+        if sample.name == "hearthlog_events_total"
+    ]
+    return {f"{each.labels['label']}/total": str(int(each.value)) for each in samples}
 
 
 def _wait(is_so: Callable[[], bool]) -> None:

@@ -21,6 +21,7 @@ from hearthlog.analyzer.bridge.home_state import follow_home
 from hearthlog.analyzer.bridge.output import Totals
 from hearthlog.analyzer.bridge.page.home_page import day_picture
 from hearthlog.analyzer.bridge.settings import RecorderAddress
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, today
 from hearthlog.analyzer.marks.marks import Mark, write_marks
@@ -105,7 +106,7 @@ def test_the_page_shows_the_counts_of_the_report(logs, followed):
 
 def test_totals_and_alerts_count_what_the_report_counts(logs, followed, tmp_path):
     start, end = day_span(DAY, ZONE)
-    totals = Totals(tmp_path / "totals.json", start)
+    totals = Totals(BridgeState(tmp_path, "home", pytest.fail), start, pytest.fail)
     counted = {total.label: total.events for total in totals.count(followed, end)}
     hour = 3600 * NANOSECONDS
     heard = read_activity(find_home_logs([logs]), "home", start - hour, end, pytest.fail)

@@ -3,11 +3,12 @@
 import json
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import UTC
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -28,14 +29,19 @@ from hearthlog.analyzer.bridge.alerts.delivery import (
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
 from hearthlog.analyzer.bridge.alerts.rules import Notification
 from hearthlog.analyzer.bridge.home_state import HomeState
+from hearthlog.analyzer.bridge.secret_files import page_token
 from hearthlog.analyzer.bridge.settings import DeliverySettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import page_token
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.http import free_port
 
 # Apprise asks for it where there is one.
 pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")
 SECOND = 1_000_000_000
 WAIT = 30  # seconds, for what comes at once
+
+
+def state_in(folder):
+    return BridgeState(folder, "home", pytest.fail)
 
 
 def ring(number, due=0):
@@ -78,15 +84,15 @@ def addresses(folder, *lines):
 
 
 def test_what_was_not_told_to_all_is_there_after_the_next_start(tmp_path):
-    outbox = Outbox(tmp_path / "box", ["a", "b"], pytest.fail)
+    outbox = Outbox(state_in(tmp_path), ["a", "b"], pytest.fail)
     outbox.put([ring(1), ring(2, due=9), ring(1)])
     assert outbox.waiting_for("a", 8) == [ring(1)]
     outbox.record_delivery("a", ring(1))
-    again = Outbox(tmp_path / "box", ["a", "b"], pytest.fail)
+    again = Outbox(state_in(tmp_path), ["a", "b"], pytest.fail)
     assert again.waiting_for("a", 10) == [ring(2, due=9)]
     assert again.waiting_for("b", 10) == [ring(1), ring(2, due=9)]
     again.record_delivery("b", ring(1))
-    assert [path.name for path in (tmp_path / "box").iterdir()] == [f"{ring(2).id}.json"]
+    assert state_in(tmp_path).names("outbox") == [f"outbox/{ring(2).id}"]
     # Told meanwhile; evaluated once more, for the bridge had no time to remember.
     again.put([ring(1)])
     assert len(again) == 1
@@ -94,13 +100,13 @@ def test_what_was_not_told_to_all_is_there_after_the_next_start(tmp_path):
 
 def test_a_full_outbox_drops_the_oldest_and_says_what_to_do(tmp_path):
     said = []
-    outbox = Outbox(tmp_path, ["a"], said.append, most=3)
+    outbox = Outbox(state_in(tmp_path), ["a"], said.append, most=3)
     outbox.put(ring(number) for number in range(1, 6))
     assert [each.time // SECOND for each in outbox.waiting_for("a", 1)] == [3, 4, 5]
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(state_in(tmp_path).names("outbox")) == 3
     assert said == [
         (
-            f"{tmp_path}: 3 alerts are waiting, and the oldest are dropped; see above which "
+            "3 alerts are waiting, and the oldest are dropped; see above which "
             "target fails; repair it, or remove it from urls_file"
         )
     ]
@@ -108,17 +114,19 @@ def test_a_full_outbox_drops_the_oldest_and_says_what_to_do(tmp_path):
 
 @pytest.mark.parametrize("content", ["", "{}", "[1]", '{"rule": 1}', "\0" * 9, "[" * 100_000])
 def test_a_file_that_is_no_ring_is_named_and_left_alone(content, tmp_path):
-    (tmp_path / "1-x.json").write_text(content)
-    said = []
-    outbox = Outbox(tmp_path, ["a"], said.append)
+    said, state = [], state_in(tmp_path)
+    state.write("outbox/1-x", content)
+    outbox = Outbox(state, ["a"], said.append)
     assert len(outbox) == 0
-    assert said == [f"{tmp_path}/1-x.json: no alert that was kept here; remove it"]
+    assert said == [f"{state.path}, outbox/1-x: cannot be read; this alert is not delivered"]
 
 
 def test_a_folder_that_takes_nothing_is_said_and_the_ring_told_all_the_same(tmp_path):
     said = []
-    outbox = Outbox(tmp_path / "box", ["a"], said.append)
-    (tmp_path / "box").rmdir()
+    state = state_in(tmp_path)
+    outbox = Outbox(state, ["a"], said.append)
+    with closing(sqlite3.connect(state.path)) as other:
+        other.execute("DROP TABLE entries")
     outbox.put([ring(1)])
     assert outbox.waiting_for("a", 1) == [ring(1)]
     assert len(said) == 1
@@ -128,7 +136,7 @@ def test_a_folder_that_takes_nothing_is_said_and_the_ring_told_all_the_same(tmp_
 def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
     port, said = free_port(), []
     targets = find_targets(addresses(tmp_path, f"json://127.0.0.1:{port}"), said.append).targets
-    outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
+    outbox = Outbox(state_in(tmp_path), [each.name for each in targets], said.append)
     outbox.put([ring(1), ring(2)])
     delivery = Delivery(outbox, targets, "home", UTC, said.append, first_pause=0.01)
     try:
@@ -145,7 +153,7 @@ def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
     assert said[0].startswith(
         "line 2, json://127.0.0.1: an alert could not be delivered (no connection)"
     )
-    assert not list((tmp_path / "box").iterdir())
+    assert state_in(tmp_path).names("outbox") == []
 
 
 def test_a_target_that_never_answers_holds_up_neither_the_others_nor_the_end(tmp_path):
@@ -157,7 +165,7 @@ def test_a_target_that_never_answers_holds_up_neither_the_others_nor_the_end(tmp
         targets = find_targets(
             addresses(tmp_path, dead, f"json://127.0.0.1:{port}"), said.append
         ).targets
-        outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
+        outbox = Outbox(state_in(tmp_path), [each.name for each in targets], said.append)
         outbox.put([ring(1)])
         delivery = Delivery(outbox, targets, "home", UTC, said.append, first_pause=60.0)
         wait_for(lambda: texts)
@@ -187,7 +195,7 @@ def test_the_pauses_after_a_failure_grow_to_a_quarter_of_an_hour_and_begin_anew(
         def is_set(self):
             return False
 
-    outbox = Outbox(tmp_path, ["a"], pytest.fail)
+    outbox = Outbox(state_in(tmp_path), ["a"], pytest.fail)
     outbox.put([ring(1), ring(2)])
     delivery = Delivery(outbox, [], "home", UTC, lambda _: None)
     delivery._run(Failing(), Stop())
@@ -246,7 +254,7 @@ def test_one_wrong_line_keeps_nobody_else_from_being_told_and_is_told_late_when_
         file = addresses(tmp_path, right, typo)
         settings = DeliverySettings(urls_file=file)
         for ring_now in rung:  # before and after a start of the bridge
-            own = AlertsOutput([], settings, home, tmp_path, said.append, tell)
+            own = AlertsOutput([], settings, home, state_in(tmp_path), said.append, tell)
             own._outbox.put([ring_now])
             wait_for(partial(_is_told, own, broker))
             wait_for(lambda: len(good) == 1)
@@ -282,7 +290,7 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
     with server() as (port, good), server() as (other, mended):
         right, typo = f"json://127.0.0.1:{port}", f"jsno://127.0.0.1:{other}"
         settings = DeliverySettings(urls_file=addresses(tmp_path, right, typo))
-        own = AlertsOutput([], settings, home, tmp_path, said.append)
+        own = AlertsOutput([], settings, home, state_in(tmp_path), said.append)
         own._outbox.put([Notification("it", now, "first", is_known=True, due=now)])
         wait_for(lambda: len(good) == 1)
         before = own._lines
@@ -290,7 +298,7 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
         wait_for(lambda: own._lines != before)
         own.close()
         addresses(tmp_path, f"{right}/?verify=yes", typo, "# and while it does not")
-        own = AlertsOutput([], settings, home, tmp_path, said.append)
+        own = AlertsOutput([], settings, home, state_in(tmp_path), said.append)
         own._outbox.put([Notification("it", now + 1, "second", is_known=True, due=now)])
         wait_for(lambda: len(good) == 2)
         addresses(tmp_path, f"{right}/?rto=9", typo.replace("jsno", "json"))  # both at once
@@ -309,7 +317,7 @@ def test_addresses_are_read_again_when_the_package_that_was_missing_is_there(tmp
         settings = DeliverySettings(urls_file=addresses(tmp_path, f"json://127.0.0.1:{port}"))
         with monkeypatch.context() as missing:
             missing.setitem(sys.modules, "apprise", None)
-            own = AlertsOutput([], settings, home, tmp_path, said.append)
+            own = AlertsOutput([], settings, home, state_in(tmp_path), said.append)
             own._outbox.put([Notification("it", now, "first", is_known=True, due=now)])
             assert said[0].startswith("alerts: apprise is not installed; try: ")
         wait_for(lambda: len(texts) == 1)
@@ -328,7 +336,7 @@ def test_what_waits_for_a_wrong_line_alone_is_dropped_after_a_day(tmp_path):
         Notification("it", now - hours * 3600 * SECOND, "", is_known=True, due=0)
         for hours in (25, 23)
     )
-    outbox = Outbox(tmp_path, ["a", UNREAD], pytest.fail)
+    outbox = Outbox(state_in(tmp_path), ["a", UNREAD], pytest.fail)
     outbox.put([old, recent])
     for each in (old, recent):
         outbox.record_delivery("a", each)
@@ -348,7 +356,12 @@ def test_without_an_address_the_broker_is_told_all_the_same(tmp_path, content):
         RecorderAddress(tmp_path / "logs", "home", UTC),
     )
     own = AlertsOutput(
-        [], settings, home, tmp_path, said.append, lambda *given: told.append(given) or True
+        [],
+        settings,
+        home,
+        state_in(tmp_path),
+        said.append,
+        lambda *given: told.append(given) or True,
     )
     own._outbox.put([ring(1)])
     own.update(SimpleNamespace(state=HomeState(), columns=()))
@@ -415,7 +428,7 @@ def test_no_part_of_an_address_is_said_when_it_cannot_be_reached_or_refuses(tmp_
         kinds = ("ntfy", "json", "xml", "form", "gotify", "mmost")
         lines = [f"{kind}://hush:hush@{place}" for kind in kinds for place in places]
         targets = find_targets(addresses(tmp_path, *lines), said.append).targets
-        outbox = Outbox(tmp_path / "box", [each.name for each in targets], said.append)
+        outbox = Outbox(state_in(tmp_path), [each.name for each in targets], said.append)
         outbox.put([ring(1)])
         delivery = Delivery(outbox, targets, "home", UTC, said.append)
         wait_for(lambda: len(set(said)) == len(lines))
@@ -431,14 +444,17 @@ def test_the_password_of_an_address_is_in_no_line_and_no_file(tmp_path):
     said = []
     file = addresses(tmp_path, f"json://user:hush@127.0.0.1:{free_port()}")
     targets = find_targets(file, said.append).targets
-    outbox = Outbox(tmp_path / "box", ["x", *(each.name for each in targets)], said.append)
+    outbox = Outbox(state_in(tmp_path), ["x", *(each.name for each in targets)], said.append)
     outbox.put([ring(1)])
     delivery = Delivery(outbox, targets, "home", UTC, said.append)
     wait_for(lambda: said)
     delivery.close()
     outbox.record_delivery(targets[0].name, ring(1))
-    (kept,) = (tmp_path / "box").iterdir()
-    assert "hush" not in kept.read_text() + "".join(said)
+    (kept,) = state_in(tmp_path).names("outbox")
+    files = [path.read_bytes() for path in tmp_path.glob("state*")]
+    assert any(kept.encode() in content for content in files)
+    assert not any(b"hush" in content for content in files)
+    assert "hush" not in "".join(said)
 
 
 DELIVERING = """
@@ -450,9 +466,11 @@ from hearthlog.analyzer.bridge.alerts.delivery import Delivery
 from hearthlog.analyzer.bridge.alerts.delivery import Outbox
 from hearthlog.analyzer.bridge.alerts.rules import Notification
 from hearthlog.analyzer.bridge.alerts.delivery import find_targets
+from hearthlog.analyzer.bridge.state import BridgeState
 folder = Path(sys.argv[1])
 targets = find_targets(folder / "urls", print).targets
-outbox = Outbox(folder / "box", [each.name for each in targets], print)
+state = BridgeState(folder, "home", print)
+outbox = Outbox(state, [each.name for each in targets], print)
 outbox.put(Notification("coughs", n, f"alert {n}", True, 0) for n in map(int, sys.argv[2:]))
 print("kept", flush=True)
 delivery = Delivery(outbox, targets, "home", UTC, print, first_pause=0.01)

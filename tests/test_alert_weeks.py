@@ -10,6 +10,7 @@ from livehome import MINUTE, LiveHome, following, rule
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressStore
 from hearthlog.analyzer.bridge.alerts.rules import RuleState
 from hearthlog.analyzer.bridge.settings import DeliverySettings, RecorderAddress
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import log_path
@@ -49,11 +50,10 @@ def test_a_silence_that_goes_on_when_it_is_judged_was_heard(part, tmp_path):
     zone = timezone(timedelta(minutes=8 * 60 + 10 - clock.hour * 60 - clock.minute))
     silent_since = now - (10 if part == "night" else 20) * HOUR - 10 * MINUTE
     quiet = rule("unlike_usual", "quiet", part=part, which="less")
-    state, told, said = tmp_path / "state", [], []
-    (state / "alerts").mkdir(parents=True)
+    state, told, said = BridgeState(tmp_path / "state", "home", pytest.fail), [], []
     until = now - 20 * MINUTE
     progress = {"quiet": RuleState(since=until, until=until)}
-    RuleProgressStore(state / "alerts" / "rules.json", pytest.fail).save([quiet], progress)
+    RuleProgressStore(state, pytest.fail).save([quiet], progress)
     home = LiveHome(tmp_path / "logs")
     write_nights(home.folder, home.classes, silent_since)
 

@@ -27,7 +27,7 @@ from hearthlog.analyzer.bridge.alerts.output import AlertsOutput, RuleProgressSt
 from hearthlog.analyzer.bridge.alerts.rules import Notification, RuleState
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.settings import DeliverySettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError, state_folder
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, state_folder
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.schemas.logs.columns import read_columns
@@ -51,8 +51,9 @@ AHEAD = 400 * 24 * HOUR * SECOND
 
 def watching(folder, rules, now, say=pytest.fail):
     """An evaluation of rules, with its notifications, and its progress on the disk."""
-    outbox = Outbox(folder / "box", ["x"], say)
-    memory = RuleProgressStore(folder / "rules.json", say)
+    state = BridgeState(folder, "home", say)
+    outbox = Outbox(state, ["x"], say)
+    memory = RuleProgressStore(state, say)
     return RuleWatch(rules, UTC, outbox, memory, say, now), outbox, memory
 
 
@@ -184,8 +185,9 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
     heard = read_activity(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
     for down_hours, expected in ((20, 1), (30, 0)):
         folder = tmp_path / str(down_hours)
-        outbox = Outbox(folder / "box", ["x"], pytest.fail)
-        memory = RuleProgressStore(folder / "rules.json", pytest.fail)
+        state = BridgeState(folder, "home", pytest.fail)
+        outbox = Outbox(state, ["x"], pytest.fail)
+        memory = RuleProgressStore(state, pytest.fail)
 
         def start(now, memory=memory, outbox=outbox):
             return RuleWatch([COUGHS], UTC, outbox, memory, pytest.fail, now)
@@ -193,9 +195,9 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
         start(begin).save(begin)
         now = begin + down_hours * HOUR * SECOND
         for _ in range(2):  # the second bridge is killed before it has remembered, the third not
-            shutil.copy(folder / "rules.json", folder / "before")
+            before = state.read("rules")
             assert len(start(now).evaluate(lambda: heard, pytest.fail, now, now)) == expected
-            shutil.copy(folder / "before", folder / "rules.json")
+            state.write("rules", before)
         assert len(outbox) == expected
         start(now).evaluate(lambda: heard, pytest.fail, now, now)
         start(now).save(now)
@@ -241,22 +243,22 @@ def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):
 
 def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
     said = []
-    path = tmp_path / "rules.json"
-    memory = RuleProgressStore(path, said.append)
+    state = BridgeState(tmp_path, "home", pytest.fail)
+    memory = RuleProgressStore(state, said.append)
     progress = {"coughs": RuleState(5, has_rung=True, until=7)}
     memory.save([COUGHS], progress)
     assert memory.load([COUGHS]) == progress
     changed = COUGHS.model_copy(update={"count": 3})
     assert memory.load([changed])["coughs"].until == 0
     assert said == []
-    path.write_text('{"x": 3}')
+    state.write("rules", '{"x": 3}')
     assert memory.load([COUGHS])["coughs"].until == 0
-    assert said == [f"{path}: cannot be read; all rules start over"]
+    assert said == [f"{state.path}, rules: cannot be read; all rules start over"]
 
 
 def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
     said = []
-    memory = RuleProgressStore(tmp_path / "rules.json", said.append)
+    memory = RuleProgressStore(BridgeState(tmp_path, "home", pytest.fail), said.append)
     memory.save([COUGHS], {"coughs": RuleState(until=9 * HOUR * SECOND)})
     watch, _, _ = watching(tmp_path, [COUGHS], HOUR * SECOND, said.append)
     assert watch.needed_from(HOUR * SECOND) < HOUR * SECOND
@@ -353,10 +355,12 @@ def bridge(root, rules, told, said):
         told.extend([ring] * is_taken)
         return is_taken
 
+    state = BridgeState(root / "state", "home", said.append)
     connected = chain([False, False], repeat(True))  # the broker comes after the first ring
-    own = AlertsOutput(rules, DeliverySettings(), home, root / "state", said.append, tell)
+    own = AlertsOutput(rules, DeliverySettings(), home, state, said.append, tell)
     with following(home, {"alerts": own}, said):
         yield
+    state.close()
 
 
 def test_a_bridge_tells_of_a_sound_that_goes_on_and_after_a_restart_not_again(tmp_path):
@@ -369,7 +373,7 @@ def test_a_bridge_tells_of_a_sound_that_goes_on_and_after_a_restart_not_again(tm
         texts = {name: text for name, text, _ in told}
         assert "Coughing: 3 times in the last 1 h, more than 2" in texts["coughs"]
         assert "Water tap for longer than 10 min, since " in texts["water"]
-        assert not list((tmp_path / "state" / "alerts" / "outbox").iterdir())
+        assert BridgeState(tmp_path / "state", "home", pytest.fail).names("outbox") == []
         other = rule("recorder_silent", "other")
         late = COUGHS.model_copy(update={"name": "late"})
         with bridge(tmp_path, [COUGHS, WATER, other, late], told, said):
@@ -427,7 +431,12 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
     try:
         ahead[0] = AHEAD * starts_ahead
         own = AlertsOutput(
-            [COUGHS, WATER], DeliverySettings(), home, tmp_path / "state", said.append, tell
+            [COUGHS, WATER],
+            DeliverySettings(),
+            home,
+            BridgeState(tmp_path / "state", "home", pytest.fail),
+            said.append,
+            tell,
         )
         if not starts_ahead:
             wait_for(lambda: hears(lambda: len(told) == 2))
@@ -459,7 +468,14 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
         return calls.count(ring) == 3
 
     home = RecorderAddress(tmp_path / "logs", "home", UTC)
-    own = AlertsOutput([COUGHS], DeliverySettings(), home, tmp_path, pytest.fail, tell)
+    own = AlertsOutput(
+        [COUGHS],
+        DeliverySettings(),
+        home,
+        BridgeState(tmp_path, "home", pytest.fail),
+        pytest.fail,
+        tell,
+    )
     now, right = time.time_ns(), time.time_ns
     own._outbox.put(
         Notification("coughs", now + number, f"ring {number}", is_known=True, due=now)
@@ -480,8 +496,9 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
 
 def test_rules_of_which_nobody_would_be_told_are_refused(tmp_path):
     home = RecorderAddress(tmp_path, "home", UTC)
+    state = BridgeState(tmp_path, "home", pytest.fail)
     with pytest.raises(BridgeError, match="alerts have no target; set urls_file in"):
-        AlertsOutput([COUGHS], DeliverySettings(), home, tmp_path, pytest.fail)
+        AlertsOutput([COUGHS], DeliverySettings(), home, state, pytest.fail)
 
 
 def test_the_state_is_where_it_is_configured_or_where_systemd_says_or_beside_the_logs(

@@ -12,6 +12,7 @@ from hearthlog.analyzer.bridge.bridge import ProblemReporter, open_outputs, outp
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.settings import BridgeSettings, RecorderAddress
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.http import free_port, listen
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.schemas.frames import NANOSECONDS
@@ -40,7 +41,10 @@ def test_an_output_that_cannot_be_opened_is_tried_again_and_stops_no_other(
             "ping": {"url": "http://127.0.0.1:9"},
         }
         opened, _ = open_outputs(
-            BridgeSettings.model_validate(tables), home, tmp_path, ProblemReporter(said.append)
+            BridgeSettings.model_validate(tables),
+            home,
+            BridgeState(tmp_path, "home", pytest.fail),
+            ProblemReporter(said.append),
         )
         opened["prometheus"].update(NEWS)
         assert list(opened) == ["prometheus", "ping"]
@@ -77,7 +81,9 @@ def test_a_table_that_contradicts_itself_closes_its_own_output_alone(home, tmp_p
         port = {"port": broker.getsockname()[1]} if "mqtt" in tables else {}
         tables = {name: table | port for name, table in tables.items()}
         settings = BridgeSettings.model_validate(tables | {"page": {"port": free_port()}})
-        opened, _ = open_outputs(settings, home, tmp_path, ProblemReporter(said.append))
+        opened, _ = open_outputs(
+            settings, home, BridgeState(tmp_path, "home", pytest.fail), ProblemReporter(said.append)
+        )
         assert [name for name, output in opened.items() if output.output] == ["page"]
         opened["page"].close()
         broker.setblocking(False)
@@ -114,7 +120,9 @@ def test_a_text_file_that_cannot_be_looked_at_is_no_reason_to_refuse_the_configu
     said = []
     with_readers = settings.prometheus.model_copy(update={"readable_by": "all"})
     outputs_of = settings.model_copy(update={"prometheus": with_readers})
-    opened, _ = open_outputs(outputs_of, home, tmp_path, ProblemReporter(said.append))
+    opened, _ = open_outputs(
+        outputs_of, home, BridgeState(tmp_path, "home", pytest.fail), ProblemReporter(said.append)
+    )
     opened["prometheus"].update(NEWS)
     opened["prometheus"].close()
     assert said[0].startswith("bridge.prometheus: text_file: ")
@@ -126,7 +134,9 @@ def test_an_output_that_is_tried_again_leaves_no_thread(home, tmp_path, monkeypa
     monkeypatch.setattr("hearthlog.analyzer.bridge.bridge._AGAIN_SECONDS", 0.0)
     mqtt = {"host": "127.0.0.1", "user": "x", "password_file": tmp_path / "none", "commands": True}
     settings = BridgeSettings.model_validate({"mqtt": mqtt})
-    opened, _ = open_outputs(settings, home, tmp_path, ProblemReporter(lambda _: None))
+    opened, _ = open_outputs(
+        settings, home, BridgeState(tmp_path, "home", pytest.fail), ProblemReporter(lambda _: None)
+    )
     count = threading.active_count()
     for _ in range(5):
         opened["mqtt"].update(NEWS)
@@ -140,12 +150,22 @@ def test_what_was_heard_while_there_was_no_bridge_is_read(home, tmp_path):
     with listen() as other:  # also while the port is taken
         figures = {"port": other.getsockname()[1]}
         settings = BridgeSettings.model_validate({"prometheus": figures})
-        _, since = open_outputs(settings, home, tmp_path, ProblemReporter(lambda _: None))
+        _, since = open_outputs(
+            settings,
+            home,
+            BridgeState(tmp_path, "home", pytest.fail),
+            ProblemReporter(lambda _: None),
+        )
     assert since <= now - 3 * day
 
 
 def test_without_a_table_nothing_is_opened(home, tmp_path):
-    opened, since = open_outputs(BridgeSettings(), home, tmp_path, ProblemReporter(pytest.fail))
+    opened, since = open_outputs(
+        BridgeSettings(),
+        home,
+        BridgeState(tmp_path, "home", pytest.fail),
+        ProblemReporter(pytest.fail),
+    )
     assert opened == {}
     assert since > 0
 
@@ -157,7 +177,9 @@ def test_a_package_that_is_missing_stops_no_other_output(home, tmp_path, monkeyp
     monkeypatch.delitem(sys.modules, "hearthlog.analyzer.bridge.mqtt.connection", raising=False)
     tables = {"mqtt": {"host": "127.0.0.1"}, "ping": {"url_file": str(tmp_path / "none")}}
     settings = BridgeSettings.model_validate(tables | {"page": {"port": free_port()}})
-    opened, _ = open_outputs(settings, home, tmp_path, ProblemReporter(said.append))
+    opened, _ = open_outputs(
+        settings, home, BridgeState(tmp_path, "home", pytest.fail), ProblemReporter(said.append)
+    )
     assert [name for name, output in opened.items() if output.output] == ["page"]
     assert said[0].startswith("paho.mqtt.client is not installed; try: ")
     assert "no such file of a ping address; trying again" in said[-1]

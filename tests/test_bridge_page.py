@@ -34,7 +34,7 @@ from hearthlog.analyzer.bridge.page.home_page import (
 )
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
 from hearthlog.analyzer.bridge.wording import length, when
 from hearthlog.analyzer.http import HttpServer
 from hearthlog.analyzer.logs.local_time import today
@@ -368,14 +368,16 @@ def place(tmp_path):
 
 
 def test_nothing_listens_unless_the_page_is_configured(place, tmp_path):
-    outputs, _ = open_outputs(BridgeSettings(), place, tmp_path, print)
+    outputs, _ = open_outputs(BridgeSettings(), place, BridgeState(tmp_path, "home", print), print)
     assert outputs == {}
 
 
 def test_the_page_listens_on_loopback_by_default(place, tmp_path):
     said, port = [], free_port()
     settings = BridgeSettings(page=PageSettings(port=port))
-    outputs, _ = open_outputs(settings, place, tmp_path, said.append)
+    outputs, _ = open_outputs(
+        settings, place, BridgeState(tmp_path, "home", pytest.fail), said.append
+    )
     assert address_of(port) == "127.0.0.1"
     outputs["page"].close()
     assert address_of(port) is None

@@ -16,7 +16,7 @@ from hearthlog.analyzer.bridge.home_state import Health, HomeState, LiveMicropho
 from hearthlog.analyzer.bridge.mqtt.topics import Place, Topics, identifier
 from hearthlog.analyzer.bridge.output import Total, Totals
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
-from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import iso_time, today
 from hearthlog.recorder.errors import ConfigurationError
@@ -174,21 +174,21 @@ def state_with(*events):
 
 
 def test_totals_survive_restarts_and_are_counted_once(tmp_path):
-    path = tmp_path / "totals.json"
-    totals = Totals(path, 100 * NANOSECONDS)
+    kept = BridgeState(tmp_path, "home", pytest.fail)
+    totals = Totals(kept, 100 * NANOSECONDS, pytest.fail)
     assert totals.count(state_with(50, 150, 250)) == [Total("mic", "coughing", 2, 2.0)]
     totals.keep(state_with(50, 150, 250), 200 * NANOSECONDS)
-    again = Totals(path, 0)
+    again = Totals(kept, 0, pytest.fail)
     assert again.time == 200 * NANOSECONDS
     assert again.count(state_with(250, 350)) == [Total("mic", "coughing", 3, 3.0)]
     assert again.count(HomeState()) == [Total("mic", "coughing", 1, 1.0)]
 
 
-def test_damaged_totals_are_named(tmp_path):
-    path = tmp_path / "totals.json"
-    path.write_text('{"time": -1}')
-    with pytest.raises(BridgeError, match=r"totals.json: is damaged; delete it"):
-        Totals(path, 0)
+def test_damaged_totals_are_named_and_counted_anew(tmp_path):
+    said, kept = [], BridgeState(tmp_path, "home", pytest.fail)
+    kept.write("totals", '{"time": -1}')
+    assert Totals(kept, 7, said.append).time == 7
+    assert said == [f"{kept.path}, totals: cannot be read; counts start over"]
 
 
 def test_a_trouble_is_said_again_after_an_hour(monkeypatch):

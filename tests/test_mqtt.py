@@ -5,6 +5,7 @@ import os
 import random
 import signal
 import time
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -15,11 +16,12 @@ from killed_bridge import ZONE, kill_at_random, start_recorder
 from livehome import LiveHome, following, midday_zone
 from paho.mqtt.client import MQTTMessage
 
-from hearthlog.analyzer.bridge.mqtt import publisher
+from hearthlog.analyzer.bridge import state as bridge_state
 from hearthlog.analyzer.bridge.mqtt.home_assistant import described, device_id, discovery
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics, Topics
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.pause_schedule import paused_until
@@ -43,7 +45,9 @@ class Bridged:
         place = RecorderAddress(folder, node, midday_zone())
         mqtt = MqttSettings(**({"host": "127.0.0.1", "port": broker.port} | settings))
         state = state or folder.parent / "bridge"
-        self.publisher = MqttPublisher(mqtt, place, state, self.said.append)
+        self.state = BridgeState(state, node, self.said.append)
+        self.state.claim(folder)
+        self.publisher = MqttPublisher(mqtt, place, self.state, self.said.append)
         everybody = dict(outputs) | {"mqtt": self.publisher}
         self._following = following(place, everybody, self.said)
 
@@ -53,6 +57,13 @@ class Bridged:
 
     def __exit__(self, *error):
         self._following.__exit__(*error)
+        self.state.close()
+
+
+def kept(home):
+    """What the bridge of a home keeps of what the broker retains."""
+    with closing(BridgeState(home.folder.parent / "bridge", "home", pytest.fail)) as state:
+        return json.loads(state.read("mqtt"))
 
 
 @pytest.fixture
@@ -195,11 +206,13 @@ def test_a_recorder_that_records_beside_another_one_is_no_other_name_of_it(
             log.touch()
             os.utime(log, (end := start.timestamp() + 3600, end))
     home = RecorderAddress(tmp_path, "new", midday_zone())
-    assert publisher._is_renamed(home, "old", is_first=True) == is_renamed
-    assert publisher._is_renamed(home, "old", is_first=False) == (is_renamed and "new" in hours)
-    assert not publisher._is_renamed(home, "new", is_first=True)
+    assert bridge_state.is_renamed(home.folder, home.node, "old", is_first=True) == is_renamed
+    assert bridge_state.is_renamed(home.folder, home.node, "old", is_first=False) == (
+        is_renamed and "new" in hours
+    )
+    assert not bridge_state.is_renamed(home.folder, home.node, "new", is_first=True)
     with FolderLock(tmp_path, "old"):
-        assert not publisher._is_renamed(home, "old", is_first=True)
+        assert not bridge_state.is_renamed(home.folder, home.node, "old", is_first=True)
 
 
 def test_two_recorders_of_different_folders_clear_nothing_of_each_other(tmp_path, broker):
@@ -213,28 +226,28 @@ def test_two_recorders_of_different_folders_clear_nothing_of_each_other(tmp_path
                 with Bridged(home.folder, broker, node=node, state=state):
                     listener.wait_for(f"hearthlog/{node}/mic/class/coughing/on", "ON")
         assert "" not in listener.values.values()
-    assert {path.name for path in state.glob("*.json")} == {"mqtt-attic.json", "mqtt-home.json"}
+    for node in ("attic", "home"):
+        with closing(BridgeState(state, node, pytest.fail)) as own:
+            assert own.names("") == ["mqtt"]
     for home in homes:
         home.close()
 
 
-def test_what_was_switched_off_under_any_name_of_a_recorder_stays_off(tmp_path):
-    said, muted = [], {"mqtt-attic.json": "speech", "mqtt-home.json": "coughing"}
-    for name, label in muted.items():
-        (tmp_path / name).write_text(json.dumps({"muted": [label]}))
-    first = RetainedTopics(tmp_path, "home", "x", lambda _, **__: True, said.append)
-    assert first.muted() == ["coughing", "speech"]
-    other = RetainedTopics(tmp_path, "attic", "x", lambda _, **__: False, said.append)
-    assert "is used by another bridge" in said.pop()  # until the name is free
-    other.close()
-    first.save()
-    later = RetainedTopics(tmp_path, "attic", "x", lambda _, **__: False, said.append)
-    later.save()
-    first.switch("speech", is_told=True)
+def test_what_was_switched_off_under_any_name_of_a_recorder_stays_off(tmp_path, monkeypatch):
+    for name, label in {"attic": "speech", "home": "coughing"}.items():
+        (tmp_path / f"mqtt-{name}.json").write_text(json.dumps({"muted": [label]}))
+    monkeypatch.setattr(bridge_state, "is_renamed", lambda *_, **__: True)
+    first = BridgeState(tmp_path, "home", pytest.fail)
+    first.claim(tmp_path)
+    topics = RetainedTopics(first, pytest.fail)
+    assert topics.muted() == ["coughing", "speech"]
+    assert first.names("mqtt") == ["mqtt", "mqtt/attic"]  # until the next time it is saved
+    topics.switch("speech", is_told=True)
+    topics.save()
+    assert first.names("mqtt") == ["mqtt"]
     first.close()
-    later.close()
-    assert {path.name for path in tmp_path.glob("*.json")} == {*muted}
-    assert said == []
+    again = BridgeState(tmp_path, "home", pytest.fail)
+    assert RetainedTopics(again, pytest.fail).muted() == ["coughing"]
 
 
 @pytest.mark.parametrize(
@@ -415,21 +428,31 @@ def test_what_was_switched_off_stays_so_without_commands_and_one_is_told_how_to_
             listener.wait_for(f"{COUGHING}/on", "ON")
             listener.publish(f"{ROOT}/command", json.dumps(command))
             listener.wait_for(f"{COUGHING}/on", "OFF")
-        memory = home.folder.parent / "bridge" / "mqtt-home.json"
         with Bridged(home.folder, broker) as bridged:
             home.heard("coughing", 0.1)
             home.heard("speech", 0.1)
             assert json.loads(listener.wait_for(f"{ROOT}/mic/event"))["event_type"] == "speech"
         (line,) = bridged.said
         assert line.startswith("mqtt: not published: coughing; ")
-        assert str(memory) in line
-        content = json.loads(memory.read_text())
-        memory.write_text(json.dumps(content | {"muted": []}))
-        with Bridged(home.folder, broker) as bridged:
+        assert line.endswith("start the bridge once with --unmute coughing")
+        config = home.folder.parent / "home.toml"
+        config.write_text(
+            f'output = "{home.folder}"\n[bridge.mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
+        )
+        refused = start_bridge(config, home.folder.parent / "said", "--unmute", "music")
+        assert refused.wait(60) == 2
+        assert (
+            "--unmute music: this class is published; muted: coughing"
+            in (home.folder.parent / "said").read_text()
+        )
+        bridge = start_bridge(config, home.folder.parent / "said", "--unmute", "cough")
+        try:
             home.hears("coughing")
             listener.wait_for(f"{COUGHING}/on", "ON")
-    assert bridged.said == []
-    assert memory.stat().st_mode & 0o77 == 0
+        finally:
+            bridge.terminate()
+            bridge.wait()
+    assert kept(home)["muted"] == []
 
 
 def test_what_earlier_versions_switched_off_is_taken_over_where_commands_are_taken(home, broker):
@@ -452,7 +475,7 @@ def test_what_no_model_knows_is_not_switched_off_by_what_is_left_at_the_broker(h
         with Bridged(home.folder, broker, commands=True) as bridged:
             listener.wait_for(f"{COUGHING}/on", "OFF")
     assert [line.partition("; ")[0] for line in bridged.said] == ["mqtt: not published: coughing"]
-    memory = json.loads((home.folder.parent / "bridge" / "mqtt-home.json").read_text())
+    memory = kept(home)
     assert memory["muted"] == ["coughing"]
 
 
@@ -482,7 +505,7 @@ def test_what_a_bridge_left_whose_memory_is_lost_is_cleared_and_nobody_elses_is(
                 listener.wait_for(f"{ROOT}/{microphone}/class/coughing/on", "ON")
             listener.wait_for(COMMANDS)
         home.close()
-        (home.folder.parent / "bridge" / "mqtt-home.json").unlink()
+        (home.folder.parent / "bridge" / "state.sqlite3").unlink()
         kitchen = f"homeassistant/device/{device_id('home', 'kitchen')}/config"
         description = listener.values[kitchen]
         changes = {  # of others, however alike
@@ -532,11 +555,11 @@ def test_what_is_left_at_a_broker_is_taken_over_up_to_a_bound(home, broker, kind
         listener.wait_for("homeassistant/device/7/config")
         with Bridged(home.folder, broker):
             listener.wait_for(f"{COUGHING}/on", "ON")
-    memory = (home.folder.parent / "bridge" / "mqtt-home.json").read_bytes()
-    taken = [topic for topic in json.loads(memory)["topics"] if "/old" in topic]
+    memory = kept(home)
+    taken = [topic for topic in memory["topics"] if "/old" in topic]
     assert (len(taken) == 0) == (kind == "large")
     assert len(taken) <= 5000
-    assert len(memory) < 4 << 20
+    assert len(json.dumps(memory)) < 4 << 20
 
 
 def test_what_is_left_at_a_broker_far_away_is_taken_over(home, broker):
@@ -549,7 +572,7 @@ def test_what_is_left_at_a_broker_far_away_is_taken_over(home, broker):
             listener.publish(f"homeassistant/device/{number}/config", text, retain=True)
         with Bridged(home.folder, link):
             listener.wait_for(f"{COUGHING}/on", "ON")
-    memory = json.loads((home.folder.parent / "bridge" / "mqtt-home.json").read_bytes())
+    memory = kept(home)
     assert {f"old{number}" for number in range(3)} <= {
         part for topic in memory["topics"] for part in topic.split("/")
     }
@@ -571,8 +594,7 @@ def test_what_comes_to_a_broker_later_is_not_taken_for_what_a_bridge_left(home, 
         home.heard("coughing", 0.1)
         listener.wait_for(f"{ROOT}/mic/event")
     assert listener.values[f"{ROOT}/hall/level"] == "-3"
-    memory = (home.folder.parent / "bridge" / "mqtt-home.json").read_text()
-    assert "/hall/" not in memory
+    assert "/hall/" not in json.dumps(kept(home))
 
 
 def _own(port):
@@ -599,17 +621,20 @@ def test_a_recorder_that_gets_its_former_name_back_leaves_nothing_of_the_other(t
             time.sleep(1)  # logs are named by the second
 
 
-def test_two_bridges_with_one_folder_clear_nothing_of_each_other(home, broker):
+def test_a_second_bridge_with_the_same_state_ends_with_a_line(home, broker):
     home.hears("coughing")
-    with (
-        Listener(broker.port) as listener,
-        Bridged(home.folder, broker),
-        Bridged(home.folder, broker, client_id="two", topic="other") as other,
-    ):
+    folder = home.folder.parent
+    config = folder / "home.toml"
+    config.write_text(
+        f'output = "{home.folder}"\n[bridge.mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
+        'topic = "other"\n'
+    )
+    with Listener(broker.port) as listener, Bridged(home.folder, broker):
         listener.wait_for(f"{COUGHING}/on")
-        listener.wait_for("other/home/mic/class/coughing/on")
-        assert "is used by another bridge" in other.said[0]
+        assert start_bridge(config, folder / "said").wait(60) == 1
         assert "" not in listener.values.values()
+    assert "other" not in {topic.partition("/")[0] for topic in listener.values}
+    assert (folder / "said").read_text().count("is used by another bridge of home; stop that") == 1
 
 
 def test_home_assistant_has_switches_and_buttons_only_where_commands_are_taken(home, broker):

@@ -17,6 +17,7 @@ from hearthlog.analyzer.bridge.alerts.delivery import Outbox
 from hearthlog.analyzer.bridge.alerts.output import RuleProgressStore, RuleWatch
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import Totals
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.logs.never_tell import NEVER_TELL_FILE, read_list, write_list
@@ -95,8 +96,9 @@ def test_a_rule_of_a_hidden_class_never_notifies(logs, tmp_path, hearthlog):
     heard = read_activity(home, "home", start, end, pytest.fail)
     for hidden, told in (((), {"music", "coughing"}), (("music",), {"coughing"})):
         folder = tmp_path / f"{len(hidden)}"
-        box = Outbox(folder / "box", ["x"], pytest.fail)
-        memory = RuleProgressStore(folder / "rules.json", pytest.fail)
+        state = BridgeState(folder, "home", pytest.fail)
+        box = Outbox(state, ["x"], pytest.fail)
+        memory = RuleProgressStore(state, pytest.fail)
         watch = RuleWatch(rules, UTC, box, memory, pytest.fail, start + MINUTE)
         watch.never_tell = frozenset(hidden)
         rang = watch.evaluate(lambda: heard, pytest.fail, end - MINUTE, end - MINUTE)
@@ -153,7 +155,7 @@ def test_totals_go_on_for_a_class_that_is_hidden_for_a_while(logs, tmp_path):
     assert {event.label for event in own.push_segments(columns)} == {"coughing"}
     assert own.labels() == ["coughing"]
     assert {event.label for event in own.ended_events()} == {"coughing"}
-    totals = Totals(tmp_path / "totals.json", 0)
+    totals = Totals(BridgeState(tmp_path, "home", pytest.fail), 0, pytest.fail)
     totals.keep(state, day_span(DAY, UTC)[1])
     state.never_tell = frozenset()
     counts = {total.label: total.events for total in totals.count(state)}

@@ -16,13 +16,17 @@ from hearthlog.analyzer import http as http_server
 from hearthlog.analyzer.bridge import home_state, prometheus
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
 from hearthlog.analyzer.http import free_port, listen
 from hearthlog.schemas.frames import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 
 HOUR = 3600 * NANOSECONDS
+
+
+def state_in(folder):
+    return BridgeState(folder, "home", pytest.fail)
 
 
 @pytest.fixture
@@ -47,7 +51,9 @@ def bridged(home, folder, **settings):
     token.write_text(f"{TOKEN}\n")
     settings = {"token_file": token, "readable_by": "all", **settings}
     place = place_of(home)
-    output = PrometheusOutput(PrometheusSettings(**settings), place, folder, since, said.append)
+    output = PrometheusOutput(
+        PrometheusSettings(**settings), place, state_in(folder), since, said.append
+    )
     with following(place, {"prometheus": output}, said):
         yield
     assert said == []
@@ -188,7 +194,7 @@ def test_a_port_without_a_token_stays_closed(home, tmp_path):
     settings = PrometheusSettings(port=port)
     place = place_of(home)
     with pytest.raises(BridgeError, match=f"port {port} stays closed.*name a `token_file`"):
-        PrometheusOutput(settings, place, tmp_path, 0, pytest.fail)
+        PrometheusOutput(settings, place, state_in(tmp_path), 0, pytest.fail)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port), timeout=10)
 
@@ -211,7 +217,7 @@ def test_a_port_that_stays_closed_takes_no_text_file_with_it(home, tmp_path, mon
         if lacking == "no port":
             token.write_text(f"{TOKEN}\n")
             held.enter_context(listen(port=port))
-        output = PrometheusOutput(settings, place, tmp_path, time.time_ns(), said.append)
+        output = PrometheusOutput(settings, place, state_in(tmp_path), time.time_ns(), said.append)
         with following(place, {"prometheus": output}, said):
             wait_for(lambda: text.read_text() if text.exists() else "")
             held.close()
@@ -226,7 +232,7 @@ def test_a_text_file_that_node_exporter_does_not_read_is_said_to_be_none(home, t
     said = []
     path = tmp_path / "hearthlog.txt"
     settings = PrometheusSettings(text_file=path, readable_by="owner")
-    PrometheusOutput(settings, place_of(home), tmp_path, 0, said.append).close()
+    PrometheusOutput(settings, place_of(home), state_in(tmp_path), 0, said.append).close()
     (line,) = said
     assert line.startswith(f"bridge.prometheus: text_file: {path} does not end in .prom")
     assert line.endswith(f'write "{tmp_path}/hearthlog.prom"')
@@ -236,7 +242,7 @@ def test_a_text_file_that_everybody_may_read_is_said_to_be(home, tmp_path):
     said = []
     path = tmp_path / "hearthlog.prom"
     settings = PrometheusSettings(text_file=path)
-    PrometheusOutput(settings, place_of(home), tmp_path, 0, said.append).close()
+    PrometheusOutput(settings, place_of(home), state_in(tmp_path), 0, said.append).close()
     (line,) = said
     assert line.startswith(
         f"bridge.prometheus: every account of this machine may read {path}; write readable_by"

@@ -33,6 +33,7 @@ from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.home_page import scenario_lines
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.bridge.wording import times
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
@@ -550,7 +551,11 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
     news = News(state, [], [], today(START + 60 * NANOSECONDS, UTC), UTC)
     figures, home = tmp_path / "figures.prom", RecorderAddress(tmp_path, "home", UTC)
     output = PrometheusOutput(
-        PrometheusSettings(text_file=figures, readable_by="all"), home, tmp_path, 0, pytest.fail
+        PrometheusSettings(text_file=figures, readable_by="all"),
+        home,
+        BridgeState(tmp_path, "home", pytest.fail),
+        0,
+        pytest.fail,
     )
 
     def samples() -> dict[tuple[str, ...], float]:

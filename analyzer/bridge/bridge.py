@@ -15,7 +15,13 @@ from typing import Any
 
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, follow_home
-from hearthlog.analyzer.bridge.output import RECENT, TOTALS, News, Output, kept_until
+from hearthlog.analyzer.bridge.output import RECENT, News, Output, Totals
+from hearthlog.analyzer.bridge.secret_files import (
+    figures_token,
+    page_secrets,
+    read_token,
+    secret_path,
+)
 from hearthlog.analyzer.bridge.settings import (
     NO_RECIPIENT,
     BridgeSettings,
@@ -24,13 +30,7 @@ from hearthlog.analyzer.bridge.settings import (
     PingSettings,
     RecorderAddress,
 )
-from hearthlog.analyzer.bridge.state import (
-    BridgeError,
-    figures_token,
-    page_secrets,
-    read_token,
-    secret_path,
-)
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
 from hearthlog.analyzer.extras import missing, remedy
 from hearthlog.analyzer.http import has_password, ip_of, listen, ping, read_ping_address
 from hearthlog.analyzer.logs.local_time import today
@@ -237,7 +237,7 @@ class ReopenedOutput:
 
 
 def open_outputs(
-    settings: BridgeSettings, home: RecorderAddress, state_folder: Path, say: ProblemReporter
+    settings: BridgeSettings, home: RecorderAddress, state: BridgeState, say: ProblemReporter
 ) -> tuple[dict[str, Output], int]:
     """Open the configured outputs.
 
@@ -256,7 +256,7 @@ def open_outputs(
         def publish() -> Output:
             from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher  # noqa: PLC0415
 
-            return MqttPublisher(mqtt, home, state_folder, say)
+            return MqttPublisher(mqtt, home, state, say)
 
         outputs["mqtt"] = publisher = ReopenedOutput(publish, say)
     if (figures := settings.prometheus) is not None:
@@ -265,15 +265,15 @@ def open_outputs(
         def count() -> Output:
             from hearthlog.analyzer.bridge.prometheus import PrometheusOutput  # noqa: PLC0415
 
-            return PrometheusOutput(figures, home, state_folder, first, say)
+            return PrometheusOutput(figures, home, state, first, say)
 
         outputs["prometheus"] = ReopenedOutput(count, say)
-        kept = kept_until(state_folder / TOTALS, since) - _EARLIER
+        kept = Totals(state, since, lambda _: None).time - _EARLIER
         since = min(since, max(kept, moment.now - _OLDEST))
     if (page := settings.page) is not None:
         from hearthlog.analyzer.bridge.page.home_page import HomePage  # noqa: PLC0415
 
-        outputs["page"] = ReopenedOutput(lambda: HomePage(page, home, state_folder, say), say)
+        outputs["page"] = ReopenedOutput(lambda: HomePage(page, home, state.folder, say), say)
     if (watchdog := settings.ping) is not None:
         outputs["ping"] = ReopenedOutput(lambda: PingOutput(watchdog, say), say)
     if settings.alert:
@@ -285,7 +285,7 @@ def open_outputs(
         rules, delivery = settings.alert, settings.delivery
         on_notification = None if mqtt is None else publish_alert
         outputs["alerts"] = ReopenedOutput(
-            lambda: AlertsOutput(rules, delivery, home, state_folder, say, on_notification), say
+            lambda: AlertsOutput(rules, delivery, home, state, say, on_notification), say
         )
     return outputs, since
 

@@ -1,19 +1,16 @@
 """Protocol of the bridge's outputs, their updates, and totals by class."""
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from datetime import tzinfo
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from pydantic import BaseModel, Field
 
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.state import BridgeError, StateFile
+from hearthlog.analyzer.bridge.state import BridgeState, StateEntry
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 
@@ -55,9 +52,6 @@ class Output(Protocol):
         """Stop within seconds."""
 
 
-TOTALS = "totals.json"  # in the state folder
-
-
 class Total(NamedTuple):
     """Totals of a class by microphone or scenario."""
 
@@ -72,34 +66,25 @@ class _Kept(BaseModel, extra="forbid"):
     totals: list[Total]
 
 
-def _totals_file(path: Path) -> StateFile[_Kept]:
-    damaged = "is damaged; delete it, and counts start over"
-    return StateFile(path, _Kept, lambda _: None, damaged)
-
-
 class Totals:
     """Totals of events and seconds by microphone and class, kept across restarts.
 
-    Events before a time are saved in a file; later ones are counted from the state of the home.
+    Events before a time are saved; later ones are counted from the state of the home.
 
     Parameters
     ----------
     time : int
-        Start of the count if there is no file, in nanoseconds of UTC.
-
-    Raises
-    ------
-    BridgeError
-        If the file is damaged.
+        Start of the count if nothing is saved, in nanoseconds of UTC.
     """
 
-    def __init__(self, path: Path, time: int) -> None:
-        self._file = _totals_file(path)
-        self._kept = self._file.read() or _Kept(time=time, totals=[])
+    def __init__(self, state: BridgeState, time: int, say: Callable[[str], None]) -> None:
+        damaged, unsaved = "cannot be read; counts start over", "saved again in ten seconds"
+        self._entry = StateEntry(state, "totals", _Kept, say, damaged, unsaved)
+        self._kept = self._entry.load() or _Kept(time=time, totals=[])
 
     @property
     def time(self) -> int:
-        """Time before which events are in the file, in nanoseconds of UTC."""
+        """Time before which events are saved, in nanoseconds of UTC."""
         return self._kept.time
 
     def count(self, state: HomeState, end: int | None = None) -> list[Total]:
@@ -127,23 +112,9 @@ class Totals:
         return [sums[key] for key in sorted(sums)]
 
     def keep(self, state: HomeState, time: int) -> None:
-        """Save the totals of events that began before a time, unless saved already.
-
-        Raise `BridgeError` if the file cannot be written.
-        """
+        """Save the totals of events that began before a time, unless saved already."""
         if time <= self.time:
             return
         kept = _Kept(time=time, totals=self.count(state, time))
-        try:
-            self._file.write(kept)
-        except LogError as error:
-            raise BridgeError(f"{self._file.path}: cannot be written ({error})") from error
-        self._kept = kept
-
-
-def kept_until(path: Path, default: int) -> int:
-    """Return the end of the totals in a file, in nanoseconds of UTC; `default` without a file."""
-    with suppress(HearthlogError):
-        kept = _totals_file(path).read()
-        return default if kept is None else kept.time
-    return default
+        if self._entry.save(kept):
+            self._kept = kept

@@ -16,9 +16,10 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from hearthlog.analyzer.activity.sources import is_of_scenario, source_parts
-from hearthlog.analyzer.bridge.output import TOTALS, News, Total, Totals
+from hearthlog.analyzer.bridge.output import News, Total, Totals
+from hearthlog.analyzer.bridge.secret_files import figures_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError, figures_token
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, is_asked_in_digits
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY
 from hearthlog.schemas.errors import LogError
@@ -41,15 +42,15 @@ class PrometheusOutput:
     Raises
     ------
     BridgeError
-        If neither port nor text file is configured, if the port cannot be opened or has no token
-        and there is no text file, or if the saved totals are damaged.
+        If neither port nor text file is configured, or if the port cannot be opened or has no
+        token and there is no text file.
     """
 
     def __init__(
         self,
         settings: PrometheusSettings,
         home: RecorderAddress,
-        state_folder: Path,
+        state: BridgeState,
         since: int,
         say: Callable[[str], None],
     ) -> None:
@@ -57,7 +58,7 @@ class PrometheusOutput:
         self._settings = settings
         self._home = home
         self._say = say
-        self.totals = Totals(state_folder / TOTALS, since)
+        self.totals = Totals(state, since, say)
         self._made = b"", -math.inf  # the metrics, and their time by CLOCK_MONOTONIC
         self._due = 0.0  # by CLOCK_MONOTONIC
         if settings.text_file is not None and settings.readable_by is None:

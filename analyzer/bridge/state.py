@@ -1,17 +1,23 @@
-"""State folder, secrets, and server tokens of the bridge."""
+"""State of the bridge that outlives it: one SQLite file of the state folder."""
 
+import fcntl
 import os
-import re
-import secrets
-from collections.abc import Callable
+import sqlite3
+import time
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
+from threading import RLock
 from typing import Generic, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.recorder.log.folder_lock import node_locks
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import read_limited
-from hearthlog.schemas.new_files import create_file, private_folder, replaced_file
+from hearthlog.schemas.logs.files import log_name, walk_logs
+from hearthlog.schemas.new_files import create_file, open_lock, private_folder
 
 
 class BridgeError(HearthlogError):
@@ -45,169 +51,401 @@ def state_folder(configured: Path | None, logs: Path) -> Path:
     return folder
 
 
+_NAME = "state.sqlite3"
+_VERSION = 1  # of the table; a bridge refuses a later one
+_TABLE = """
+    CREATE TABLE entries (
+        node TEXT NOT NULL, name TEXT NOT NULL, content TEXT NOT NULL, PRIMARY KEY (node, name)
+    ) WITHOUT ROWID
+"""
+_AGAIN_SECONDS = 60.0  # between attempts to open a file that could not be opened
+_LARGEST = 4 << 20  # bytes of an entry
+RETAINED = "mqtt"  # name of an entry; below it, with a slash, those of former recorder names
+# Files of earlier versions in the state folder, as patterns, and their entries.
+_FILES = {
+    "alerts/rules.json": "rules",
+    "alerts/lines.json": "addresses",
+    "alerts/outbox/*.json": "outbox/",
+    "totals.json": "totals",
+    "mqtt-*.json": RETAINED,
+}
+
+
+class BridgeState:
+    """Persistent entries of one recorder's bridge: JSON texts by name; thread-safe.
+
+    An entry that was written survives a kill and a power cut. While the file cannot be used, as
+    on a full disk, entries are kept in memory, and the file is tried again every minute.
+
+    Parameters
+    ----------
+    folder : Path
+        State folder; recorders may share one.
+    node : str
+        Name of the recorder.
+    say : callable
+        Called with a line about a file that cannot be used.
+    """
+
+    def __init__(self, folder: Path, node: str, say: Callable[[str], None]) -> None:
+        self.folder = folder
+        self.path = folder / _NAME
+        self.node = node
+        self._say = say
+        self._lock = RLock()
+        self._opened: sqlite3.Connection | None = None
+        self._is_in_memory = False
+        self._removed: set[str] = set()  # entries removed while they are kept in memory
+        self._due = 0.0  # of the next attempt to open the file, by CLOCK_MONOTONIC
+        self._descriptor: int | None = None
+
+    def claim(self, logs: Path) -> None:
+        """Lock the entries of the recorder, and adopt those of its former names.
+
+        Parameters
+        ----------
+        logs : Path
+            Folder of the recorder's logs, which tell whether it was renamed.
+
+        Raises
+        ------
+        BridgeError
+            If another bridge of the recorder uses the folder, or the file is of a later version.
+        """
+        with suppress(OSError):  # a disk that cannot be written: entries stay in memory
+            private_folder(self.folder)
+            self._descriptor = _locked(self.folder, self.node)
+            if self._descriptor is None:
+                raise BridgeError(
+                    f"{self.folder}: is used by another bridge of {self.node}; stop that bridge, "
+                    "or give each its own `state` in [bridge]"
+                )
+        with self._database() as database:
+            nodes = {node for (node,) in database.execute("SELECT DISTINCT node FROM entries")}
+        for former in sorted(nodes - {self.node}):
+            if is_renamed(logs, self.node, former, is_first=self.node not in nodes):
+                self._adopt(former)
+
+    def read(self, name: str) -> str | None:
+        """Return an entry; None if there is none."""
+        query = "SELECT content FROM entries WHERE node = ? AND name = ?"
+        with self._database() as database:
+            row = database.execute(query, (self.node, name)).fetchone()
+        return None if row is None else str(row[0])
+
+    def names(self, prefix: str) -> list[str]:
+        """Return the names of the entries that begin with a prefix, sorted."""
+        query = "SELECT name FROM entries WHERE node = ? AND substr(name, 1, ?) = ? ORDER BY name"
+        with self._database() as database:
+            return [
+                str(row[0]) for row in database.execute(query, (self.node, len(prefix), prefix))
+            ]
+
+    def write(self, name: str, content: str, obsolete: Collection[str] = ()) -> None:
+        """Write an entry, and remove obsolete ones; on disk on return.
+
+        Raise `sqlite3.Error` on a failure: nothing has changed then.
+        """
+        with self._database() as database, _transaction(database):
+            database.execute(
+                "INSERT OR REPLACE INTO entries VALUES (?, ?, ?)", (self.node, name, content)
+            )
+            self._remove(database, obsolete)
+
+    def remove(self, names: Collection[str]) -> None:
+        """Remove entries; raise `sqlite3.Error` on a failure."""
+        with self._database() as database, _transaction(database):
+            self._remove(database, names)
+
+    def close(self) -> None:
+        """Close the file, and release the lock."""
+        with self._lock:
+            if self._opened is not None:
+                self._opened.close()
+            self._opened = None
+            if self._descriptor is not None:
+                os.close(self._descriptor)
+            self._descriptor = None
+
+    def __del__(self) -> None:  # Python 3.13 warns of a connection that nobody closed
+        if self._opened is not None:
+            self._opened.close()
+
+    def _remove(self, database: sqlite3.Connection, names: Collection[str]) -> None:
+        database.executemany(
+            "DELETE FROM entries WHERE node = ? AND name = ?", [(self.node, name) for name in names]
+        )
+        if self._is_in_memory:
+            self._removed.update(names)
+
+    @contextmanager
+    def _database(self) -> Iterator[sqlite3.Connection]:
+        with self._lock:
+            if self._opened is None or (self._is_in_memory and time.monotonic() >= self._due):
+                self._open()
+            assert self._opened is not None
+            yield self._opened
+
+    def _open(self) -> None:
+        """Open the file, or begin to keep entries in memory."""
+        try:
+            database = self._open_file()
+        except (OSError, sqlite3.Error) as error:
+            self._due = time.monotonic() + _AGAIN_SECONDS
+            self._say(
+                f"{self.path}: cannot be used ({_reason(error)}); nothing is saved until then"
+            )
+            if self._opened is None:
+                self._opened, self._is_in_memory = self._copy(), True
+            return
+        if self._opened is not None:
+            with _transaction(database):
+                rows = self._opened.execute("SELECT * FROM entries WHERE node = ?", (self.node,))
+                database.executemany("INSERT OR REPLACE INTO entries VALUES (?, ?, ?)", rows)
+                self._is_in_memory = False
+                self._remove(database, self._removed)
+            self._opened.close()
+        self._opened = database
+        self._take_files()
+
+    def _open_file(self) -> sqlite3.Connection:
+        private_folder(self.folder)
+        if self.path.is_symlink():
+            raise OSError(0, "is a link")
+        with suppress(FileExistsError):
+            create_file(self.path).close()  # private; SQLite gives its other files the same mode
+        try:
+            return _open_database(self.path)
+        except sqlite3.OperationalError:
+            raise
+        except sqlite3.DatabaseError as error:
+            aside = self._set_aside()
+            self._say(
+                f"{self.path}: is damaged ({error}) and now called {aside}; the bridge starts "
+                "over: muted classes are published, and alerts may come twice"
+            )
+            create_file(self.path).close()
+            return _open_database(self.path)
+
+    def _set_aside(self) -> str:
+        stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+        for suffix in ("", "-wal", "-shm"):
+            with suppress(FileNotFoundError):
+                Path(f"{self.path}{suffix}").replace(f"{self.path}.damaged-{stamp}{suffix}")
+        return f"{self.path.name}.damaged-{stamp}"
+
+    def _copy(self) -> sqlite3.Connection:
+        """Return the entries of a file that can only be read, if it can, in memory."""
+        memory = sqlite3.connect(":memory:", check_same_thread=False, isolation_level=None)
+        # Without a write-ahead log nothing needs to be created to read the file.
+        has_log = self.path.with_name(f"{_NAME}-wal").exists()
+        address = f"{self.path.absolute().as_uri()}?{'mode=ro' if has_log else 'immutable=1'}"
+        with suppress(sqlite3.Error):
+            source = sqlite3.connect(address, uri=True)
+            try:
+                source.backup(memory)
+            finally:
+                source.close()
+        with suppress(sqlite3.OperationalError):  # the table is there
+            memory.execute(_TABLE)
+        return memory
+
+    def _take_files(self) -> None:
+        """Move files of earlier versions into the database.
+
+        A file whose entry is there is newer: a bridge of an earlier version has run since.
+        """
+        for pattern, name in _FILES.items():
+            for path in sorted(self.folder.glob(pattern)):
+                node = path.stem.partition("-")[2] if name == RETAINED else self.node
+                own = f"{name}{path.stem}" if name.endswith("/") else name
+                try:
+                    content = read_limited(path, "file of the bridge", _LARGEST, BridgeError)
+                    row = node, own, content.decode()
+                    assert self._opened is not None
+                    self._opened.execute("INSERT OR REPLACE INTO entries VALUES (?, ?, ?)", row)
+                    path.unlink()
+                except (HearthlogError, OSError, ValueError, sqlite3.Error) as error:
+                    self._say(f"{path}: cannot be read ({error}) and is left there; remove it")
+        for path in self.folder.glob(".mqtt-*.lock"):
+            with suppress(OSError):
+                path.unlink()
+        for folder in ("alerts/outbox", "alerts"):
+            with suppress(OSError):  # missing, or something else is in it
+                (self.folder / folder).rmdir()
+
+    def _adopt(self, former: str) -> None:
+        """Take over the entries of a former name, unless its bridge runs; own entries are kept."""
+        with suppress(OSError):
+            descriptor = _locked(self.folder, former)
+            if descriptor is None:
+                return
+            try:
+                with self._database() as database, _transaction(database):
+                    database.execute(
+                        "UPDATE OR REPLACE entries SET name = ? WHERE node = ? AND name = ?",
+                        (f"{RETAINED}/{former}", former, RETAINED),
+                    )
+                    database.execute(
+                        "UPDATE OR IGNORE entries SET node = ? WHERE node = ?", (self.node, former)
+                    )
+                    database.execute("DELETE FROM entries WHERE node = ?", (former,))
+            finally:
+                os.close(descriptor)
+
+
+def _open_database(path: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+    try:
+        _prepare(database, path)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def _prepare(database: sqlite3.Connection, path: Path) -> None:
+    """Create the table in a new database; raise `sqlite3.DatabaseError` if it is damaged."""
+    database.execute("PRAGMA journal_mode = WAL")
+    database.execute("PRAGMA synchronous = FULL")  # else a power cut undoes what was written
+    (version,) = database.execute("PRAGMA user_version").fetchone()
+    if version > _VERSION:
+        raise BridgeError(
+            f"{path}: was written by a later version of hearthlog; update this one, or name "
+            "another folder with `state` in [bridge]"
+        )
+    (problem,) = database.execute("PRAGMA quick_check(1)").fetchone()
+    if problem != "ok":
+        raise sqlite3.DatabaseError(problem)
+    if version < _VERSION:
+        with _transaction(database):
+            database.execute(_TABLE)
+            database.execute(f"PRAGMA user_version = {_VERSION}")
+
+
+@contextmanager
+def _transaction(database: sqlite3.Connection) -> Iterator[None]:
+    database.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        database.execute("COMMIT")
+    except BaseException:
+        if database.in_transaction:
+            database.execute("ROLLBACK")
+        raise
+
+
+def _locked(folder: Path, node: str) -> int | None:
+    """Lock the entries of a recorder; None if another bridge has the lock."""
+    descriptor = open_lock(folder / f".bridge-{node}.lock")
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+
+
 Content = TypeVar("Content")
-_LARGEST = 4 << 20  # bytes of a file
 
 
-class StateFile(Generic[Content]):
-    """A JSON file of the state folder, checked when it is read and replaced atomically.
+class StateEntry(Generic[Content]):
+    """An entry of the bridge's state, checked when it is read.
 
     Parameters
     ----------
     kind : type
         Type of the content, for pydantic.
     damaged, unsaved : str
-        Consequence of a file that cannot be read, or written, for `say`.
+        Consequence of an entry that cannot be read, or written, for `say`.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913, PLR0917
         self,
-        path: Path,
+        state: BridgeState,
+        name: str,
         kind: type[Content],
         say: Callable[[str], None],
         damaged: str,
-        unsaved: str = "",
+        unsaved: str,
     ) -> None:
-        self.path = path
+        self._state = state
+        self.name = name
         self._kind = TypeAdapter(kind)
         self._say = say
         self._damaged, self._unsaved = damaged, unsaved
 
-    def read(self) -> Content | None:
-        """Return the content; None if there is no file.
-
-        Raise `BridgeError` if the file is damaged.
-        """
-        if not self.path.exists():
-            return None
-        try:
-            return self._kind.validate_json(
-                read_limited(self.path, "file of the bridge", _LARGEST, BridgeError)
-            )
-        except ValidationError as error:
-            raise BridgeError(f"{self.path}: {self._damaged}") from error
-
     def load(self) -> Content | None:
-        """Return the content; None if there is no file, or it is reported to be damaged."""
+        """Return the content; None if there is none, or it is reported to be damaged."""
         try:
-            return self.read()
-        except HearthlogError:
+            content = self._state.read(self.name)
+            return None if content is None else self._kind.validate_json(content)
+        except (ValidationError, sqlite3.Error):
             self.report_damage()
             return None
 
     def report_damage(self) -> None:
-        """Report that the file is damaged."""
-        self._say(f"{self.path}: {self._damaged}")
+        """Report that the entry is damaged."""
+        self._say(f"{self._state.path}, {self.name}: {self._damaged}")
 
-    def save(self, content: Content) -> bool:
-        """Write the content, on disk on return; return False if the failure is reported."""
+    def save(self, content: Content, obsolete: Collection[str] = ()) -> bool:
+        """Write the content, on disk on return; return False if the failure is reported.
+
+        Parameters
+        ----------
+        obsolete : collection of str, optional
+            Names of entries to remove at the same moment.
+        """
         try:
-            self.write(content)
-        except LogError as error:
-            self._say(f"{error}; {self._unsaved}")
+            self._state.write(self.name, self._kind.dump_json(content).decode(), obsolete)
+        except sqlite3.Error as error:
+            self._say(f"{self._state.path}: cannot be written ({error}); {self._unsaved}")
             return False
         return True
 
-    def write(self, content: Content) -> None:
-        """Write the content, on disk on return; raise `LogError` on a failure."""
-        with replaced_file(self.path) as temporary, create_file(temporary) as stream:
-            stream.write(self._kind.dump_json(content))
+
+_RESTART_SECONDS = 2.0  # overlap up to which two logs do not count as simultaneous
 
 
-_CREDENTIALS = "CREDENTIALS_DIRECTORY"  # of systemd
+def is_renamed(logs: Path, node: str, former: str, *, is_first: bool) -> bool:
+    """Whether a former recorder of a folder was renamed to this one.
 
-
-def secret_path(path: Path) -> Path:
-    """Return the path of a secret, relative to the systemd credentials folder if there is one."""
-    return Path(os.environ.get(_CREDENTIALS, "")) / path
-
-
-_TOKEN, _COOKIES, _ADDRESS = "page-token", "page-cookies", "page-address"
-_FORM = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # characters that URLs need not escape
-
-
-def page_token(file: Path | None, state: Path) -> str:
-    """Return the token of the page.
+    True if the former recorder wrote logs there and no longer records, and this recorder wrote no
+    log during that time, but later ones, or writes now. Two different recorders of one folder
+    would write at the same time.
 
     Parameters
     ----------
-    file : Path or None
-        One-line token file, resolved by `secret_path`; None to create a token in the state folder
-        and keep it.
-
-    Raises
-    ------
-    BridgeError
-        If the file cannot be used or created.
+    is_first : bool
+        Whether no bridge of this recorder ran before, so that it may have no log yet.
     """
-    return read_token(file) if file is not None else _kept(state / _TOKEN)
+    if former == node:
+        return False
+    locks = {each.node: each.is_held for each in node_locks(logs)}
+    if locks.get(former, False) is not False:
+        return False
+    spans = _log_spans(logs, {node, former})
+    own, theirs = spans[node], spans[former]
+    if not theirs:  # the former recorder may write to another folder
+        return False
+    if not own:
+        return is_first
+    first, last = min(start for start, _ in theirs), max(end for _, end in theirs)
+    is_since = max(start for start, _ in own) > last or bool(locks.get(node, False))
+    return is_since and not any(start <= last and end >= first for start, end in own)
 
 
-def cookie_key(state: Path) -> bytes:
-    """Return the key that signs the page's cookies; a new key is created if its file is missing.
-
-    Raise `BridgeError` if the key cannot be read or created.
-    """
-    return _kept(state / _COOKIES).encode()
-
-
-def page_secrets(state: Path) -> list[Path]:
-    """Return the paths of the page's secrets in the state folder."""
-    return [state / name for name in (_TOKEN, _COOKIES, _ADDRESS)]
-
-
-def keep_address(address: str, state: Path) -> Path:
-    """Write the page's address with its token to a file that only the owner may read.
-
-    Raise `BridgeError` if the file cannot be written.
-    """
-    path = state / _ADDRESS
-    _write(path, address)
-    return path
-
-
-def read_token(file: Path) -> str:
-    """Read a token file, resolved by `secret_path`.
-
-    Raise `BridgeError` if the file cannot be used.
-    """
-    file = secret_path(file)
-    data = read_limited(file, "file of a token", 1 << 12, BridgeError)
-    token = data.decode("utf-8", errors="replace").strip()
-    if not _FORM.fullmatch(token):
-        raise BridgeError(
-            f"{file}: has no token: one line of 16 to 200 letters, digits, '.', '_', '~' and '-'"
-        )
-    return token
-
-
-def figures_token(port: int, file: Path | None) -> str:
-    """Return the token of the port for Prometheus.
-
-    Raise `BridgeError` if no token is configured: every account of the machine can reach a loopback
-    port.
-    """
-    if file is None:
-        raise BridgeError(
-            f"bridge.prometheus: port {port} stays closed, as every account of this machine could "
-            "read it: name a `token_file`, and the same file as `credentials_file` in Prometheus"
-        )
-    return read_token(file)
-
-
-def _kept(path: Path) -> str:
-    if not path.exists():
-        _write(path, secrets.token_urlsafe(16))
-    return read_token(path.absolute())
-
-
-def _write(path: Path, line: str) -> None:
-    try:
-        private_folder(path.parent)
-        with replaced_file(path, readers=0) as temporary, create_file(temporary) as stream:
-            stream.write(f"{line}\n".encode())
-    except (LogError, OSError) as error:
-        text = (
-            f"{path}: cannot be written ({error.strerror})" if isinstance(error, OSError) else error
-        )
-        raise BridgeError(f"{text}; name another folder with `state` in [bridge]") from error
+def _log_spans(folder: Path, nodes: Collection[str]) -> dict[str, list[tuple[str, str]]]:
+    """Return the start and last write time of nodes' logs, formatted as in log names."""
+    spans: dict[str, list[tuple[str, str]]] = {node: [] for node in nodes}
+    for entry in walk_logs(folder):
+        name = log_name(Path(entry.name))
+        if name.node in spans and not name.layer:
+            with suppress(OSError, ValueError, OverflowError):  # deleted, or an invalid time
+                end = datetime.fromtimestamp(entry.stat().st_mtime - _RESTART_SECONDS, UTC)
+                spans[name.node].append((name.time, max(name.time, f"{end:%Y%m%dT%H%M%SZ}")))
+    return spans

@@ -1,7 +1,7 @@
 """`hearthlog bridge` and `hearthlog alerts`: events for other systems, and alert rules on logs."""
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import tzinfo
 from pathlib import Path
 from threading import Event
@@ -23,6 +23,7 @@ from hearthlog.tools.cli.terminal import (
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.bridge.alerts.rules import AlertRule, Notification
+    from hearthlog.analyzer.bridge.state import BridgeState
     from hearthlog.analyzer.logs.home_logs import HomeLogs
 
 
@@ -39,6 +40,12 @@ def bridge(
     config: Annotated[
         Path | None,
         typer.Option(help="Configuration of the recorder, a TOML file with a table `bridge`."),
+    ] = None,
+    unmute: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Class to publish to the broker again that an MQTT command muted; repeatable."
+        ),
     ] = None,
 ) -> None:
     """Follow the log of a recorder, and publish it to MQTT, Home Assistant and other outputs.
@@ -59,7 +66,7 @@ def bridge(
         configured_microphones,
         load_bridge_settings,
     )
-    from hearthlog.analyzer.bridge.state import state_folder
+    from hearthlog.analyzer.bridge.state import BridgeState, state_folder
     from hearthlog.analyzer.extras import require
     from hearthlog.models.classes import class_name
     from hearthlog.recorder.config import exposed_passwords
@@ -84,14 +91,35 @@ def bridge(
         logs or settings.output, settings.node, time_zone(settings.timezone), never_tell
     )
     say = ProblemReporter(print_notice)
-    state = state_folder(own.state, home.folder)
-    for line in [*exposed_files(own, config, state), *exposed_passwords(settings, config)]:
+    state = BridgeState(state_folder(own.state, home.folder), home.node, say)
+    for line in [*exposed_files(own, config, state.folder), *exposed_passwords(settings, config)]:
         say(line)
     microphones = [] if logs else configured_microphones(settings)
     for line in rule_doubts(own.alert, settings, microphones):
         say(f"alerts: {line}")
-    outputs, since = open_outputs(own, home, state, say)
-    Bridge(home, since, outputs, say).run(stop)
+    try:
+        if own.mqtt or own.prometheus or own.alert:
+            state.claim(home.folder)
+        if unmute:
+            _unmute(state, [class_name(name) for name in unmute], say)
+        outputs, since = open_outputs(own, home, state, say)
+        Bridge(home, since, outputs, say).run(stop)
+    finally:
+        state.close()
+
+
+def _unmute(state: "BridgeState", classes: list[str], say: "Callable[[str], None]") -> None:
+    from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics
+    from hearthlog.schemas.errors import listed
+
+    topics = RetainedTopics(state, say)
+    muted = topics.muted()
+    if others := [name for name in classes if name not in muted]:
+        there = f"muted: {listed(muted, 'and')}" if muted else "no class is muted"
+        wrong_use(f"--unmute {others[0]}: this class is published; {there}")
+    for name in classes:
+        topics.switch(name, is_told=True)
+    topics.save()
 
 
 _WEEK = 7 * 86_400 * 1_000_000_000

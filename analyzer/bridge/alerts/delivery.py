@@ -5,6 +5,7 @@ import hashlib
 import importlib
 import logging
 import re
+import sqlite3
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import tzinfo
@@ -17,17 +18,17 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from hearthlog.analyzer.bridge.alerts.rules import Notification
-from hearthlog.analyzer.bridge.state import BridgeError, StateFile, secret_path
+from hearthlog.analyzer.bridge.secret_files import secret_path
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, StateEntry
 from hearthlog.analyzer.extras import remedy
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.schemas.files import exposed_secret, read_limited
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.new_files import private_folder
 
 MOST = 1000
 UNREAD = "?"  # stands for the target of an unreadable line, in place of a target name
 _UNREAD_LONGEST = 24 * 3600 * NANOSECONDS  # how long notifications wait for a fix of such a line
-_SUFFIX = ".json"
+_OUTBOX = "outbox/"  # begins the names of the entries
 
 
 class Waiting(BaseModel):
@@ -53,25 +54,24 @@ class Outbox:
     ----------
     most : int, optional
         Most notifications kept; beyond that the oldest are dropped.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be created or read.
     """
 
     def __init__(
-        self, folder: Path, targets: Sequence[str], say: Callable[[str], None], most: int = MOST
+        self,
+        state: BridgeState,
+        targets: Sequence[str],
+        say: Callable[[str], None],
+        most: int = MOST,
     ) -> None:
-        self._folder = folder
+        self._state = state
         self._targets = frozenset(targets)
         self._say = say
         self._most = most
         self._lock = Lock()
         self._waiting: dict[str, Waiting] = {}
-        private_folder(folder)
-        for path in sorted(folder.glob(f"*{_SUFFIX}")):
-            self._load(path.name.removesuffix(_SUFFIX))
+        for name in state.names(_OUTBOX):
+            self._load(name.removeprefix(_OUTBOX))
+        self._remove([n for n, each in self._waiting.items() if each.told >= self._targets])
         self._early = frozenset(self._waiting)  # these may be evaluated again after a restart
 
     def __len__(self) -> int:
@@ -99,8 +99,7 @@ class Outbox:
                     self._write(waiting)
 
     def _remove_done(self, now: int) -> None:
-        for name in [n for n, each in self._waiting.items() if self._is_done(each, now)]:
-            self._remove(name)
+        self._remove([n for n, each in self._waiting.items() if self._is_done(each, now)])
 
     def _is_done(self, waiting: Waiting, now: int) -> bool:
         missing = self._targets - waiting.told
@@ -136,55 +135,52 @@ class Outbox:
                 return
             waiting.told.add(target)
             if waiting.told >= self._targets:
-                self._remove(notification.id)
+                self._remove([notification.id])
             else:
                 self._write(waiting)
 
     def forget_after(self, time: int) -> None:
         """Drop notifications later than a time: they were created while the clock was ahead."""
         with self._lock:
-            for name in [n for n, each in self._waiting.items() if each.time > time]:
-                self._remove(name)
+            self._remove([n for n, each in self._waiting.items() if each.time > time])
 
     def _drop_oldest(self) -> None:
         number = len(self._waiting) - self._most
         if number > 0:
-            for name in sorted(self._waiting, key=lambda each: self._waiting[each].time)[:number]:
-                self._remove(name)
+            self._remove(sorted(self._waiting, key=lambda each: self._waiting[each].time)[:number])
             self._say(
-                f"{self._folder}: {self._most} alerts are waiting, and the oldest are dropped; "
-                "see above which target fails; repair it, or remove it from urls_file"
+                f"{self._most} alerts are waiting, and the oldest are dropped; see above which "
+                "target fails; repair it, or remove it from urls_file"
             )
 
-    def _remove(self, name: str) -> None:
-        del self._waiting[name]
-        path = self._file(name).path
+    def _remove(self, names: Sequence[str]) -> None:
+        for name in names:
+            del self._waiting[name]
         try:
-            path.unlink(missing_ok=True)
-        except OSError as error:
-            self._say(f"{path}: cannot be removed ({error.strerror}); do so by hand")
+            self._state.remove([f"{_OUTBOX}{name}" for name in names])
+        except sqlite3.Error as error:
+            self._say(f"{self._state.path}: cannot be written ({error}); alerts may come twice")
 
     def _write(self, waiting: Waiting) -> None:
-        self._file(waiting.notification.id).save(waiting)
+        self._entry(waiting.notification.id).save(waiting)
 
-    def _file(self, name: str) -> StateFile[Waiting]:
-        return StateFile(
-            self._folder / f"{name}{_SUFFIX}",
+    def _entry(self, name: str) -> StateEntry[Waiting]:
+        return StateEntry(
+            self._state,
+            f"{_OUTBOX}{name}",
             Waiting,
             self._say,
-            "no alert that was kept here; remove it",
+            "cannot be read; this alert is not delivered",
             "until it can, alerts are only kept in memory",
         )
 
     def _load(self, name: str) -> None:
-        file = self._file(name)
-        waiting = file.load()
+        entry = self._entry(name)
+        waiting = entry.load()
         if waiting is None:
             return
         if waiting.notification.id != name:
-            file.report_damage()
-        elif waiting.told >= self._targets:
-            file.path.unlink(missing_ok=True)
+            entry.report_damage()
         else:
             self._waiting[name] = waiting
 

@@ -37,8 +37,9 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     live_history,
 )
 from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError, StateFile, secret_path
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, StateEntry
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -48,19 +49,19 @@ from hearthlog.schemas.logs.columns import Columns
 class RuleProgressStore:
     """Persistent evaluation progress of each rule; a changed rule starts over."""
 
-    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+    def __init__(self, state: BridgeState, say: Callable[[str], None]) -> None:
         damaged = "cannot be read; all rules start over"
         unsaved = "alerts may come twice after the next start"
-        self._file = StateFile(path, dict[str, RuleState], say, damaged, unsaved)
+        self._entry = StateEntry(state, "rules", dict[str, RuleState], say, damaged, unsaved)
 
     def load(self, rules: Sequence[AlertRule]) -> dict[str, RuleState]:
         """Return the states of rules by name."""
-        known = self._file.load() or {}
+        known = self._entry.load() or {}
         return {rule.name: known.get(rule.fingerprint, RuleState()) for rule in rules}
 
     def save(self, rules: Sequence[AlertRule], states: Mapping[str, RuleState]) -> None:
         """Save the states of rules; they are on disk on return."""
-        self._file.save({rule.fingerprint: states[rule.name] for rule in rules})
+        self._entry.save({rule.fingerprint: states[rule.name] for rule in rules})
 
 
 _OLDEST = DAY  # notifications older than this are not delivered
@@ -189,7 +190,7 @@ class AlertsOutput:
     Raises
     ------
     BridgeError
-        If there is no recipient, or the state folder cannot be written.
+        If there is no recipient.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -197,7 +198,7 @@ class AlertsOutput:
         rules: Sequence[AlertRule],
         delivery: DeliverySettings,
         home: RecorderAddress,
-        state_folder: Path,
+        state: BridgeState,
         say: Callable[[str], None],
         on_notification: OnNotification | None = None,
     ) -> None:
@@ -208,19 +209,15 @@ class AlertsOutput:
         self._followed = home
         self._say = say
         self._on_notification = on_notification
-        folder = state_folder / "alerts"
         self._has_problems = False
         self._read_file, self._looked_at_file = object(), -math.inf  # the second: CLOCK_MONOTONIC
-        try:
-            self._outbox = Outbox(folder / "outbox", [BROKER, UNREAD], say)
-        except OSError as error:
-            raise BridgeError(f"{folder}: cannot be used ({error.strerror})") from error
+        self._outbox = Outbox(state, [BROKER, UNREAD], say)
         twice = "targets on edited lines may be notified twice"
-        self._lines_file = StateFile(
-            folder / "lines.json", list[str], say, f"cannot be read; {twice}", twice
+        self._lines_entry = StateEntry(
+            state, "addresses", list[str], say, f"cannot be read; {twice}", twice
         )
-        self._lines = self._lines_file.load() or []  # target names of the file of addresses
-        memory = RuleProgressStore(folder / "rules.json", say)
+        self._lines = self._lines_entry.load() or []  # target names of the file of addresses
+        memory = RuleProgressStore(state, say)
         now = self._latest = time.time_ns()
         self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
         self._heard = LiveActivity(now, _PATIENCE)
@@ -287,11 +284,11 @@ class AlertsOutput:
         if time.monotonic() - self._looked_at_file < _LOOK_AT_FILE_SECONDS:
             return
         self._looked_at_file = time.monotonic()
-        state = None if self._file is None else _state_of(self._file)
-        if state == self._read_file:
+        current = None if self._file is None else _state_of(self._file)
+        if current == self._read_file:
             return
         targets, problems, names, lacks_package = find_targets(self._file, self._say)
-        self._read_file = object() if lacks_package else state
+        self._read_file = object() if lacks_package else current
         for problem in problems:
             self._say(
                 f"alerts: {problem}; other targets are notified, this one once it is corrected"
@@ -303,7 +300,7 @@ class AlertsOutput:
             self._outbox.replace_targets(replaced_names(self._lines, names))
             if names != self._lines:
                 self._lines = names
-                self._lines_file.save(names)
+                self._lines_entry.save(names)
         told = [target.name for target in targets] + [UNREAD] * bool(problems)
         told += [BROKER] * (self._on_notification is not None)
         self._outbox.set_targets(told, time.time_ns())

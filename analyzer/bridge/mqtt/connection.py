@@ -15,8 +15,9 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
+from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import MqttSettings
-from hearthlog.analyzer.bridge.state import BridgeError, secret_path
+from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.schemas.files import read_limited
 
 _KEEPALIVE = 20  # seconds: the broker drops a client that is silent for 1.5 times as long

@@ -3,18 +3,14 @@
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import suppress
-from datetime import UTC, datetime
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from paho.mqtt.client import MQTTMessage
 
 from hearthlog.analyzer.activity.events import ANY_SOUND, SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
-from hearthlog.analyzer.bridge.mqtt.connection import Connection, place_of
+from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     command_discovery,
     described,
@@ -25,11 +21,10 @@ from hearthlog.analyzer.bridge.mqtt.home_assistant import (
 from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, RetainedTopics, Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
+from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.local_time import iso_time
 from hearthlog.models.classes import SILENCE, UNKNOWN
-from hearthlog.recorder.log.folder_lock import node_locks
 from hearthlog.schemas.errors import shortened
-from hearthlog.schemas.logs.files import log_name, walk_logs
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.bridge.commands import Answer, Commands
@@ -43,7 +38,6 @@ _MOST_OFF = 1000  # muted classes read back from the broker
 _MOST_BEGUN = 1000
 _LARGEST_FOUND = 1 << 20  # bytes of a discovery payload that is read back
 _MOST_FOUND, _MOST_FOUND_SIZE = 5000, 1 << 20  # adopted topics, and their characters
-_RESTART_SECONDS = 2.0  # overlap up to which two logs do not count as simultaneous
 
 
 class MqttPublisher:
@@ -56,7 +50,7 @@ class MqttPublisher:
         self,
         settings: MqttSettings,
         home: RecorderAddress,
-        state_folder: Path,
+        state: BridgeState,
         say: Callable[[str], None],
     ) -> None:
         self._settings = settings
@@ -75,9 +69,7 @@ class MqttPublisher:
         self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
         self._say = say
-        self._announced = RetainedTopics(
-            state_folder, home.node, place_of(settings), partial(_is_renamed, home), say
-        )
+        self._announced = RetainedTopics(state, say)
         self._forgotten: set[str] = set()  # topics being cleared at the broker
         self._has_said_muted = False
         # Earlier versions stored retained topics and muted classes only at the broker.
@@ -93,18 +85,14 @@ class MqttPublisher:
         if self._is_new:
             subscriptions.append(self._discovery_topic("+"))
         client_id = settings.client_id or f"hearthlog-{home.node}"
-        try:
-            self._connection = Connection(
-                settings,
-                client_id,
-                topics.at("bridge"),
-                say,
-                subscriptions=subscriptions,
-                received=self._take,
-            )
-        except BaseException:
-            self._announced.close()
-            raise
+        self._connection = Connection(
+            settings,
+            client_id,
+            topics.at("bridge"),
+            say,
+            subscriptions=subscriptions,
+            received=self._take,
+        )
         self._announced.add(topics.at("bridge"), Place("bridge"))
         self._commands = self._take_commands() if settings.commands else None
 
@@ -177,7 +165,7 @@ class MqttPublisher:
         if self._commands is not None:
             self._commands.close()
         self._connection.close()
-        self._announced.close()
+        self._announced.save()
 
     def _take_commands(self) -> "Commands":
         # Imported here: without commands, the code that corrects logs is not needed.
@@ -236,9 +224,8 @@ class MqttPublisher:
             remedy = (
                 f'a command such as {{"told": true, "label": "{muted[0]}"}} changes that'
                 if self._settings.commands
-                else "a command did that, and commands are off now: to change it, remove the "
-                f"classes from the list `muted` in {self._announced.path}, and start the "
-                "bridge again"
+                else "a command did that, and commands are off now: to change it, start the "
+                f"bridge once with --unmute {muted[0]}"
             )
             self._say(f"mqtt: not published: {', '.join(muted)}; {remedy}")
         self._has_said_muted = True
@@ -357,43 +344,3 @@ def event_fields(event: SoundEvent, news: News) -> dict[str, str | float]:
         "seconds": round(event.seconds, 2),
         "confidence": round(event.confidence, 3),
     }
-
-
-def _is_renamed(home: RecorderAddress, former: str, *, is_first: bool) -> bool:
-    """Whether a former recorder of the folder was renamed to this one.
-
-    True if the former recorder wrote logs here and no longer records, and this recorder wrote no
-    log during that time, but later ones, or writes now. Two different recorders of one folder
-    would write at the same time.
-
-    Parameters
-    ----------
-    is_first : bool
-        Whether no bridge of this recorder ran before, so that it may have no log yet.
-    """
-    if former == home.node:
-        return False
-    locks = {each.node: each.is_held for each in node_locks(home.folder)}
-    if locks.get(former, False) is not False:
-        return False
-    spans = _log_spans(home.folder, {home.node, former})
-    own, theirs = spans[home.node], spans[former]
-    if not theirs:  # the former recorder may write to another folder
-        return False
-    if not own:
-        return is_first
-    first, last = min(start for start, _ in theirs), max(end for _, end in theirs)
-    is_since = max(start for start, _ in own) > last or bool(locks.get(home.node, False))
-    return is_since and not any(start <= last and end >= first for start, end in own)
-
-
-def _log_spans(folder: Path, nodes: Collection[str]) -> dict[str, list[tuple[str, str]]]:
-    """Return the start and last write time of nodes' logs, formatted as in log names."""
-    spans: dict[str, list[tuple[str, str]]] = {node: [] for node in nodes}
-    for entry in walk_logs(folder):
-        name = log_name(Path(entry.name))
-        if name.node in spans and not name.layer:
-            with suppress(OSError, ValueError, OverflowError):  # deleted, or an invalid time
-                end = datetime.fromtimestamp(entry.stat().st_mtime - _RESTART_SECONDS, UTC)
-                spans[name.node].append((name.time, max(name.time, f"{end:%Y%m%dT%H%M%SZ}")))
-    return spans

@@ -1,20 +1,15 @@
 """MQTT topics: names, and the record of topics that the broker retains."""
 
-import fcntl
-import os
 import re
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from pathlib import Path
 from threading import Lock
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 from urllib.parse import quote, unquote
 
 from pydantic import BaseModel
 
 from hearthlog.analyzer.activity.events import SoundEvent
-from hearthlog.analyzer.bridge.state import StateFile
-from hearthlog.schemas.new_files import open_lock, private_folder
+from hearthlog.analyzer.bridge.state import RETAINED, BridgeState, StateEntry
 
 _KEPT = "".join(chr(code) for code in range(33, 127) if chr(code) not in "%+#/$")
 
@@ -83,58 +78,49 @@ def identifier(text: str) -> str:
     return re.sub(escaped, lambda match: f"_{ord(match[0]):x}_", text)
 
 
-_PREFIX, _SUFFIX = "mqtt-", ".json"  # around the name of the recorder
+_DAMAGED = "cannot be read and starts over; all classes are published"
 _UNSAVED = "topics that go are not cleared after the next start"
 
 
 class _Content(BaseModel, extra="forbid"):
-    broker: str = ""
+    broker: str = ""  # of earlier versions
     topics: dict[str, Place] = {}
     muted: list[str] = []
     last_events: dict[str, str] = {}  # id of the last published event, by microphone
 
 
-class _IsRenamed(Protocol):
-    def __call__(self, former: str, /, *, is_first: bool) -> bool: ...
-
-
 class RetainedTopics:
-    """Persistent record of retained topics, muted classes and last published events."""
+    """Persistent record of retained topics, muted classes and last published events.
 
-    def __init__(
-        self,
-        folder: Path,
-        node: str,
-        broker: str,
-        is_renamed: _IsRenamed,
-        say: Callable[[str], None],
-    ) -> None:
-        self.path = folder / f"{_PREFIX}{node}{_SUFFIX}"
-        self._report = say
+    Attributes
+    ----------
+    is_new : bool
+        Whether there was no record.
+    """
+
+    def __init__(self, state: BridgeState, say: Callable[[str], None]) -> None:
+        def entry(name: str) -> StateEntry[_Content]:
+            return StateEntry(state, name, _Content, report, _DAMAGED, _UNSAVED)
+
+        def report(text: str) -> None:
+            say(f"mqtt: {text}")
+
         self._lock = Lock()
-        self._is_changed = False
-        self._descriptor = self._take_lock(folder)
-        has_own = self.path.exists()
-        # Files of former recorder names, with locks that keep other bridges from using them.
-        self._former: dict[Path, int] = {}
-        if self._descriptor is not None:
-            for path in sorted(folder.glob(f"{_PREFIX}*{_SUFFIX}")):
-                former = path.name.removeprefix(_PREFIX).removesuffix(_SUFFIX)
-                if path != self.path and is_renamed(former, is_first=not has_own):
-                    self._take_over(path)
-        sources = [*self._former, *([self.path] if has_own else [])]
-        self.is_new = self._descriptor is None or not sources
-        contents = [] if self.is_new else [self._file(source).load() for source in sources]
+        self._entry = entry(RETAINED)
+        names = state.names(RETAINED)
+        self._former = [name for name in names if name != RETAINED]  # of other recorder names
+        self.is_new = not names
         self._is_changed = bool(self._former)
-        self._broker = broker
         self.topics: dict[str, Place] = {}
-        # Kept if the broker's address changes: it may be the same broker; a new one has no topics.
+        # Of any broker: another address may be the same broker; a new one has no topics.
         self._muted: set[str] = set()
         self._last_events: dict[str, str] = {}
-        for each in filter(None, contents):
-            self.topics |= each.topics
-            self._muted.update(each.muted)
-            self._last_events |= each.last_events
+        own = [RETAINED] if RETAINED in names else []
+        for each in (entry(name).load() for name in [*self._former, *own]):
+            if each is not None:
+                self.topics |= each.topics
+                self._muted.update(each.muted)
+                self._last_events |= each.last_events
 
     def add(self, topic: str, place: Place) -> None:
         """Record a topic with a retained value."""
@@ -198,73 +184,13 @@ class RetainedTopics:
     def save(self) -> None:
         """Save changes; they are on disk on return."""
         with self._lock:
-            if self._descriptor is None or not (self._is_changed or self.is_new):
+            if not (self._is_changed or self.is_new):
                 return
             content = _Content(
-                broker=self._broker,
                 topics=self.topics,
                 muted=sorted(self._muted),
                 last_events=self._last_events,
             )
             self._is_changed = self.is_new = False
-            if self._file(self.path).save(content):
-                self._remove_former()
-
-    def close(self) -> None:
-        """Save changes, and release the lock for other bridges."""
-        self.save()
-        for descriptor in [*self._former.values(), self._descriptor]:
-            if descriptor is not None:
-                os.close(descriptor)
-        self._former.clear()
-        self._descriptor = None
-
-    def _say(self, text: str) -> None:
-        self._report(f"mqtt: {text}")
-
-    def _take_over(self, path: Path) -> None:
-        """Lock the record of a former name, unless another bridge uses it."""
-        with suppress(OSError):
-            descriptor = _locked(path)
-            if descriptor is not None:
-                self._former[path] = descriptor
-
-    def _remove_former(self) -> None:
-        """Delete the adopted records, and only then release their locks."""
-        while self._former:
-            path = next(iter(self._former))
-            try:
-                path.unlink(missing_ok=True)
-            except OSError as error:
-                self._say(f"{error}; {_UNSAVED}")
-                return
-            os.close(self._former.pop(path))
-
-    def _take_lock(self, folder: Path) -> int | None:
-        try:
-            private_folder(folder)
-            descriptor = _locked(self.path)
-        except OSError as error:
-            self._say(f"{folder}: cannot be used ({error.strerror}); nothing is saved")
-            return None
-        if descriptor is None:
-            self._say(
-                f"{folder}: is used by another bridge; nothing is saved: give each bridge its "
-                "own `state` in [bridge]"
-            )
-        return descriptor
-
-    def _file(self, path: Path) -> StateFile[_Content]:
-        damaged = "cannot be read and starts over; all classes are published"
-        return StateFile(path, _Content, self._say, damaged, _UNSAVED)
-
-
-def _locked(path: Path) -> int | None:
-    """Lock the record of a name; None if another bridge has the lock."""
-    descriptor = open_lock(path.with_name(f".{path.stem}.lock"))
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        return None
-    return descriptor
+            if self._entry.save(content, self._former):
+                self._former = []

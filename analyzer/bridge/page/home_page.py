@@ -19,8 +19,9 @@ from hearthlog.analyzer.bridge.home_state import HomeState, ListeningThreshold, 
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
+from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, page_token
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError, cookie_key, keep_address, page_token
+from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import (
     class_words,
     clock,
