@@ -139,6 +139,29 @@ class PulseMicrophone:
         samples_again.stdout.close()
         self._player = [player, samples_again]
 
+    def speaker_env(self) -> dict[str, str]:
+        """Return the environment for a process whose speaker is what this microphone hears."""
+        file = self._folder / "speaker.conf"
+        server = f"unix:{self._folder / 'native'}"
+        file.write_text(
+            f'<{_ALSA_CONFIGURATION}>\npcm.!default {{ type pulse server "{server}" }}\n'
+        )
+        return self.env | {"ALSA_CONFIG_PATH": str(file)}
+
+    @contextlib.contextmanager
+    def recorded(self):
+        """Record what the microphone hears; yield a function that returns the samples so far."""
+        file = self._folder / "recorded.s16"
+        command = [*DIES_WITH_PARENT, "parec", "--raw", "--format=s16le", f"--rate={_RATE}"]
+        command += ["--channels=1", "--latency-msec=50", "-d", "microphone.monitor"]
+        with file.open("wb") as stream:
+            recorder = subprocess.Popen(command, env=self.env, stdout=stream)
+        try:
+            yield lambda: np.fromfile(file, "<i2")
+        finally:
+            recorder.kill()
+            recorder.wait(timeout=5)
+
     def stop(self):
         """Stop playing: PulseAudio then delivers silence, up to 2 s late."""
         if self._player:

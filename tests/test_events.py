@@ -2,27 +2,36 @@
 
 import json
 import re
+import subprocess
 from collections import Counter
 from datetime import date, timedelta
 from functools import partial
+from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
+import sounddevice
+import soundfile
+from conftest import HEARTHLOG
 from homelife import GENERAL, at, midnight, write_day
 from spliced import run
+from waiting import wait_for
 
 from hearthlog.analyzer.activity.daily_metrics import day_of, whole_home
 from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.review.session import listen
+from hearthlog.analyzer.review.timeline import SoundClip
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, is_layer
 
 DAY = date(2026, 3, 2)
 ZONE = ZoneInfo("Europe/Vienna")
+_CLIPS = Path(__file__).parent / "data" / "household"
 
 
 @pytest.fixture
@@ -164,7 +173,77 @@ def test_sound_that_was_not_kept_cannot_be_played_and_is_said_so(home, hearthlog
 
 
 def test_time_that_nobody_listened_to_is_said(tmp_path, hearthlog):
-    write_day(tmp_path, DAY, [(at("03:00"), 2, "coughing", 0.8)], hours=range(6), classes=GENERAL)
+    write_day(
+        tmp_path,
+        DAY,
+        [(at("03:00"), 2, "coughing", 0.8)],
+        hours=range(6),
+        gaps=[(at("01:00"), 1200, "quiet hours"), (at("02:00"), 60, "overrun")],
+        classes=GENERAL,
+    )
     result = hearthlog("events", tmp_path, "--day", DAY, "--label", "coughing")
-    assert "only 25 % of that time was listened to" in result.stderr
     assert result.stdout.splitlines()[-1] == "Coughing on Monday, 2026-03-02: 1"
+    assert result.stderr == (
+        "hearthlog: 24 % of that time was listened to, not: 01:00 to 01:20 and 06:00 to 00:00\n"
+    )
+    (first, short, last) = found(hearthlog, tmp_path, "--day", DAY)["not_listened"]
+    assert (first["start"][11:16], first["end"][11:16]) == ("01:00", "01:20")
+    assert (short["start"][11:16], last["end"][11:16]) == ("02:00", "00:00")
+
+
+@pytest.fixture
+def kept(tmp_path, capfd):
+    """The log of a cough and a pause, with the sound of both."""
+    clip = _CLIPS / "coughing" / "coughing_003.flac"
+    cough, rate = soundfile.read(clip, dtype="float32")
+    soundfile.write(tmp_path / "cough.wav", np.append(cough, np.zeros(2 * rate)), rate)
+    words = "--output", tmp_path / "logs", "--model", "general", "--start", "2026-03-02T08:00"
+    config = tmp_path / "home.toml"
+    config.write_text('keep_audio = "always"\nnever_keep = []\n')
+    run(capfd, "record", tmp_path / "cough.wav", "--config", config, *words)
+    return tmp_path / "logs"
+
+
+def test_the_kept_sound_is_played(kept, pulse_microphone):
+    """What a speaker gets is recorded, by PulseAudio."""
+    pulse_microphone.stop()
+    env = pulse_microphone.speaker_env()
+    words = "--start", "2026-03-02T08:00", "--label", "coughing", "--play"
+    with pulse_microphone.recorded() as samples:
+        result = subprocess.run(
+            [*HEARTHLOG, "events", kept, *words],
+            env=env,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert result.returncode == 0, result.stderr
+        assert re.fullmatch(r"hearthlog: playing 0\d:00:0\d Coughing\n", result.stderr)
+        wait_for(lambda: np.abs(samples()).max(initial=0) > 1000)
+
+
+def test_without_a_speaker_a_line_says_so(kept):
+    if any(each["max_output_channels"] for each in sounddevice.query_devices()):
+        pytest.skip("this machine has a speaker")
+    words = "--start", "2026-03-02T08:00", "--label", "coughing", "--play"
+    result = subprocess.run(
+        [*HEARTHLOG, "events", kept, *words],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.splitlines()[-1] == (
+        "hearthlog: the sound cannot be played here (Error querying device -1); is there a speaker?"
+    )
+
+
+def test_a_review_says_so_too():
+    if any(each["max_output_channels"] for each in sounddevice.query_devices()):
+        pytest.skip("this machine has a speaker")
+    clip = SoundClip(0, 16_000, np.zeros(16_000, np.int16))
+    assert listen([clip], 0, NANOSECONDS) == (
+        "the sound cannot be played here (Error querying device -1); is there a speaker?"
+    )

@@ -17,7 +17,17 @@ from hearthlog.analyzer.activity.sources import (
 )
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import array_names, select
-from hearthlog.analyzer.logs.spans import NEVER, NONE, SEGMENT_DELAY, Rows, Spans, cut, joined, one
+from hearthlog.analyzer.logs.spans import (
+    NEVER,
+    NONE,
+    SEGMENT_DELAY,
+    Rows,
+    Spans,
+    cut,
+    joined,
+    one,
+    union,
+)
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -126,7 +136,7 @@ class HomeActivity:
             for name, spans in self.coverage.items()
             if microphone in {"", source_microphone(name)} and self._knows(name, label)
         ]
-        return _union(*knowing)
+        return union(*knowing)
 
     def _knows(self, source: str, label: str) -> bool:
         known = self.classes.get(source)
@@ -148,11 +158,6 @@ class HomeActivity:
             self.classes,
             cut(self.written, start, end),
         )
-
-
-def _union(*parts: Spans, pause: int = 0) -> Spans:
-    starts, ends = (np.concatenate(edges) for edges in zip(NONE, *parts, strict=True))
-    return joined(starts, ends, pause)
 
 
 SEGMENT_FIELDS = "header.stamp", "duration", "label", "confidence"
@@ -281,8 +286,8 @@ class SegmentCollector:
         written = self._written.spans(_PAUSE)
         for source, start, end, label, confidence in others:
             span, spans = one(start, end), coverage.get(source, NONE)
-            written = _union(written, span, pause=_PAUSE)
-            coverage[source] = _union(spans, span, pause=FRAME_NANOSECONDS)
+            written = union(written, span, pause=_PAUSE)
+            coverage[source] = union(spans, span, pause=FRAME_NANOSECONDS)
             name = class_name(label)
             if _is_told(source, name):
                 more, key = _Rows(), (name, is_of_scenario(source))

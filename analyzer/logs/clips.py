@@ -148,6 +148,31 @@ def kept_sound(layers: Sequence[Path], name: str, start: int, end: int) -> tuple
     return rate, sound
 
 
+def play_sound(samples: Float32, rate: int, *, wait: bool = False) -> None:
+    """Play sound on the default output of the machine.
+
+    Parameters
+    ----------
+    wait : bool, optional
+        Whether to return at the end of the sound.
+
+    Raises
+    ------
+    LogError
+        If there is no output, or PortAudio is missing.
+    """
+    try:
+        import sounddevice  # noqa: PLC0415  PortAudio may be missing
+    except OSError as error:
+        raise LogError(f"the sound cannot be played here ({error})") from error
+    try:
+        sounddevice.play(samples, rate)
+        if wait:
+            sounddevice.wait()
+    except (sounddevice.PortAudioError, ValueError) as error:
+        raise LogError(f"the sound cannot be played here ({error}); is there a speaker?") from error
+
+
 def _mono(clip: LoggedClip) -> Float32:
     samples = np.frombuffer(clip.data, "<i2").astype(np.float32) / _FULL_SCALE
     return samples if clip.channels == 1 else samples.reshape(-1, clip.channels).mean(axis=1)

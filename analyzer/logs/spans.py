@@ -141,6 +141,12 @@ def common(a: Spans, b: Spans) -> Spans:
     return pieces(a, b)[0]
 
 
+def union(*parts: Spans, pause: int = 0) -> Spans:
+    """Return the union of sets of spans, with pauses up to a length, in nanoseconds, closed."""
+    starts, ends = (np.concatenate(edges) for edges in zip(NONE, *parts, strict=True))
+    return joined(starts, ends, pause)
+
+
 def cut(spans: Spans, start: int, end: int) -> Spans:
     """Return the part of spans between two times, without visiting all spans."""
     first = np.searchsorted(spans.ends, start, side="right")

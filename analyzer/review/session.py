@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.clips import play_sound
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.spans import NONE, Spans, joined
@@ -46,7 +47,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER, load
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.errors import HearthlogError, Progress, ignore_progress
+from hearthlog.schemas.errors import HearthlogError, LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_review, scenario_name
 
@@ -547,11 +548,9 @@ def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
     if not len(samples):
         return "no sound of this span was kept"
     try:
-        import sounddevice  # noqa: PLC0415 - few reviews have sound, and PortAudio may be missing
-
-        sounddevice.play(samples, rate)
-    except (OSError, ValueError, RuntimeError) as error:
-        return f"the sound cannot be played here ({error})"
+        play_sound(samples, rate)
+    except LogError as error:
+        return str(error)
     return f"playing {len(samples) / rate:.1f} s"
 
 

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Collection, Sequence
 from datetime import date, timedelta, tzinfo
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.activity.daily_metrics import HomeMetrics
     from hearthlog.analyzer.activity.home_events import HomeEvent
     from hearthlog.analyzer.logs.home_logs import HomeLogs
+    from hearthlog.analyzer.logs.spans import Spans
 
 
 class ListedSpan(NamedTuple):
@@ -90,22 +92,26 @@ def events(
     metrics = whole_home(data)
     classes = _chosen_classes(metrics.classes, label or (), data.never_told)
     found = home_events(data, metrics, classes, *span[:2])
-    share = _listened_share(metrics, classes, span)
+    missing = _not_listened(metrics, classes, span, every=bool(label))
     if as_json:
         print_json(
             {
                 "start": _time(span.start, zone),
                 "end": _time(span.end, zone),
                 "labelling": labels,
-                "listened": round(share, 4),
+                "listened": round(1 - missing.length / (span.end - span.start), 4),
+                "not_listened": [
+                    {"start": _time(start, zone), "end": _time(end, zone)}
+                    for start, end in zip(missing.starts, missing.ends, strict=True)
+                ],
                 "events": [_fields(event, labels, zone) for event in found],
                 "counts": _counts(found),
             }
         )
     else:
-        _print(found, span, classes, share, zone)
+        _print(found, span, classes, missing, zone)
     if play:
-        _play(found, home_logs)
+        _play(found, home_logs, zone)
     end_with_warnings(data.losses)
 
 
@@ -185,12 +191,15 @@ def _chosen_classes(
     return list(dict.fromkeys(chosen))
 
 
-def _listened_share(metrics: "HomeMetrics", classes: Sequence[str], span: ListedSpan) -> float:
-    """Return the least share of a span in which the classes could be labelled, 0 to 1."""
-    from hearthlog.analyzer.logs.spans import cut
+def _not_listened(
+    metrics: "HomeMetrics", classes: Sequence[str], span: ListedSpan, *, every: bool
+) -> "Spans":
+    """Return the parts of a span in which no class could be labelled, or not every one of them."""
+    from hearthlog.analyzer.logs.spans import NONE, common, one, union, without
 
-    parts = [cut(metrics.listened[name], span.start, span.end).length for name in classes]
-    return min(parts, default=0) / (span.end - span.start)
+    own = one(span.start, span.end)
+    listened = [metrics.listened[name] for name in classes]
+    return without(own, reduce(common if every else union, listened) if listened else NONE)
 
 
 def _time(time: int, zone: tzinfo) -> str:
@@ -216,18 +225,20 @@ def _counts(found: Sequence["HomeEvent"]) -> dict[str, dict[str, int]]:
 
 
 _MINUTE = 60  # seconds
-_MOST = 0.75  # listened share below which a count says so
+_MENTIONED = 600 * 1_000_000_000  # ns: shortest pause in listening that is listed
+_MOST_PAUSES = 5
 
 
 def _print(
     found: Sequence["HomeEvent"],
     span: ListedSpan,
     classes: Sequence[str],
-    share: float,
+    missing: "Spans",
     zone: tzinfo,
 ) -> None:
     from hearthlog.analyzer.logs.local_time import local_time
     from hearthlog.models.classes import in_words
+    from hearthlog.schemas.errors import listed
 
     several = len({name for event in found for name in event.microphones}) > 1
     days = len({_date(event.start, zone) for event in found}) > 1
@@ -257,8 +268,18 @@ def _print(
         apart = sum(event.television for event in own)
         beside = f", and {apart} while something like a television sounded" if apart else ""
         print(f"{in_words(name)} {span.words}: {len(own) - apart or 'none'}{beside}")
-    if share < _MOST:
-        print_notice(f"only {100 * share:.0f} % of that time was listened to")
+    pauses = [
+        f"{local_time(start, zone):{form[:-3]}} to {local_time(end, zone):{form[:-3]}}"
+        for start, end in zip(missing.starts.tolist(), missing.ends.tolist(), strict=True)
+        if end - start >= _MENTIONED
+    ]
+    if pauses:
+        share = 1 - missing.length / (span.end - span.start)
+        more = [f"{len(pauses) - _MOST_PAUSES} more pauses"] * (len(pauses) > _MOST_PAUSES)
+        print_notice(
+            f"{100 * share:.0f} % of that time was listened to, not: "
+            f"{listed([*pauses[:_MOST_PAUSES], *more], 'and')}"
+        )
 
 
 def _length(seconds: float) -> str:
@@ -267,9 +288,12 @@ def _length(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds < _MINUTE else Duration.show(seconds / _MINUTE)
 
 
-def _play(found: Sequence["HomeEvent"], logs: "HomeLogs") -> None:
-    """Play the kept sound of events; say of each that has none."""
-    from hearthlog.analyzer.logs.clips import kept_sound
+def _play(found: Sequence["HomeEvent"], logs: "HomeLogs", zone: tzinfo) -> None:
+    """Play the kept sound of events, one after the other."""
+    from hearthlog.analyzer.logs.clips import kept_sound, play_sound
+    from hearthlog.analyzer.logs.local_time import local_time
+    from hearthlog.models.classes import in_words
+    from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.files import audio_path
     from hearthlog.schemas.messages.topics import LIVE, labelling_topic
 
@@ -286,12 +310,12 @@ def _play(found: Sequence["HomeEvent"], logs: "HomeLogs") -> None:
             unkept += 1
             continue
         try:
-            import sounddevice
-
-            sounddevice.play(samples, rate)
-            sounddevice.wait()
-        except (OSError, ValueError, RuntimeError) as error:
-            print_notice(f"the sound cannot be played here ({error})")
+            print_notice(
+                f"playing {local_time(event.start, zone):%H:%M:%S} {in_words(event.label)}"
+            )
+            play_sound(samples, rate, wait=True)
+        except LogError as error:
+            print_notice(str(error))
             return
     if unkept:
         print_notice(

@@ -276,13 +276,13 @@ def _gap_lines(summary: "LogSummary") -> Iterator[str]:
 
 
 def _label_rows(summary: "LogSummary") -> Iterator[tuple[str, ...]]:
-    from hearthlog.models.classes import ordered
+    from hearthlog.models.classes import in_words, ordered
 
     for microphone in dict.fromkeys([*summary.label_seconds, *summary.segments]):
         seconds = summary.label_seconds.get(microphone, Counter())
         segments = summary.segments.get(microphone, Counter())
         for label in ordered([*seconds, *segments]):
-            yield microphone, label, f"{seconds[label] / 60:.2f}", str(segments[label])
+            yield microphone, in_words(label), f"{seconds[label] / 60:.2f}", str(segments[label])
 
 
 def _duration(seconds: float) -> str:

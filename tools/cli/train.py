@@ -399,6 +399,8 @@ def _warn_of_few(segments: "Dataset") -> None:
 
 
 def _print(model: "Model", segments: "Dataset") -> None:
+    from hearthlog.models.classes import in_words, ordered
+
     data, amounts = model.description.training_data, ("sources", "seconds", "segments")
     adapted = bool(data.base_sha256)
     if not adapted:  # an adapted model has the base model's figures, which were printed
@@ -408,9 +410,9 @@ def _print(model: "Model", segments: "Dataset") -> None:
         print(home if adapted else f"\n{home} (the figures above are those without it)")
         kept = data.home_confirmed
         rows = [
-            (name, *_amounts(one), str(kept.get(name, 0)))
-            for name, one in data.home.items()
-            if one.segments
+            (in_words(name), *_amounts(data.home[name]), str(kept.get(name, 0)))
+            for name in ordered(data.home)
+            if data.home[name].segments
         ]
         print_table(("class", *amounts, "not marked"), rows)
     print_skipped(segments.skipped)
@@ -418,7 +420,7 @@ def _print(model: "Model", segments: "Dataset") -> None:
 
 def print_figures(model: "Model") -> None:
     """Print the training data of a model, and its scores on unseen sources."""
-    from hearthlog.models.classes import UNKNOWN, ordered
+    from hearthlog.models.classes import UNKNOWN, in_words, ordered
     from hearthlog.models.classifiers.classifier import classifier_kind
 
     description, metrics = model.description, model.description.metrics
@@ -429,7 +431,7 @@ def print_figures(model: "Model") -> None:
         if not amount.segments:  # taken from another model only
             continue
         figures = (f"{value:.3f}" for value in (result.precision, result.recall, result.f1))
-        rows.append((name, *_amounts(amount), *figures))
+        rows.append((in_words(name), *_amounts(amount), *figures))
     head = "class", "sources", "seconds", "segments", "precision", "recall", "F1"
     print_table(head, rows)
     others = f" without {UNKNOWN}" * (UNKNOWN in description.classes)
