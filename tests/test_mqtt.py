@@ -22,6 +22,7 @@ from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics, Topics
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
+from hearthlog.analyzer.logs.never_tell import NEVER_TELL_FILE, write_list
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.pause_schedule import paused_until
@@ -453,6 +454,24 @@ def test_what_was_switched_off_stays_so_without_commands_and_one_is_told_how_to_
             bridge.terminate()
             bridge.wait()
     assert kept(home)["muted"] == []
+
+
+def test_a_class_that_is_hidden_leaves_the_broker_until_it_is_shown_again(home, broker):
+    home.hears("coughing")
+    with Listener(broker.port) as listener, Bridged(home.folder, broker) as bridged:
+        listener.wait_for(f"{COUGHING}/on", "ON")
+        write_list(home.folder, ["coughing"])
+        listener.wait_for(f"{COUGHING}/on", "")
+        (home.folder / NEVER_TELL_FILE).write_text("{")  # damaged: it stays hidden
+        home.hears("coughing")
+        listener.wait_until(lambda: any("is no list of classes" in line for line in bridged.said))
+        listener.wait_for(f"{ROOT}/mic/heard", '{"label": "unknown", "confidence": 0.9}')
+        assert listener.values[f"{COUGHING}/on"] == ""
+        removed = json.loads(listener.values[DISCOVERY])["components"]["on_coughing"]
+        assert removed == {"p": "binary_sensor"}  # without more, Home Assistant removes it
+        write_list(home.folder, [])
+        home.hears("coughing")
+        listener.wait_for(f"{COUGHING}/on", "ON")
 
 
 def test_what_earlier_versions_switched_off_is_taken_over_where_commands_are_taken(home, broker):

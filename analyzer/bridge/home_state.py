@@ -15,7 +15,7 @@ from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, Sound
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.logs.local_time import Today
-from hearthlog.analyzer.logs.never_tell import current_list
+from hearthlog.analyzer.logs.never_tell import read_list
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN
 from hearthlog.schemas.errors import LogError
@@ -384,7 +384,8 @@ def follow_home(
         Messages of the batch, with the fields of `FIELDS`.
     """
     state, folder = HomeState(), home.folder
-    state.never_tell = current_list(folder, home.never_tell)
+    state.never_tell = home.never_tell
+    _hide(state, home, say)
     while not folder.is_dir():
         say(f"{folder}: no such folder yet; waiting for a recorder")
         state.caught_up = True
@@ -401,7 +402,7 @@ def follow_home(
             if current != described and (names := _labelling_sources(current)) is not None:
                 state.sources, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
-                state.never_tell = current_list(folder, home.never_tell)
+                _hide(state, home, say)
                 state.caught_up = True
                 yielded = time.monotonic()
                 yield state, [], []
@@ -414,6 +415,17 @@ def follow_home(
             yield state, *_push(state, path, batch, say)
         if stop.is_set():
             return
+
+
+def _hide(state: HomeState, home: RecorderAddress, say: Callable[[str], None]) -> None:
+    """Hide the classes of the configuration and of the list beside the logs.
+
+    While the list cannot be read, what it hid last stays hidden.
+    """
+    try:
+        state.never_tell = home.never_tell | read_list(home.folder)
+    except (LogError, OSError) as error:
+        say(f"{error}; until then, classes hidden since the start of the bridge stay hidden")
 
 
 def _push(

@@ -45,7 +45,7 @@ class Events:
         return Events(self.starts[rows], self.ends[rows], self.labels[rows])
 
 
-def events_of(labelling: Labelling, classes: Sequence[str]) -> Events:
+def indexed_events(labelling: Labelling, classes: Sequence[str]) -> Events:
     """Return the spans of a labelling, with labels as indices."""
     indices = {name: i for i, name in enumerate(classes)}
     labels = np.fromiter(map(indices.__getitem__, labelling.labels), np.int64, len(labelling))
@@ -327,7 +327,7 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> LabellingDiffere
     """
     b = b.called_as(a.classes)
     classes = list(dict.fromkeys([*a.classes, *b.classes]))
-    events = [events_of(side.labelling, classes) for side in (a, b)]
+    events = [indexed_events(side.labelling, classes) for side in (a, b)]
     pieces = overlay(events, DAY).in_all()
     if not len(pieces.starts):
         raise DataError(f"{a.name} and {b.name} have no time in common")

@@ -12,7 +12,7 @@ from hearthlog.analyzer.evaluation.event_scores import (
     Detections,
     Events,
     detect,
-    events_of,
+    indexed_events,
     laid_out,
 )
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, all_classes, labelling_of
@@ -68,7 +68,9 @@ def evaluate_labelling(
         )
     reference = reference.called_as(classes)
     names = [*classes, *sorted(set(reference.labels) - set(classes))]
-    target, output = (laid_out(events_of(each, names), spans) for each in (reference, predicted))
+    target, output = (
+        laid_out(indexed_events(each, names), spans) for each in (reference, predicted)
+    )
     lengths = np.bincount(target.labels, target.ends - target.starts, len(names)) / NANOSECONDS
     unknown = {
         name: float(length)

@@ -6,13 +6,12 @@ logs, so that it holds wherever the logs are read, and for what was recorded bef
 
 import json
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
 from hearthlog.models.classes import class_name
-from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.logs.metadata import NEVER_TELL
 from hearthlog.schemas.new_files import create_file, replaced_file
@@ -59,10 +58,3 @@ def list_beside(log: Path) -> frozenset[str]:
         if (folder / NEVER_TELL_FILE).exists():
             return read_list(folder)
     return frozenset()
-
-
-def current_list(folder: Path, configured: frozenset[str]) -> frozenset[str]:
-    """Return the configured classes, and those of a list that can be read."""
-    with suppress(HearthlogError, OSError):
-        return configured | read_list(folder)
-    return configured

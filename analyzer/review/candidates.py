@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import Events, events_of
+from hearthlog.analyzer.evaluation.event_scores import Events, indexed_events
 from hearthlog.analyzer.logs.labelling import LabelledFile, Labelling, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, overlay
@@ -75,7 +75,7 @@ def hinted_spans(
     hints, above = _named(sources, microphone, names)
     classes = list(dict.fromkeys([*side.classes, *(name.name for name in names)]))
     spans = judgeable_spans(without(hints, reviewed))
-    labels, _ = other_labels(spans, events_of(side.labelling, classes))
+    labels, _ = other_labels(spans, indexed_events(side.labelling, classes))
     own = [class_name(classes[label]) if label >= 0 else "" for label in labels.tolist()]
     new = np.array(
         [names[n].name != label for n, label in zip(spans.labels.tolist(), own, strict=True)], bool
@@ -343,7 +343,7 @@ def _where(changed: ChangedTime, side: NamedLabelling) -> Events:
     """Return the changed time in which a labelling agrees with the first model."""
     classes, labels = changed.changes.classes, side.called_as(changed.changes.classes)
     every = list(dict.fromkeys([*classes, *labels.classes]))
-    said = events_of(labels.labelling, every)
+    said = indexed_events(labels.labelling, every)
     parts = overlay([changed.spans, said]).in_all()
     pairs = changed.spans.labels[parts.rows[0]]
     same = pairs // len(classes) == said.labels[parts.rows[1]]

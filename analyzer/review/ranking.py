@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import DAY, events_of
+from hearthlog.analyzer.evaluation.event_scores import DAY, indexed_events
 from hearthlog.analyzer.logs.labelling import LABEL_FIELDS, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.spans import Spans, pieces
 from hearthlog.analyzer.review.spans import (
@@ -206,7 +206,7 @@ def make_queue(  # noqa: PLR0913
     """
     other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))
-    segments = events_of(side.labelling, classes)
+    segments = indexed_events(side.labelling, classes)
     segments = without(segments, reviewed)
     spans = judgeable_spans(segments)
     if not len(spans):
@@ -226,7 +226,7 @@ def make_queue(  # noqa: PLR0913
         )
     labels, differing = np.full(len(spans), -1), np.zeros(len(spans))
     if other is not None:
-        labels, differing = other_labels(spans, events_of(other.labelling, classes))
+        labels, differing = other_labels(spans, indexed_events(other.labelling, classes))
     parts = means.uncertainty.values(), differing, means.novelty.values()
     if ranking == USEFUL:
         logs = sources.with_topic(labelling_topic(microphone, side.name, "segment"))

@@ -434,7 +434,7 @@ def print_figures(model: "Model") -> None:
         rows.append((in_words(name), *_amounts(amount), *figures))
     head = "class", "sources", "seconds", "segments", "precision", "recall", "F1"
     print_table(head, rows)
-    others = f" without {UNKNOWN}" * (UNKNOWN in description.classes)
+    others = f" without {in_words(UNKNOWN)!r}" * (UNKNOWN in description.classes)
     print(
         f"\nmacro F1 {metrics.macro_f1:.3f}{others}, expected calibration error "
         f"{metrics.expected_calibration_error:.3f} (cross-validated, {metrics.folds} folds, "

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hearthlog.analyzer.evaluation.event_scores import events_of, false_alarms_per_day
+from hearthlog.analyzer.evaluation.event_scores import false_alarms_per_day, indexed_events
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import overlay
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name
@@ -111,7 +111,7 @@ def scored(truth: Labelling, labelled: Labelling) -> Scored:
     duration = int((parts.ends - parts.starts).sum())
     classes = sorted({*true.labels, *own.labels})
     false = false_alarms_per_day(
-        events_of(true, classes), events_of(own, classes), classes, duration
+        indexed_events(true, classes), indexed_events(own, classes), classes, duration
     )
     return Scored(seconds, {name: n for name, n in false.items() if n and name not in _NO_EVENTS})
 

@@ -15,7 +15,7 @@ import numpy as np
 import soundfile
 import typer
 
-from hearthlog.analyzer.evaluation.event_scores import events_of
+from hearthlog.analyzer.evaluation.event_scores import indexed_events
 from hearthlog.analyzer.evaluation.scenes import Colour, background, compose
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
@@ -280,7 +280,7 @@ def by_chance(logs: Path, count: int, seed: Sequence[int]) -> list[ReviewItem]:
     """
     sources = find_labellings(logs)
     side = sources.read(sources.microphone(None), LIVE)
-    spans = judgeable_spans(events_of(side.labelling, side.classes))
+    spans = judgeable_spans(indexed_events(side.labelling, side.classes))
     rows = np.random.default_rng(seed).permutation(len(spans))[:count]
     return _items(spans.starts[rows], spans.ends[rows])
 
