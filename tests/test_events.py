@@ -245,5 +245,6 @@ def test_a_review_says_so_too():
         pytest.skip("this machine has a speaker")
     clip = SoundClip(0, 16_000, np.zeros(16_000, np.int16))
     assert listen([clip], 0, NANOSECONDS) == (
-        "the sound cannot be played here (Error querying device -1); is there a speaker?"
+        0.0,
+        "the sound cannot be played here (Error querying device -1); is there a speaker?",
     )

@@ -247,6 +247,7 @@ class Screen:
         self.shown = []
         self.asked = []
         self.played = []
+        self.refreshed = 0
         self.lane = None
 
     def is_open(self):
@@ -260,9 +261,12 @@ class Screen:
     def cursor(self):
         return self.at
 
-    def show(self, start, end, margin):
-        self.marked = (start, end)
+    def show(self, start, end, margin, *, select=True):
+        self.marked = (start, end) if select else None
         self.shown.append((start, end, margin))
+
+    def refresh(self):
+        self.refreshed += 1
 
     def ask(self, start, end, text):
         self.asked.append((start, end, text))
@@ -285,6 +289,7 @@ class Sitting:
         self.said = []
         self.closely = []
         self.heard = []
+        self.seconds = 3.0  # of each sound
         marking = marking_of(home)
         self.labelled = marking.labelled
         self.session = ReviewSession(
@@ -294,7 +299,8 @@ class Sitting:
             UTC,
             self.said.append,
             lambda start, end: self.closely.append((start, end)),
-            lambda start, end: self.heard.append((start, end)) or "playing",
+            lambda start, end: self.heard.append((start, end)) or (self.seconds, "playing"),
+            lambda: self.said.append("silence"),
             items,
         )
 
@@ -502,6 +508,32 @@ def test_in_a_minute_one_marks_what_is_wrong_and_the_rest_is_right(home):
     assert (reviewed(home), len(layers(home))) == ([], 1)
     sitting.session.press("z")
     assert layers(home) == []
+
+
+@pytest.mark.parametrize("key", ["2", "u", "d"])
+def test_in_a_minute_a_key_without_a_drag_names_nothing(home, key):
+    sitting = Sitting(home, [minute_of(START + 30 * SECOND)])
+    sitting.run("")
+    assert sitting.screen.marked is None
+    sitting.session.press(key)
+    assert sitting.said[-1].startswith("drag over the sound first: without that the key would name")
+    assert (reviewed(home), layers(home)) == ([], [])
+    sitting.session.press(" ")  # all of it is played
+    assert sitting.heard == [(START + 30 * SECOND, START + 90 * SECOND)]
+
+
+def test_space_plays_and_stops(home):
+    sitting = Sitting(home, items_of(1))
+    sitting.run("")
+    for _ in range(3):
+        sitting.session.press(" ")
+    assert sitting.heard == [items_of(1)[0][:2]] * 2
+    assert sitting.said[-4:] == ["playing", "silence", "stopped", "playing"]
+    sitting.seconds = 0.0  # nothing was kept
+    sitting.session.press("p")
+    sitting.session.press("p")
+    assert len(sitting.heard) == 3
+    assert len(sitting.screen.played) == 2
 
 
 def test_what_is_skipped_is_not_reviewed_and_what_is_judged_is(home):

@@ -56,7 +56,7 @@ from hearthlog.analyzer.review.timeline import (
 )
 from hearthlog.analyzer.review.timeline_reader import MOST_SHARES, read_timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
-from hearthlog.analyzer.review.viewer.drawing import DrawnLane
+from hearthlog.analyzer.review.viewer.drawing import LANE_HEIGHT, DrawnLane
 from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classes import in_words
@@ -767,7 +767,7 @@ def test_every_sound_is_a_strip_in_the_lane_of_its_class_and_in_its_colour(recor
         (text,) = fixed(recording, entity, "SeriesLines:names")
         (shade,) = fixed(recording, entity, "SeriesLines:colors")
         red, green, blue = shade >> 24, shade >> 16 & 255, shade >> 8 & 255
-        place = len(names) - int(number) - 0.5
+        place = (len(names) - int(number) - 0.5) * LANE_HEIGHT
         assert [height for (height,) in heights[1:3]] == [place, place]
         for start, end in zip(times[1::4].tolist(), times[2::4].tolist(), strict=True):
             drawn.add((labelling, names[int(number)], start, end, text, (red, green, blue)))

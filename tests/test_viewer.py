@@ -24,6 +24,7 @@ from viewers import (
     patiently,
     pixels,
     reviewing,
+    ruler,
     shown,
     viewer,
 )
@@ -31,8 +32,9 @@ from viewers import (
 from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.review.lanes import SHARES
+from hearthlog.analyzer.review.lanes import SELECTED_COLOUR, SHARES
 from hearthlog.analyzer.review.timeline_reader import read_timeline
+from hearthlog.analyzer.review.viewer.drawing import SHARED_AXIS
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.review.viewer.viewer import WindowViewer
@@ -73,6 +75,10 @@ def timeline(reviewed_day):
     return read_timeline([reviewed_day])
 
 
+_NAMES = 150  # pixels with names of lanes in each picture
+_BESIDE_RULER = 30  # pixels at the right of the time ruler
+
+
 class Picture:
     """What is seen of a timeline; each view begins where its scale ends."""
 
@@ -83,14 +89,16 @@ class Picture:
 
     def begin_at_cursor(self, rows):
         """Take the column of the cursor, which is at the start, in these rows."""
-        words = self.image.shape[1] // 6 + 2
-        white = (self.image[rows, words : 2 * words] > _WHITE).all(axis=2)
-        self._left = words + int(white.sum(axis=0).argmax())
+        columns = slice(_NAMES, self.image.shape[1] // 3)
+        white = (self.image[rows, columns] > _WHITE).all(axis=2)
+        self._left = _NAMES + int(white.sum(axis=0).argmax())
+        is_above_ruler = self._left < self.image.shape[1] // 6
+        self._right = self.image.shape[1] - _BESIDE_RULER * is_above_ruler
 
     def place(self, time):
         """The number of a column."""
         share = (time - self._grid.start) / (self._grid.end - self._grid.start)
-        return self._left + int(share * (self.image.shape[1] - self._left))
+        return self._left + int(share * (self._right - self._left))
 
     def is_coloured(self, time, wanted, darkest):
         """For each row, whether it has a colour at a time, mixed with black to some extent."""
@@ -295,3 +303,80 @@ def test_every_short_sound_of_a_day_is_seen_in_the_page(short_sounds, size, tmp_
         with suppress(AssertionError):
             patiently(page.picture, lambda png: is_seen(png, timeline, path))
         check_seen(path.read_bytes(), timeline)
+
+
+# What one does with the mouse
+
+
+_LANES, _TITLES = 203, 130  # pixels at the left of the lanes, and above them
+
+
+def rows_of(picture, name):
+    """The rows in which a class is drawn as a strip."""
+    return np.flatnonzero((np.abs(picture - colour(name)).max(axis=2) <= _NEAR).any(axis=1))
+
+
+def columns_of(picture, shade):
+    """The first and the last column in which a strip of a colour is drawn, without round ends."""
+    lanes = picture[_TITLES : len(picture) * 6 // 10, _LANES:]
+    columns = np.flatnonzero((np.abs(lanes - shade).max(axis=2) <= _NEAR).sum(axis=0) > 3)
+    return (_LANES + columns[0] + 5, _LANES + columns[-1] - 5) if len(columns) else None
+
+
+@pytest.fixture
+def day_page(short_sounds, tmp_path):
+    """A page that shows a day at 1366 x 768, with its viewer."""
+    timeline = read_timeline([short_sounds], *day_span(DAY, UTC))
+    with (
+        open_page() as viewer,
+        browsing(viewer.address, tmp_path / "browser", "1366,768") as page,
+    ):
+        viewer.draw(timeline, close_up=False)
+        assert viewer.wait_until_drawn().errors == []
+        patiently(page.picture, lambda png: is_seen(png, timeline, tmp_path / "day.png"))
+        yield timeline, viewer, page
+
+
+def test_the_wheel_moves_no_lane_away_from_its_name(day_page, tmp_path):
+    """It zooms in time alone, and what it scrolls is put back."""
+    timeline, viewer, page = day_page
+    png = page.picture()
+    before = pixels(png)
+    first = timeline.grid.start + round(SOUGHT[next(iter(SOUGHT))][0][0] * 1e9)
+    x = Picture(png, timeline).place(first)
+    lanes = {name: set(rows_of(before, name)) for name in SOUGHT}
+    view = viewer._blueprint()[f"/{SHARED_AXIS}"]
+    for steps, zoom in ((-2, True), (3, False), (-5, False)):
+        page.wheel(x, 200, steps, zoom=zoom)
+
+        def is_in_place(png):
+            viewer.refresh()  # as a session does several times a second
+            (tmp_path / "wheel.png").write_bytes(png)
+            now = pixels(png)
+            found = {name: set(rows_of(now, name)) for name in SOUGHT}
+            return any(found.values()) and all(found[name] <= lanes[name] for name in SOUGHT)
+
+        patiently(page.picture, is_in_place)
+    assert viewer._blueprint()[f"/{SHARED_AXIS}"] != view  # it did zoom
+
+
+def test_what_is_dragged_on_the_ruler_is_selected_in_the_lanes_above_it(day_page):
+    timeline, viewer, page = day_page
+    x, y = ruler(page.picture())
+    page.drag(y, x + 200, x + 420)
+    start, end = patiently(viewer.selection, bool)
+    viewer.refresh()
+    found = patiently(lambda: columns_of(pixels(page.picture()), SELECTED_COLOUR), bool)
+    shares = [
+        (time - timeline.grid.start) / (timeline.grid.end - timeline.grid.start)
+        for time in (start, end)
+    ]
+    on_ruler = [x + share * (1366 - _BESIDE_RULER - x) for share in shares]
+    assert np.abs(np.subtract(found, on_ruler)).max() <= 3
+    assert abs(on_ruler[1] - (x + 420)) <= 3  # where the mouse was released
+    viewer.show(start, end, 0, select=False)
+    assert viewer.selection() is None
+    viewer.refresh()
+    patiently(
+        lambda: columns_of(pixels(page.picture()), SELECTED_COLOUR), lambda found: found is None
+    )

@@ -367,6 +367,13 @@ class Page:
             self._mouse("mouseMoved", x, y, button="left", buttons=1)
         self._mouse("mouseReleased", end, y, button="left", clickCount=1)
 
+    def wheel(self, x, y, steps, *, zoom=False):
+        """Turn the wheel over a place; with `zoom`, hold Ctrl."""
+        self._mouse("mouseMoved", x, y)
+        for _ in range(abs(steps)):
+            delta = 100 if steps > 0 else -100
+            self._mouse("mouseWheel", x, y, deltaX=0, deltaY=delta, modifiers=2 * zoom)
+
     def _mouse(self, kind, x, y, **more):
         """Do something with the mouse, and let the page draw twice."""
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)

@@ -1,6 +1,7 @@
 """Audio clips in a log."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -171,6 +172,14 @@ def play_sound(samples: Float32, rate: int, *, wait: bool = False) -> None:
             sounddevice.wait()
     except (sounddevice.PortAudioError, ValueError) as error:
         raise LogError(f"the sound cannot be played here ({error}); is there a speaker?") from error
+
+
+def stop_sound() -> None:
+    """Stop what `play_sound` plays."""
+    with suppress(OSError):
+        import sounddevice  # noqa: PLC0415  PortAudio may be missing
+
+        sounddevice.stop()
 
 
 def _mono(clip: LoggedClip) -> Float32:

@@ -31,6 +31,7 @@ from hearthlog.analyzer.review.timeline import (
     PlotKind,
     Style,
     Timeline,
+    TimelineGrid,
     no_spans,
 )
 from hearthlog.models.classes import (
@@ -150,11 +151,13 @@ def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
 
 
 REVIEWED = "Reviewed"  # name of the lane, and text of spans without a mark
+SELECTED = "Selected"  # name of the lane of the span that a key would mark
 NOT_HEARD = "Not heard"
 _TROUBLE = "Trouble"
 _RECURRING = "Recurs"
 _VOICES = "Voices"
 _LOOKED_AT: Colour = (58, 70, 92)
+SELECTED_COLOUR: Colour = (245, 240, 225)
 _MOST_LANES = 12  # of classes, if some were not heard at all
 
 
@@ -174,24 +177,42 @@ class Lane(NamedTuple):
     colours: Mapping[str, Colour]
 
 
-def timeline_lanes(timeline: Timeline) -> Iterator[Lane]:
+def timeline_lanes(timeline: Timeline, *, marking: bool = False) -> Iterator[Lane]:
     """Make the lanes of a timeline, microphone by microphone, from the top.
+
+    Parameters
+    ----------
+    marking : bool, optional
+        Whether there is a lane of the selected span.
 
     Yields
     ------
     Lane
-        For each labelling a lane for each class except silence: the class heard for the shortest
-        time first, classes not heard last. Then the lanes shared by all labellings: each scenario,
-        differences from the first labelling, reviewed spans (also of scenarios), gaps, and trouble.
+        For each labelling a lane for each class except silence, the most important class first.
+        Then the lanes shared by all labellings: each scenario, differences from the first
+        labelling, the selected span, reviewed spans (also of scenarios), gaps, and trouble.
+        Nothing lies outside of the timeline: it would stretch the viewer's time ruler.
     """
     for microphone in timeline.microphones.values():
-        labellings = labellings_of(microphone)
-        words = _classes(microphone, labellings)
-        for one in labellings:
-            for name, shade in words.items():
-                spans = _of_class(one.spans, name)
-                yield Lane(microphone.name, one.name, name, spans, {name: shade})
-        yield from _beside(microphone, labellings)
+        for lane in _lanes_of(microphone, marking=marking):
+            yield lane._replace(spans=cut_spans(lane.spans, timeline.grid))
+
+
+def cut_spans(spans: LabelledSpans, grid: TimelineGrid) -> LabelledSpans:
+    """Return the parts of spans within a grid."""
+    inside = (spans.ends > grid.start) & (spans.starts < grid.end)
+    starts, ends = (np.clip(edge[inside], grid.start, grid.end) for edge in spans[:2])
+    return LabelledSpans(starts, ends, spans.texts[inside])
+
+
+def _lanes_of(microphone: MicrophoneTimeline, *, marking: bool) -> Iterator[Lane]:
+    labellings = labellings_of(microphone)
+    words = _classes(microphone, labellings)
+    for one in labellings:
+        for name, shade in words.items():
+            spans = _of_class(one.spans, name)
+            yield Lane(microphone.name, one.name, name, spans, {name: shade})
+    yield from _shared_lanes(microphone, labellings, marking=marking)
 
 
 def labellings_of(microphone: MicrophoneTimeline) -> list[LabellingTimeline]:
@@ -232,6 +253,11 @@ def reviewed_lane(
     return marked._replace(spans=spans, colours=colours)
 
 
+def selected_lane(microphone: str, spans: LabelledSpans) -> Lane:
+    """Make the lane of the selected span."""
+    return Lane(microphone, "", SELECTED, spans, {SELECTED: SELECTED_COLOUR})
+
+
 def _classes(
     microphone: MicrophoneTimeline, labellings: list[LabellingTimeline]
 ) -> dict[str, Colour]:
@@ -261,7 +287,9 @@ def _of_class(spans: LabelledSpans, name: str) -> LabelledSpans:
     return LabelledSpans(spans.starts[own], spans.ends[own], np.full(own.sum(), name, object))
 
 
-def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline]) -> Iterator[Lane]:
+def _shared_lanes(
+    microphone: MicrophoneTimeline, labellings: list[LabellingTimeline], *, marking: bool
+) -> Iterator[Lane]:
     for one in microphone.labellings:
         if is_scenario(one.name):
             name = in_words(scenario_name(one.name))
@@ -273,6 +301,8 @@ def _beside(microphone: MicrophoneTimeline, labellings: list[LabellingTimeline])
     for name, spans in ((_RECURRING, microphone.recurring), (_VOICES, microphone.spoken)):
         if len(spans):
             yield _lane_in_words(microphone.name, name, spans)
+    if marking:
+        yield selected_lane(microphone.name, no_spans())
     marks = {one.name: one.spans for one in microphone.labellings if is_review(one.name)}
     for scenario, looked_at in {"": microphone.reviewed, **microphone.reviewed_scenarios}.items():
         own = marks.get(review_labelling(scenario), no_spans())

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import tzinfo
 from functools import partial
@@ -81,8 +81,8 @@ class Screen(Protocol):
     def cursor(self) -> int | None:
         """Return the time of the cursor, in nanoseconds of UTC; None without a cursor."""
 
-    def show(self, start: int, end: int, margin: int) -> None:
-        """Select a span, and show it with a margin.
+    def show(self, start: int, end: int, margin: int, *, select: bool = True) -> None:
+        """Show a span with a margin, and select the span, or nothing.
 
         Parameters
         ----------
@@ -91,6 +91,9 @@ class Screen(Protocol):
         margin : int
             On either side, in nanoseconds.
         """
+
+    def refresh(self) -> None:
+        """Draw the selected span, and put the lanes beside their names again."""
 
     def ask(self, start: int, end: int, text: str) -> None:
         """Draw the requested span, in place of the previous one.
@@ -135,8 +138,10 @@ class ReviewSession:
     look_closely : callable
         Draws a span (start, end in nanoseconds of UTC) at the resolution of its frames.
     listen : callable
-        Plays the kept sound of a span (start, end in nanoseconds of UTC); returns a line for the
-        reviewer.
+        Plays the kept sound of a span (start, end in nanoseconds of UTC); returns its length in
+        seconds, 0 without sound, and a line for the reviewer.
+    stop : callable
+        Stops the sound.
     items : sequence of ReviewItem
         The spans to review; empty where the reviewer chooses spans.
     """
@@ -147,12 +152,14 @@ class ReviewSession:
     zone: tzinfo
     say: Callable[[str], None]
     look_closely: Callable[[int, int], None]
-    listen: Callable[[int, int], str]
+    listen: Callable[[int, int], tuple[float, str]]
+    stop: Callable[[], None]
     items: Sequence[ReviewItem] = ()
     _at: int = -1
     _judged: list[int] = field(default_factory=list)  # the item of each change
     _began: float = 0.0
     _begin: int | None = None  # start of a span without an end yet
+    _plays_until: float = 0.0  # by CLOCK_MONOTONIC
 
     @property
     def keys(self) -> list[tuple[str, str]]:
@@ -174,7 +181,7 @@ class ReviewSession:
         actions |= {
             "d": ("delete marks", lambda: self._mark(self.marking.delete)),
             "z": ("undo", self._undo),
-            "p": ("play", self._play),
+            "p": ("or Space: play, stop", self._play),
             "[": ("from", self._begin_here),
             "]": ("to", self._end_here),
         }
@@ -199,6 +206,8 @@ class ReviewSession:
             try:
                 key = keys.get(timeout=_POLL_SECONDS)
             except Empty:
+                with suppress(ConnectionError, TimeoutError):
+                    self.screen.refresh()
                 continue
             if key == "q":
                 break
@@ -212,8 +221,8 @@ class ReviewSession:
         Parameters
         ----------
         key : str
-            One of `keys`, or Enter; with items, a space also skips one. Any other key except
-            white space shows the list of keys.
+            One of `keys`, Enter, or a space, which plays. Any other key except white space shows
+            the list of keys.
         """
         try:
             self._press(key)
@@ -224,7 +233,7 @@ class ReviewSession:
 
     def _press(self, key: str) -> None:
         actions = self._actions()
-        same = {"\n": _RIGHT, " ": "n"}.get(key, key)
+        same = {"\n": _RIGHT, " ": "p"}.get(key, key)
         if same in actions:
             actions[same][1]()
         elif key.strip():
@@ -294,9 +303,20 @@ class ReviewSession:
             self.say("the viewer did not answer: the change was made, but is not shown")
 
     def _play(self) -> None:
-        start, end = self._chosen()
-        self.say(self.listen(start, end))
-        self.screen.play(start)
+        """Play the selected span, or the item; stop a sound that plays."""
+        if time.monotonic() < self._plays_until:
+            self._plays_until = 0.0
+            self.stop()
+            self.say("stopped")
+            return
+        item = self.items[self._at] if self.items else None
+        span = self.screen.selection() or (item and (item.start, item.end))
+        start, end = span or self._chosen()
+        seconds, text = self.listen(start, end)
+        self._plays_until = time.monotonic() + seconds
+        self.say(text)
+        if seconds:
+            self.screen.play(start)
 
     def _look_around(self) -> None:
         cursor = self._cursor()
@@ -324,11 +344,19 @@ class ReviewSession:
         return cursor
 
     def _chosen(self) -> tuple[int, int]:
-        item = self.items[self._at] if self.items else None
-        span = self.screen.selection() or (item and (item.start, item.end))
-        if span is None:
+        """Return the selected span, or the item: but a minute is no single sound."""
+        span = self.screen.selection()
+        if span is not None:
+            return span
+        if self._in_minute:
+            raise DataError(
+                "drag over the sound first: without that the key would name the whole minute "
+                "(Enter: all of it is right as it is labelled)"
+            )
+        if not self.items:
             raise DataError(f"no span is marked: {_HELP} press a key")
-        return span
+        item = self.items[self._at]
+        return item.start, item.end
 
     def _go(self, step: int) -> None:
         """Show the next or previous item."""
@@ -343,7 +371,8 @@ class ReviewSession:
         with self._unless_silent():
             self.look_closely(item.start - margin, item.end + margin)
             self.screen.ask(item.start, item.end, _question(item))
-            self.screen.show(item.start, item.end, margin)
+            # A minute has several sounds: what is named in it is selected by hand.
+            self.screen.show(item.start, item.end, margin, select=item.chosen != RANDOM)
 
     def _text(self, start: int, end: int) -> str:
         length = (end - start) / NANOSECONDS
@@ -536,22 +565,35 @@ def _text(span: ReviewSpan) -> str:
 _FULL_SCALE = np.float32(32768.0)
 
 
-def listen(clips: Sequence[SoundClip], start: int, end: int) -> str:
+def listen(
+    clips: Sequence[SoundClip],
+    start: int,
+    end: int,
+    play: Callable[[Float32, int], None] = play_sound,
+) -> tuple[float, str]:
     """Start playback of the kept sound of a span of time.
+
+    Parameters
+    ----------
+    play : callable, optional
+        Plays samples of a rate; raises `LogError` if that is not possible.
 
     Returns
     -------
-    str
-        A line for the reviewer: the duration of the sound, or why there is none.
+    seconds : float
+        Length of the sound; 0 if nothing plays.
+    text : str
+        A line for the reviewer: the length of the sound, or why there is none.
     """
     rate, samples = sound_of(clips, start, end)
     if not len(samples):
-        return "no sound of this span was kept"
+        return 0.0, "no sound of this span was kept"
     try:
-        play_sound(samples, rate)
+        play(samples, rate)
     except LogError as error:
-        return str(error)
-    return f"playing {len(samples) / rate:.1f} s"
+        return 0.0, str(error)
+    seconds = len(samples) / rate
+    return seconds, f"playing {seconds:.1f} s; Space stops"
 
 
 def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Float32]:

@@ -274,6 +274,53 @@ class SoundClip(NamedTuple):
         return self.start + len(self.samples) * NANOSECONDS // self.rate
 
 
+_WINDOW_SECONDS = 0.032
+_HIGHEST = 8000.0  # Hz
+_RANGE = 55.0  # dB below the peak of a spectrogram that are visible
+
+
+def spectrogram(
+    clips: Sequence[SoundClip], start: int, end: int, shape: tuple[int, int]
+) -> Float64 | None:
+    """Compute the spectrogram of the kept sound of a span of time.
+
+    Parameters
+    ----------
+    start, end : int
+        In nanoseconds of UTC.
+    shape : (int, int)
+        Rows from 8 kHz down to 0, and columns from start to end.
+
+    Returns
+    -------
+    np.ndarray, float64, or None
+        0 (55 dB below the loudest value) to 1, and 0 where no sound was kept; None without sound.
+    """
+    rows, count = shape
+    times = start + (np.arange(count) + 0.5) * ((end - start) / count)
+    power = np.zeros((count, rows))
+    for clip in clips:
+        inside = np.flatnonzero((times >= clip.start) & (times < clip.end))
+        if not len(inside):
+            continue
+        window = max(round(clip.rate * _WINDOW_SECONDS), 2)
+        middles = (times[inside] - clip.start) * (clip.rate / NANOSECONDS)
+        places = middles.astype(np.int64)[:, np.newaxis] + np.arange(window) - window // 2
+        known = (places >= 0) & (places < len(clip.samples))
+        frames = np.where(known, clip.samples[np.clip(places, 0, len(clip.samples) - 1)], 0)
+        bins = np.abs(np.fft.rfft(frames * np.hanning(window))) ** 2
+        frequencies = np.linspace(_HIGHEST, 0.0, rows)
+        nearest = np.rint(frequencies * window / clip.rate).astype(np.int64)
+        audible = nearest < bins.shape[1]
+        power[np.ix_(inside, np.flatnonzero(audible))] = bins[:, nearest[audible]]
+    peak = power.max()
+    if not peak:
+        return None
+    level = 10 * np.log10(np.maximum(power / peak, 1e-12))
+    shades: Float64 = np.clip(1 + level / _RANGE, 0.0, 1.0).T
+    return shades
+
+
 @dataclass
 class LabellingTimeline:
     """Labels of one source: the recorder (`live`), a relabelling, a reviewer (`review`)."""

@@ -219,6 +219,7 @@ class _Choice(NamedTuple):
 
 def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Choice) -> None:
     """Show a timeline until the reviewer ends."""
+    from hearthlog.analyzer.logs.clips import stop_sound
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.review.lanes import class_precision
@@ -258,6 +259,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         say,
         look_closely,
         lambda start, end: listen(heard.clips, start, end),
+        stop_sound,
         items,
     )
     keys: SimpleQueue[str] = SimpleQueue()
@@ -303,7 +305,10 @@ def _work(
     timeline: "Timeline", logs: list[Path], choice: _Choice, microphone: str
 ) -> "tuple[list[ReviewItem], Marking]":
     """Return the review items and the marking of a labelling."""
+    import numpy as np
+
     from hearthlog.analyzer.logs.labelling import find_labellings
+    from hearthlog.analyzer.logs.spans import Spans
     from hearthlog.analyzer.review.marking import Marking
     from hearthlog.analyzer.review.review_list import corrected_name
     from hearthlog.analyzer.review.session import review_items
@@ -316,8 +321,12 @@ def _work(
         sources = find_labellings(*logs)
         labelling = sources.find(microphone, choice.labels)
         if choice.queue is not None:
+            clips = timeline.microphones[microphone].clips
+            edges = np.array([(one.start, one.end) for one in clips], np.int64).reshape(-1, 2)
+            audible = Spans(edges[:, 0], edges[:, 1])
+            of = microphone, labelling
             items = review_items(
-                _queue_spans(choice.queue, sources, (microphone, labelling), choice)
+                _queue_spans(choice.queue, sources, of, choice, audible if clips else None)
             )
             _report_fewer(len(items), choice)
     marking = Marking(

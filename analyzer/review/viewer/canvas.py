@@ -16,6 +16,7 @@ from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float64, Int64
 
 _STROKE_WIDTH = 2.0  # pixels
+_FILLING = 400  # texts that leave no pause in the data
 _LEAST_SHARE = 0.004  # a smaller share makes a band less than a pixel high
 _ROWS_AT_ONCE = 72_000  # an hour of frames
 _HEAT_SQUARE = 6.5  # half the side: squares overlap from afar, and are apart in close-ups
@@ -63,10 +64,14 @@ class Canvas:
         """Hide strips; a recording cannot delete data."""
         self.recording.log(entity, rr.SeriesLines(visible_series=[False]), static=True)
 
-    def begin(self, entity: str, time: int) -> None:
-        """Put an empty text at a time (ns of UTC): a viewer's cursor starts with the data."""
-        text = rr.TextDocument.columns(text=[""])
-        self.recording.send_columns(entity, [self._time_column(np.array([time]))], text)
+    def fill(self, entity: str, start: int, end: int) -> None:
+        """Put empty texts in a span (ns of UTC).
+
+        A viewer's time ruler has the span of the data, and leaves out long pauses in them.
+        """
+        times = np.linspace(start, end, _FILLING, dtype=np.int64)
+        texts = rr.TextDocument.columns(text=[""] * len(times))
+        self.recording.send_columns(entity, [self._time_column(times)], texts)
 
     def write(self, entity: str, text: str) -> None:
         """Set the text of a text entity."""
@@ -192,17 +197,31 @@ class Canvas:
         shade : np.ndarray [shape=(n, k)], float
             0 (dark) to 1 (bright).
         """
-        scale = np.linspace(0.0, 1.0, len(_DARK_TO_BRIGHT))
-        colours = np.stack([np.interp(shade, scale, part) for part in _DARK_TO_BRIGHT.T], axis=-1)
+        colours = _coloured(shade)
         count = shade.shape[1]
         heights = np.tile(np.arange(count, dtype=np.float64), len(times))
         lengths = [count] * len(times)
         columns = [
             *rr.Scalars.columns(scalars=heights).partition(lengths),
-            *rr.SeriesPoints.columns(colors=colours.round().astype(np.uint8).reshape(-1, 3))
+            *rr.SeriesPoints.columns(colors=colours.reshape(-1, 3))
             .partition(lengths),
         ]  # fmt: skip
         self.recording.send_columns(entity, [self._time_column(times)], columns)
+
+    def show_image(self, entity: str, time: int, shade: NDArray[np.floating], text: str) -> None:
+        """Show an image from a time (ns of UTC) on, with a text in the entity below.
+
+        Parameters
+        ----------
+        shade : np.ndarray [shape=(rows, columns)], float
+            0 (dark) to 1 (bright).
+        """
+        self.recording.set_time(
+            self.clock.name, timestamp=np.datetime64(self.clock.shown(time), "ns")
+        )
+        self.recording.log(entity, rr.Image(_coloured(shade)).compress())
+        self.recording.log(f"{entity}/text", rr.TextDocument(text))
+        self.recording.reset_time()
 
     def write_lines(self, entity: str, lines: LogLines) -> None:
         """Add lines of text, each at its time and with its level."""
@@ -244,6 +263,13 @@ class Canvas:
     def _time_column(self, times: Int64) -> rr.TimeColumn:
         shown = self.clock.shown(times).astype("datetime64[ns]")
         return rr.TimeColumn(self.clock.name, timestamp=shown)
+
+
+def _coloured(shade: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return the colours of shades from 0 (dark) to 1 (bright)."""
+    scale = np.linspace(0.0, 1.0, len(_DARK_TO_BRIGHT))
+    colours = np.stack([np.interp(shade, scale, part) for part in _DARK_TO_BRIGHT.T], axis=-1)
+    return colours.round().astype(np.uint8)
 
 
 def _with_holes(part: Plot, names: Sequence[str]) -> tuple[Int64, Float64]:

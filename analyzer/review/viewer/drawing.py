@@ -8,10 +8,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hearthlog.analyzer.colours import Colour, colour
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING
 from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.analyzer.review.lanes import (
     LEVEL,
     REVIEWED,
+    SELECTED,
     SHARES,
     Checked,
     Lane,
@@ -20,13 +22,20 @@ from hearthlog.analyzer.review.lanes import (
     timeline_lanes,
     timeline_plots,
 )
-from hearthlog.analyzer.review.timeline import MicrophoneTimeline, Plot, Style, Timeline
+from hearthlog.analyzer.review.timeline import (
+    MicrophoneTimeline,
+    Plot,
+    Style,
+    Timeline,
+    spectrogram,
+)
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.models.classes import in_words
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 
-LINES, CLIP, WORDS = "events", "clip", "words"
+LINES, CLIP, WORDS, HOURS = "events", "clip", "words", "hours"
+SPECTRUM = "spectrum"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # suffix of a microphone's name
 ASKED, ASKED_WORDS = "asked", "words/asked"
@@ -34,6 +43,10 @@ _CLOSE_STROKES, _ASKED_STROKES = 1_200, 600  # maximum strokes of a band
 _ASKED: Colour = (245, 240, 225)
 
 _THICK, _THIN = 12.0, 8.0  # in screen points
+_HOUR = 3600 * NANOSECONDS
+_HOURS_FROM = 4 * _HOUR
+_DAY: Colour = (70, 80, 92)
+_NIGHT: Colour = (28, 36, 58)
 _Strip = tuple[int, int, str]
 
 
@@ -86,9 +99,9 @@ class LanePlace(NamedTuple):
     height: float
 
 
-def placed_lanes(timeline: Timeline) -> list[tuple[Lane, LanePlace]]:
+def placed_lanes(timeline: Timeline, *, marking: bool = False) -> list[tuple[Lane, LanePlace]]:
     """Assign a place to each lane; all labellings of a microphone share the same places."""
-    lanes = list(timeline_lanes(timeline))
+    lanes = list(timeline_lanes(timeline, marking=marking))
     names: dict[str, dict[str, None]] = {}
     for lane in lanes:
         names.setdefault(lane.microphone, {})[lane.name] = None
@@ -98,7 +111,9 @@ def placed_lanes(timeline: Timeline) -> list[tuple[Lane, LanePlace]]:
         number = own.index(lane.name)
         root = lanes_entity(lane.microphone, lane.labelling)
         name = f"{lane.microphone}/{WORDS}/names/{_word(lane.labelling) or 'all'}/{number:02}"
-        placed.append((lane, LanePlace(f"{root}/{number:02}", name, len(own) - number - 0.5)))
+        placed.append(
+            (lane, LanePlace(f"{root}/{number:02}", name, (len(own) - number - 0.5) * LANE_HEIGHT))
+        )
     return placed
 
 
@@ -107,27 +122,32 @@ def lanes_entity(microphone: str, labelling: str) -> str:
     return f"{microphone}/lanes/{_word(labelling) or 'all'}"
 
 
-def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]:
+def draw(
+    timeline: Timeline, canvas: Canvas, *, marking: bool = False
+) -> dict[tuple[str, str], DrawnLane]:
     """Draw a timeline, except single frames.
 
     Returns
     -------
     dict of (str, str) to DrawnLane
-        Reviewed lanes by microphone and name, to redraw them when reviewed spans are added.
+        The lanes that change, by microphone and name: those of reviewed spans, and of the selected
+        span.
 
     Raises
     ------
     DataError
         If the timeline's time zone is unknown.
     """
-    reviewed = {}
-    canvas.begin(NOTHING, timeline.grid.start)
-    for lane, place in placed_lanes(timeline):
+    changing = {}
+    canvas.fill(NOTHING, timeline.grid.start, timeline.grid.end)
+    if _has_hours(timeline):
+        _draw_hours(timeline, canvas)
+    for lane, place in placed_lanes(timeline, marking=marking):
         canvas.write(place.name, lane.name)
         drawn = DrawnLane(place.entity, place.height, timeline.grid.step)
         drawn.show(lane, canvas)
-        if REVIEWED in lane.colours:
-            reviewed[lane.microphone, lane.name] = drawn
+        if {REVIEWED, SELECTED} & lane.colours.keys():
+            changing[lane.microphone, lane.name] = drawn
     for plot in timeline_plots(timeline):
         if len(plot.times):
             configure_plot(plot, plot_entity(plot), canvas)
@@ -137,12 +157,32 @@ def draw(timeline: Timeline, canvas: Canvas) -> dict[tuple[str, str], DrawnLane]
         if microphone.clips:
             canvas.show_clips(f"{microphone.name}/{CLIP}", microphone.clips, timeline.grid.start)
     canvas.write_lines(LINES, timeline.lines)
-    return reviewed
+    return changing
 
 
-def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
+def _has_hours(timeline: Timeline) -> bool:
+    """Whether hours are shown: the viewer's own axis of a day has one label or two."""
+    return timeline.grid.end - timeline.grid.start > _HOURS_FROM
+
+
+def _draw_hours(timeline: Timeline, canvas: Canvas) -> None:
+    """Draw the hours of the home's clock, those of the night in another colour."""
+    clock, grid = timeline.clock, timeline.grid
+    first = clock.shown(grid.start) // _HOUR
+    hours = np.arange(first, -(-clock.shown(grid.end) // _HOUR) + 1)
+    names = [f"{hour % 24:02}" for hour in hours.tolist()]
+    night = {f"{hour:02}" for hour in (*range(EVENING, 24), *range(MORNING))}
+    shades = {name: _NIGHT if name in night else _DAY for name in sorted(set(names))}
+    canvas.configure_states(HOURS, shades)
+    times = np.clip(clock.utc(hours * _HOUR), grid.start, grid.end)
+    canvas.change_states(HOURS, times, [*names[:-1], None])
+
+
+def write_checked(
+    timeline: Timeline, checked: Checked, canvas: Canvas, *, marking: bool = False
+) -> None:
     """Write next to the recorder's classes how many of their sounds were right in this home."""
-    for lane, place in placed_lanes(timeline):
+    for lane, place in placed_lanes(timeline, marking=marking):
         known = checked.get((lane.microphone, lane.name))
         if lane.labelling == LIVE and known is not None:
             canvas.write(place.name, f"{lane.name} · {known.right}/{known.labelled} right")
@@ -159,6 +199,12 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
             new = rows_at(before, plot.times) < 0
             part = plot._replace(times=plot.times[new], values=plot.values[new])
             add_to_plot(part, entity, canvas, strokes)
+    grid = timeline.grid
+    for microphone in timeline.microphones.values():
+        shade = spectrogram(microphone.clips, grid.start, grid.end, _SPECTRUM_SHAPE)
+        text = "Kept sound, 0 to 8 kHz" if shade is not None else "No sound of this was kept"
+        shade = np.zeros(_SPECTRUM_SHAPE) if shade is None else shade
+        canvas.show_image(f"{microphone.name}/{SPECTRUM}", grid.start, shade, text)
 
 
 def draw_requested(number: int, start: int, end: int, text: str, canvas: Canvas) -> None:
@@ -265,10 +311,17 @@ APPLICATION = "hearthlog"
 # The viewer keeps the shared range of linked time axes under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
-_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 140, 60
+_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 140, 44
+_CLOSE_HEIGHT = 100  # of a plot in a close-up
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
-_BELOW = 0.65  # height of the time axis, in lanes
-_COLUMNS = (2, 10)  # widths of the text and of the plot
+BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
+# Numbers of the lanes' axis are as wide as those of the plots below: the plots begin at one place.
+LANE_HEIGHT = 0.1
+_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 110
+_SPECTRUM_SHAPE = (128, 1792)  # flatter than any view of it
+_BLACK: Colour = (0, 0, 4)
+HOUR_COLUMNS = (2, 11)  # the same, of the hours, whose view has no vertical axis
+COLUMNS = (2, 10)  # widths of the text and of the plot, until the width of the window is known
 Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
 
@@ -280,13 +333,22 @@ class TimelineBlueprint(rrb.Blueprint):
     ----------
     start, end : Boundary
         Times, or seconds from the cursor.
+    lanes_share : float, optional
+        Share of the height that the lanes have.
     """
 
     def __init__(
-        self, rows: Sequence[Row], panel: rrb.TimePanel, start: Boundary, end: Boundary
+        self,
+        rows: Sequence[Row],
+        panel: rrb.TimePanel,
+        start: Boundary,
+        end: Boundary,
+        *,
+        lanes_share: float = 1.0,
     ) -> None:
         super().__init__(stack(rows), panel, collapse_panels=True)
         self._range = rr.encodings.TimeRange(start, end)
+        self.lanes_share = lanes_share
 
     def _log_to_stream(self, stream: rr.RecordingStream) -> None:
         super()._log_to_stream(stream)
@@ -349,7 +411,8 @@ def _time_series(
         name=name,
         titlebar=titlebar,
         axis_x=_axis(),
-        axis_y=None if scale is None else rrb.ScalarAxis(range=scale),
+        # The wheel zooms in time alone: names of lanes do not move with their lanes.
+        axis_y=rrb.ScalarAxis(range=scale, zoom_lock=True),
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=legend),
     )
 
@@ -369,7 +432,7 @@ def review_layout(
     plots: dict[str, list[Plot]] = {name: [] for name in timeline.microphones}
     for plot in timeline_plots(timeline):
         plots[plot.microphone].append(plot)
-    places = placed_lanes(timeline)
+    places = placed_lanes(timeline, marking=marking)
     stacks: dict[str, list[Row]] = {}
     for name, microphone in timeline.microphones.items():
         own = [(lane.labelling, place) for lane, place in places if lane.microphone == name]
@@ -379,21 +442,27 @@ def review_layout(
         more = _plot_views(microphone, plots[name], timeline, close_up=close_up)
         level = [_all(same) for same in _by_title(plots[name]) if same[0].kind is LEVEL]
         if close_up:
-            rows += [(_LEVEL_HEIGHT, view) for view in _sounds(microphone)]
+            rows.insert(0, (_SPECTRUM_HEIGHT, _spectrum_view(microphone.name)))
         elif marking or not more:
             more[1:1] = level
         else:
             rows += [(_LEVEL_HEIGHT, view) for view in level]
-        stacks[name] = [*rows, (_PLOT_HEIGHT, tabs(more))] if more else rows
+        height = _CLOSE_HEIGHT if close_up else _PLOT_HEIGHT
+        stacks[name] = [*rows, (height, tabs(more))] if more else rows
     panel = rrb.TimePanel(
         state="expanded" if marking else "collapsed", timeline=clock.name, play_state="paused"
     )
-    ends = (clock.shown(time) for time in (timeline.grid.start, timeline.grid.end))
-    boundaries = (Boundary.absolute(nanos=time) for time in ends)
+    start, end = (
+        Boundary.absolute(nanos=clock.shown(time))
+        for time in (timeline.grid.start, timeline.grid.end)
+    )
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
     asked: list[Row] = [(_ASKED_HEIGHT, _requested_view())]
     whole = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
-    return TimelineBlueprint([*(asked if close_up else []), whole], panel, *boundaries)
+    hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []
+    everything = [*(asked if close_up else []), *hours, whole]
+    share = max(own[close_up][0] for own in stacks.values()) / sum(part for part, _ in everything)
+    return TimelineBlueprint(everything, panel, start, end, lanes_share=share)
 
 
 def _note(timeline: Timeline) -> str:
@@ -410,13 +479,13 @@ def _lane_views(
     for labelling, words in labellings or [("", "")]:
         entities = [lanes_entity(microphone.name, each) for each in dict.fromkeys((labelling, ""))]
         names = [place.name for own, place in places if own in {labelling, ""}]
-        lanes = _time_series(words, entities, (0.0, float(count)))
+        lanes = _time_series(words, entities, (0.0, count * LANE_HEIGHT))
         beside = rrb.Vertical(
-            *(_text(name) for name in names), _text(NOTHING), row_shares=[*[1.0] * count, _BELOW]
+            *(_text(name) for name in names), _text(NOTHING), row_shares=[*[1.0] * count, BELOW]
         )
         by = f" by {words}" if words else ""
         title = f"What was heard{by}: {note}"
-        views.append(rrb.Horizontal(beside, lanes, column_shares=_COLUMNS, name=title))
+        views.append(rrb.Horizontal(beside, lanes, column_shares=COLUMNS, name=title))
     return views
 
 
@@ -444,9 +513,28 @@ def _by_title(plots: Sequence[Plot]) -> list[list[Plot]]:
     return [[plot for plot in plots if plot.kind.title == title] for title in titles]
 
 
+def _hours_view() -> rrb.Container:
+    view = rrb.StateTimelineView(origin=HOURS, name="Hours", titlebar=False, time_view=_axis())
+    return rrb.Horizontal(_text(NOTHING), view, column_shares=HOUR_COLUMNS)
+
+
+def _spectrum_view(microphone: str) -> rrb.Container:
+    """Show the spectrogram as wide as the lanes: it is flatter than its view."""
+    rows, columns = _SPECTRUM_SHAPE
+    entity = f"{microphone}/{SPECTRUM}"
+    view = rrb.Spatial2DView(
+        origin=entity,
+        name="Sound",
+        titlebar=False,
+        visual_bounds=rrb.VisualBounds2D(x_range=[0, columns], y_range=[0, rows]),
+        background=_BLACK,
+    )
+    return rrb.Horizontal(_text(f"{entity}/text"), view, column_shares=HOUR_COLUMNS)
+
+
 def _requested_view() -> rrb.Container:
     lane = _time_series("Which span is asked", [ASKED], (0.0, 1.0))
-    return rrb.Horizontal(_text(ASKED_WORDS), lane, column_shares=_COLUMNS)
+    return rrb.Horizontal(_text(ASKED_WORDS), lane, column_shares=COLUMNS)
 
 
 def _close_up(plot: Plot, clock: str) -> rrb.Container:
@@ -468,7 +556,7 @@ def _beside(plots: Sequence[Plot], view: rrb.View, note: str = "") -> rrb.Contai
     return rrb.Horizontal(
         _text(text_entity(plots[0])),
         view,
-        column_shares=_COLUMNS,
+        column_shares=COLUMNS,
         name=f"{plots[0].kind.view}{labelling}{note}",
     )
 

@@ -1,22 +1,40 @@
 """Timeline viewer, in a window or under another control, with mouse selections."""
 
+import io
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import rerun as rr
+from PIL import Image
 from rerun.experimental import ViewerClient
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.spans import NONE, joined
-from hearthlog.analyzer.review.lanes import Checked, reviewed_lane
-from hearthlog.analyzer.review.timeline import HomeClock, LabelledSpans, Timeline
+from hearthlog.analyzer.review.lanes import (
+    SELECTED,
+    Checked,
+    cut_spans,
+    reviewed_lane,
+    selected_lane,
+)
+from hearthlog.analyzer.review.timeline import (
+    HomeClock,
+    LabelledSpans,
+    Timeline,
+    TimelineGrid,
+    no_spans,
+)
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
     APPLICATION,
+    BELOW,
+    COLUMNS,
+    HOUR_COLUMNS,
     SHARED_AXIS,
     DrawnLane,
     draw,
@@ -29,9 +47,10 @@ from hearthlog.analyzer.review.viewer.drawing import (
 from hearthlog.analyzer.review.viewer.process import ViewerProcess, check_display
 from hearthlog.analyzer.review.viewer.recording import name_recording
 
-_PANEL = "/time_panel"
+_PANEL, _AXIS = "/time_panel", "ScalarAxis"
 _WAIT_SECONDS = 60
 _FLUSH_SECONDS = 30.0
+_SIZE_SECONDS = 3.0
 
 Blueprint = dict[str, Any]
 
@@ -51,6 +70,20 @@ class ViewerState(NamedTuple):
     cursor: int | None
 
 
+class ViewerSize(NamedTuple):
+    """Size of a viewer, in points of the screen."""
+
+    width: float
+    height: float
+
+
+# Points of the viewer's own parts.
+_RULER_LEFT, _RULER_RIGHT = 200.0, 30.0  # from the edges of the viewer to the ends of its ruler
+_SCALE_WIDTH, _AXIS_HEIGHT = 28.0, 17.0  # between a view and its plot
+TOP_BAR, _TAB_BAR = 36.0, 30.0
+_PANEL_HEIGHTS = 150.0, 250.0  # a quarter of the viewer, within these
+
+
 class Viewer(ABC):
     """A viewer in a window or in a browser.
 
@@ -65,7 +98,17 @@ class Viewer(ABC):
         self._process = process
         self._recording = rr.RecordingStream(APPLICATION)
         self._canvas = Canvas(self._recording, HomeClock("", 0))
-        self._reviewed: dict[tuple[str, str], DrawnLane] = {}
+        self._lanes: dict[tuple[str, str], DrawnLane] = {}  # those that change
+        self._grid: TimelineGrid | None = None
+        self._lanes_share = 1.0
+        # Containers in the blueprint: of a text and a plot, and of the names of lanes.
+        self._columns: dict[str, float] = {}  # with the width of the text, in points
+        self._names: list[str] = []
+        self._aligned: ViewerSize | None = None
+        self._size_due = 0.0  # of the next look at the size, by CLOCK_MONOTONIC
+        self._opening: Any = None  # range of the time axes
+        self._axes: dict[str, list[float]] = {}  # vertical ranges, by component of the blueprint
+        self._selected: tuple[int, int] | None = None  # as drawn
         self._asked = 0
         self._close = NONE  # spans of the close-ups
         self._sent = False
@@ -127,15 +170,17 @@ class Viewer(ABC):
         rr.set_strict_mode(True)
         self._sent = True
         layout = review_layout(timeline, marking=True, close_up=close_up)
+        self._lanes_share = layout.lanes_share
         self._recording.connect_grpc(self._process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
         self._canvas = Canvas(self._recording, timeline.clock)
-        self._reviewed = draw(timeline, self._canvas)
+        self._grid = timeline.grid
+        self._lanes = draw(timeline, self._canvas, marking=True)
         self._flush()
 
     def write_checked(self, timeline: Timeline, checked: Checked) -> None:
         """Draw the precision of each class of a timeline next to its name."""
-        write_checked(timeline, checked, self._canvas)
+        write_checked(timeline, checked, self._canvas, marking=True)
         self._flush()
 
     def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
@@ -178,8 +223,43 @@ class Viewer(ABC):
         marks, reviewed : LabelledSpans
             All current ones; earlier drawn spans that are missing here are hidden.
         """
+        assert self._grid is not None
         lane = reviewed_lane(microphone, scenario, marks, reviewed)
-        self._reviewed[microphone, lane.name].show(lane, self._canvas)
+        lane = lane._replace(spans=cut_spans(lane.spans, self._grid))
+        self._lanes[microphone, lane.name].show(lane, self._canvas)
+        self._flush()
+
+    def refresh(self) -> None:
+        """Draw the selected span in the lanes, and put the lanes beside their names again.
+
+        The wheel and a drag move the lanes vertically, and a window may have a new size.
+
+        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
+        """
+        blueprint = self._blueprint()
+        moved = [path for path, span in self._axes.items() if _scalars(blueprint, path) != span]
+        for path in moved:
+            blueprint.setdefault(path, {}).setdefault(_AXIS, {})["range"] = self._axes[path]
+        is_changed = bool(moved)
+        if time.monotonic() >= self._size_due:
+            self._size_due = time.monotonic() + _SIZE_SECONDS
+            is_changed |= self._align(blueprint)
+        if is_changed:
+            self._set_blueprint(blueprint)
+        self._draw_selection(self._selection_in(blueprint))
+
+    def _draw_selection(self, selection: tuple[int, int] | None) -> None:
+        if selection == self._selected:
+            return
+        self._selected = selection
+        spans = no_spans()
+        if selection is not None:
+            starts, ends = (np.array([edge], np.int64) for edge in selection)
+            spans = LabelledSpans(starts, ends, np.array([SELECTED], object))
+        assert self._grid is not None
+        for (microphone, name), drawn in self._lanes.items():
+            if name == SELECTED:
+                drawn.show(selected_lane(microphone, cut_spans(spans, self._grid)), self._canvas)
         self._flush()
 
     def wait_until_drawn(self, is_over: Callable[[], bool] = bool) -> ViewerState | None:
@@ -209,6 +289,7 @@ class Viewer(ABC):
                 continue
             check_version(state.version)
             if state.views:
+                self._take_layout()
                 return state
             time.sleep(0.05)
         raise DataError("Rerun's viewer does not show anything; use --save FILE.rrd")
@@ -226,7 +307,10 @@ class Viewer(ABC):
         ConnectionError, TimeoutError
             If the viewer does not answer.
         """
-        panel = self._blueprint().get(_PANEL, {}).get("TimePanelBlueprint", {})
+        return self._selection_in(self._blueprint())
+
+    def _selection_in(self, blueprint: Blueprint) -> tuple[int, int] | None:
+        panel = blueprint.get(_PANEL, {}).get("TimePanelBlueprint", {})
         span = _span(panel.get("time_selection"))
         return span and (self._clock.utc(span[0]), self._clock.utc(span[1]))
 
@@ -238,13 +322,73 @@ class Viewer(ABC):
         cursor = self.state().cursor
         return None if cursor is None else self._clock.utc(cursor)
 
-    def show(self, start: int, end: int, margin: int) -> None:
-        """Select a span, show it with a margin, and put the cursor on its start.
+    def _take_layout(self) -> None:
+        """Remember the layout as it was opened."""
+        with suppress(ConnectionError, TimeoutError):
+            blueprint = self._blueprint()
+            found = {path: _scalars(blueprint, path) for path in blueprint}
+            self._axes = {path: span for path, span in found.items() if span is not None}
+            self._opening = _view(blueprint)
+            shares = {path: _container(blueprint, path) for path in blueprint}
+            for columns, left in (
+                (COLUMNS, _RULER_LEFT - _SCALE_WIDTH),
+                (HOUR_COLUMNS, _RULER_LEFT),
+            ):
+                own = [*map(float, columns)]
+                self._columns |= {
+                    k: left for k, one in shares.items() if one.get("col_shares") == own
+                }
+            self._names = [
+                path
+                for path, own in shares.items()
+                if isinstance(heights := own.get("row_shares"), list) and heights[-1:] == [BELOW]
+            ]
+            self.refresh()
+
+    def _size(self) -> ViewerSize | None:  # noqa: B027
+        """Return the size of the viewer; None if unknown."""
+
+    def _align(self, blueprint: Blueprint) -> bool:
+        """Put the lanes beside their names and above the time ruler.
+
+        Returns
+        -------
+        bool
+            Whether the blueprint was changed, as the viewer has another size than before.
+        """
+        size, grid = self._size(), self._grid
+        if size is None or grid is None or size == self._aligned:
+            return False
+        self._aligned = size
+        self._set_shares(blueprint, size)
+        if _view(blueprint) == self._opening:  # else the user looks at another span
+            start, end = self._clock.shown(grid.start), self._clock.shown(grid.end)
+            beyond = _RULER_RIGHT / max(size.width - _RULER_RIGHT - _RULER_LEFT, 1.0)
+            _set_view(blueprint, start, end + round((end - start) * beyond))
+            self._opening = _view(blueprint)
+        return True
+
+    def _set_shares(self, blueprint: Blueprint, size: ViewerSize) -> None:
+        """Set the widths and heights of the names of lanes."""
+        least, most = _PANEL_HEIGHTS
+        viewport = size.height - TOP_BAR - min(max(size.height / 4, least), most)
+        lanes = viewport * self._lanes_share - _TAB_BAR - _AXIS_HEIGHT
+        for path, left in self._columns.items():
+            _container(blueprint, path)["col_shares"] = [left, size.width - left]
+        for path in self._names:
+            heights = _container(blueprint, path)["row_shares"]
+            below = _AXIS_HEIGHT * (len(heights) - 1) / max(lanes, _AXIS_HEIGHT)
+            _container(blueprint, path)["row_shares"] = [*heights[:-1], below]
+
+    def show(self, start: int, end: int, margin: int, *, select: bool = True) -> None:
+        """Show a span with a margin, put the cursor on its start, and select the span.
 
         Parameters
         ----------
         margin : int
             On either side, in nanoseconds.
+        select : bool, optional
+            Whether the span is selected; otherwise nothing is.
 
         Raises
         ------
@@ -254,10 +398,12 @@ class Viewer(ABC):
         start, end = self._clock.shown(start), self._clock.shown(end)
         blueprint = self._blueprint()
         panel = blueprint.setdefault(_PANEL, {}).setdefault("TimePanelBlueprint", {})
-        panel["time_selection"] = {"min": start, "max": end}
+        if select:
+            panel["time_selection"] = {"min": start, "max": end}
+        else:
+            panel.pop("time_selection", None)
         panel["play_state"] = "Paused"
-        bounds = {"start": {"Absolute": start - margin}, "end": {"Absolute": end + margin}}
-        blueprint[f"/{SHARED_AXIS}"] = {"TimeAxis": {"view_range": bounds}}
+        _set_view(blueprint, start - margin, end + margin)
         self._set_blueprint(blueprint)
         self._set_time(start, play=False)
 
@@ -297,6 +443,27 @@ def check_version(version: str) -> None:
         )
 
 
+def _set_view(blueprint: Blueprint, start: int, end: int) -> None:
+    bounds = {"start": {"Absolute": start}, "end": {"Absolute": end}}
+    blueprint[f"/{SHARED_AXIS}"] = {"TimeAxis": {"view_range": bounds}}
+
+
+def _container(blueprint: Blueprint, path: str) -> dict[str, Any]:
+    """Return a container of a blueprint; empty for anything else."""
+    found: dict[str, Any] = blueprint.get(path, {}).get("ContainerBlueprint", {})
+    return found
+
+
+def _view(blueprint: Blueprint) -> Any:
+    """Return the range of the time axes in a blueprint; None without one."""
+    return blueprint.get(f"/{SHARED_AXIS}", {}).get("TimeAxis", {}).get("view_range")
+
+
+def _scalars(blueprint: Blueprint, path: str) -> Any:
+    """Return the vertical range of a view in a blueprint; None without one."""
+    return blueprint.get(path, {}).get(_AXIS, {}).get("range")
+
+
 def _span(selection: Any) -> tuple[int, int] | None:
     if not isinstance(selection, Mapping):
         return None
@@ -306,6 +473,8 @@ def _span(selection: Any) -> tuple[int, int] | None:
     return start, end
 
 
+_LIGHT = 140  # of 255: brightness of the time cursor
+_SHORTEST = 40  # pixels of the time cursor
 _MEMORY = "800MB"  # of a viewer with days of incoming data; then it drops the oldest
 
 
@@ -336,6 +505,15 @@ class WindowViewer(Viewer):
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         return self._client.take_screenshot()
+
+    def _size(self) -> ViewerSize | None:
+        with Image.open(io.BytesIO(self._client.take_screenshot())) as image:
+            light = np.asarray(image.convert("L"))[:-6, : image.width // 2] > _LIGHT
+            # The time cursor is a line from the ruler's left end down to the lower edge.
+            lengths = np.argmin(light[::-1], axis=0)
+            left = int(np.argmax(lengths))
+            scale = left / _RULER_LEFT if lengths[left] > _SHORTEST else 1.0
+            return ViewerSize(image.width / scale, image.height / scale)
 
     def _blueprint(self) -> Blueprint:
         return self._client.get_blueprint().blueprint

@@ -14,7 +14,13 @@ from typing import Any, cast
 
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, free_port
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
-from hearthlog.analyzer.review.viewer.viewer import Blueprint, Viewer, ViewerState
+from hearthlog.analyzer.review.viewer.viewer import (
+    TOP_BAR,
+    Blueprint,
+    Viewer,
+    ViewerSize,
+    ViewerState,
+)
 
 # Messages of Rerun's viewer control (0.41), accepted by the page in a browser; a viewer in a
 # window has Rerun's own client. A field is a head, 8 * number + kind, and a value.
@@ -100,6 +106,7 @@ def _text(content: bytes, field: int) -> str:
 _POLL_SECONDS = 20.0
 _SECONDS = 120.0  # for a request, with the time in which a browser takes the viewer
 _ANSWER_SECONDS = 15.0
+_LARGEST = 20_000.0  # points of a viewer
 _LIMIT = 16 << 20  # maximum bytes of an answer
 _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 
@@ -113,6 +120,7 @@ class Relay:
     texts: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
     requests: queue.SimpleQueue[tuple[int, bytes]] = field(default_factory=queue.SimpleQueue)
     answers: dict[int, "Future[bytes]"] = field(default_factory=dict)
+    size: ViewerSize | None = None  # of the viewer in the page
     _last: int = 0
 
     def ask(self, request: bytes) -> bytes:
@@ -221,6 +229,12 @@ class _Handler(HttpHandler):
         verb, _, rest = name.partition("/")
         if verb in {"answer", "refused"} and rest.isdecimal():
             relay.answer(int(rest[:9]), content if verb == "answer" else None)
+        elif verb == "size":
+            with suppress(ValueError):
+                width, height = (float(part) for part in content[:32].split())
+                if 0 < width < _LARGEST and 0 < height < _LARGEST:
+                    # The page hides the viewer's own top bar.
+                    relay.size = ViewerSize(width, height + TOP_BAR)
         elif verb == "key":
             relay.press(content[:16].decode(errors="replace"))
         self.send(HTTPStatus.OK, b"", "text/plain")
@@ -277,6 +291,9 @@ class _PageViewer(Viewer):
     def close(self) -> None:
         self._server.end()
         super().close()
+
+    def _size(self) -> ViewerSize | None:
+        return self._relay.size
 
     def _blueprint(self) -> Blueprint:
         blueprint: Any = json.loads(_text(self._ask(_BLUEPRINT), 2))
