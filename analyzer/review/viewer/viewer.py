@@ -402,6 +402,7 @@ class Viewer(ABC):
             panel["time_selection"] = {"min": start, "max": end}
         else:
             panel.pop("time_selection", None)
+            panel["loop_mode"] = "Off"  # else the viewer selects something itself
         panel["play_state"] = "Paused"
         _set_view(blueprint, start - margin, end + margin)
         self._set_blueprint(blueprint)
