@@ -23,6 +23,7 @@ from lossy import LossySource
 from spliced import run
 from viewers import Window, browsing, display, free_port, patiently, reviewing, ruler
 
+from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.layers import Coverage
@@ -579,11 +580,11 @@ def test_a_session_ends_when_the_viewer_is_closed(home):
 
 def test_every_key_is_offered_once_with_what_it_does(home):
     for items in ((), items_of(1)):
-        keys = [key for key, _ in Sitting(home, items).session.keys]
+        keys = [one.key for one in Sitting(home, items).session.keys]
         assert len(set(keys)) == len(keys)
     many = Sitting(home)
     many.session.classes = [f"class_{i}" for i in range(60)]
-    keys = [key for key, _ in many.session.keys]
+    keys = [one.key for one in many.session.keys]
     assert len(set(keys)) == len(keys)
 
 
@@ -591,7 +592,11 @@ def test_a_reviewer_reads_the_names_that_the_lanes_have_and_one_key_means_not_su
     item = ReviewItem(START, START + 5 * SECOND, "yelling", "an item")
     sitting = Sitting(home, [item])
     sitting.session.classes = ["silence", "yelling", "unknown", "phone_ring"]
-    classes = [text for key, text in sitting.session.keys if key in "1234u"]
+    named = [one for one in sitting.session.keys if one.key in "1234u"]
+    classes = [one.text for one in named]
+    assert [one.colour for one in named] == [
+        colour(name) for name in ("silence", "yelling", "phone_ring", "unknown")
+    ]
     assert classes == ["quiet", "shouting", "telephone ringing", "not sure"]
     sitting.run("3")
     assert sitting.screen.asked == [(*item[:2], "shouting? 5.0 s")]
@@ -857,9 +862,9 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
     assert review.lines[-1].endswith(f"hearthlog train --home {home}")
 
 
-def shows_ruler(picture):
+def shows_ruler(picture, below=0):
     with contextlib.suppress(AssertionError):
-        return ruler(picture)
+        return ruler(picture, below)
     return None
 
 
@@ -871,18 +876,20 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
         with browsing(address, tmp_path / "browser") as page:
             review.wait_for("drag a span")
             check_privacy(review)
-            x, y = ruler(patiently(page.picture, shows_ruler))
+            patiently(page.text, lambda text: "drag a span" in text)
+            below = page.evaluate("document.getElementById('keys').offsetHeight")
+            x, y = ruler(patiently(page.picture, lambda png: shows_ruler(png, below)), below)
             page.drag(y, x + 200, x + 350)  # a part of the second log
             buttons = "[...document.querySelectorAll('button')]"
-            page.evaluate(f"{buttons}.find(each => each.textContent == '2talking').click()")
+            page.evaluate(f"{buttons}.find(each => each.textContent == 'talking2').click()")
             mark = one_mark(home)
             assert (mark.label, mark.reviewer, mark.corrects) == ("speech", "Ann", "live")
             seconds = (mark.end - mark.start) / SECOND
             assert 25 < seconds < 45  # of 200 in about 870 pixels
             patiently(page.text, lambda text: text.endswith("talking"))
-            page.evaluate(f"{buttons}.find(each => each.textContent == 'zundo').click()")
+            page.evaluate(f"{buttons}.find(each => each.textContent == 'undoz').click()")
             patiently_without_layer(home)
-            page.evaluate(f"{buttons}.find(each => each.textContent == 'qquit').click()")
+            page.evaluate(f"{buttons}.find(each => each.textContent == 'quitq').click()")
             assert review.process.wait(60) == 0
 
 

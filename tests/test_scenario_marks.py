@@ -98,9 +98,9 @@ def test_a_review_marks_the_classes_of_a_scenario_in_a_lane_of_their_own(home):
     assert ("tap_water" in heard.classes, "speech" in heard.classes) == (False, True)
     marking = Marking("mic", timeline.coverage["mic"], "Ann", WATER, segments[WATER], "water")
     screen = Screen()
-    session = ReviewSession(screen, marking, classes, UTC, print, print, print)
+    session = ReviewSession(screen, marking, classes, UTC, print, print, print, print)
     screen.marked = span = START + 2 * SECOND, START + 4 * SECOND
-    key = {text: key for key, text in session.keys}["water tap"]
+    key = {one.text: one.key for one in session.keys}["water tap"]
 
     def press(*keys: str) -> None:
         queue: SimpleQueue[str] = SimpleQueue()

@@ -408,12 +408,12 @@ def browsing(address, folder, size="1100,760", flags=()):
         page.close()
 
 
-def ruler(picture):
+def ruler(picture, below=0):
     """Find the time ruler in a picture: x of its start, where the cursor is, and its y.
 
-    The cursor is a line from the ruler down to the lower edge.
+    The cursor is a line from the ruler down to the lower edge, or so many pixels above it.
     """
-    light = pixels(picture)[:-6].min(axis=2) > 140
+    light = pixels(picture)[: -6 - below].min(axis=2) > 140
     left = light[:, : light.shape[1] // 2]
     lengths = np.argmin(left[::-1], axis=0)  # of the line from the lower edge on
     x = int(np.argmax(lengths))

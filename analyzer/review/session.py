@@ -12,6 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from hearthlog.analyzer.colours import Colour, colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import play_sound
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
@@ -67,6 +68,14 @@ class ReviewItem(NamedTuple):
     label: str
     text: str
     chosen: str = QUEUE
+
+
+class Key(NamedTuple):
+    """A key, its action, and the colour of the class that it names: red, green and blue."""
+
+    key: str
+    text: str
+    colour: Colour | None = None
 
 
 class Screen(Protocol):
@@ -162,9 +171,20 @@ class ReviewSession:
     _plays_until: float = 0.0  # by CLOCK_MONOTONIC
 
     @property
-    def keys(self) -> list[tuple[str, str]]:
-        """Each key and its action."""
-        return [*((key, text) for key, (text, _) in self._actions().items()), ("q", "quit")]
+    def keys(self) -> list[Key]:
+        """All keys."""
+        labels = self._labels()
+        own = [
+            Key(key, text, colour(labels[key]) if key in labels else None)
+            for key, (text, _) in self._actions().items()
+        ]
+        return [*own, Key("q", "quit")]
+
+    def _labels(self) -> dict[str, str]:
+        """Return the class of each key that names one."""
+        classes = [name for name in self.classes if name not in {UNKNOWN, TELEVISION}]
+        named = dict(zip(_CLASS_KEYS, classes, strict=False))
+        return named | {"t": TELEVISION, "u": UNKNOWN}
 
     def _actions(self) -> dict[str, tuple[str, Callable[[], None]]]:
         """Text and function of each key."""
@@ -174,9 +194,7 @@ class ReviewSession:
         else:
             actions["c"] = "correct as labelled", lambda: self._mark(self.marking.confirm)
         actions[_RIGHT] = "or Enter: all else in the span is right", self._rest_is_right
-        classes = [name for name in self.classes if name not in {UNKNOWN, TELEVISION}]
-        labels = dict(zip(_CLASS_KEYS, classes, strict=False)) | {"t": TELEVISION, "u": UNKNOWN}
-        for key, label in labels.items():
+        for key, label in self._labels().items():
             actions[key] = _words(label), partial(self._mark_as, label)
         actions |= {
             "d": ("delete marks", lambda: self._mark(self.marking.delete)),
@@ -237,7 +255,9 @@ class ReviewSession:
         if same in actions:
             actions[same][1]()
         elif key.strip():
-            self.say(f"{key!r} is no key; {', '.join(f'{k} {text}' for k, text in self.keys)}")
+            self.say(
+                f"{key!r} is no key; {', '.join(f'{one.key} {one.text}' for one in self.keys)}"
+            )
 
     def _mark_as(self, label: str) -> None:
         chosen = "" if self._in_minute or not self.items else self.items[self._at].chosen

@@ -2,6 +2,7 @@
 
 import shlex
 import signal
+import sys
 from contextlib import suppress
 from datetime import date, datetime, timedelta
 from pathlib import Path
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.logs.spans import Spans
     from hearthlog.analyzer.review.marking import Marking
     from hearthlog.analyzer.review.review_list import ReviewSpan, SoundFile
-    from hearthlog.analyzer.review.session import ReviewItem
+    from hearthlog.analyzer.review.session import Key, ReviewItem
     from hearthlog.analyzer.review.timeline import Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
@@ -274,11 +275,30 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         if not items and grid.end - grid.start <= MOST_FRAMES:
             look_closely(grid.start, grid.end)
         viewer.write_checked(timeline, class_precision(timeline, find_home_logs(logs)))
-        print(printable(", ".join(f"{key} {text}" for key, text in session.keys)), flush=True)
+        _print_keys(session.keys)
         if session.run(keys):
             _say_next(logs, marking.scenario)
     if not marking.scenario:
         _report_accuracy(logs)
+
+
+def _print_keys(keys: "Sequence[Key]") -> None:
+    """Print the keys: on a terminal in columns, with the colours of their classes."""
+    if not sys.stdout.isatty():
+        print(printable(", ".join(f"{one.key} {one.text}" for one in keys)), flush=True)
+        return
+    from rich.columns import Columns
+    from rich.console import Console
+    from rich.text import Text
+
+    cells = [
+        Text.assemble(
+            (f" {one.key} ", "reverse" if one.colour is None else f"black on rgb{one.colour}"),
+            f" {printable(one.text)}",
+        )
+        for one in keys
+    ]
+    Console(highlight=False).print(Columns(cells, equal=True, column_first=True, padding=(0, 3)))
 
 
 def _say_next(logs: list[Path], scenario: str) -> None:

@@ -22,6 +22,7 @@ from hearthlog.analyzer.review.lanes import (
     reviewed_lane,
     selected_lane,
 )
+from hearthlog.analyzer.review.session import Key
 from hearthlog.analyzer.review.timeline import (
     HomeClock,
     LabelledSpans,
@@ -133,7 +134,7 @@ class Viewer(ABC):
         """Set the time cursor, in nanoseconds of the clock of the home, and let it run."""
 
     def offer(  # noqa: B027 - in a window, the keys are typed in the terminal
-        self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]
+        self, keys: Sequence[Key], press: Callable[[str], None]
     ) -> None:
         """Show buttons in the page of the viewer, if it has one."""
 

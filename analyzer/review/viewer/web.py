@@ -13,6 +13,7 @@ from importlib.resources import files
 from typing import Any, cast
 
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, free_port
+from hearthlog.analyzer.review.session import Key
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.viewer import (
     TOP_BAR,
@@ -115,7 +116,7 @@ _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 class Relay:
     """Queue of requests to a page, with its answers."""
 
-    keys: Sequence[tuple[str, str]] = ()
+    keys: Sequence[Key] = ()
     press: Callable[[str], None] = lambda _: None
     texts: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
     requests: queue.SimpleQueue[tuple[int, bytes]] = field(default_factory=queue.SimpleQueue)
@@ -282,7 +283,7 @@ class _PageViewer(Viewer):
         cursors = _numbers(_message(_message(shown[0], 3), 3), 1) if shown else []
         return ViewerState(_text(state, 6), len(views), errors, cursors[-1] if cursors else None)
 
-    def offer(self, keys: Sequence[tuple[str, str]], press: Callable[[str], None]) -> None:
+    def offer(self, keys: Sequence[Key], press: Callable[[str], None]) -> None:
         self._relay.keys, self._relay.press = keys, press
 
     def say(self, text: str) -> None:
