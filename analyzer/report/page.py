@@ -1,22 +1,26 @@
 """HTML page of a report."""
 
-import base64
 import re
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
 import jinja2
+import numpy as np
 
-from hearthlog.analyzer.activity.daily_metrics import MOST, DayMetrics
+from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
+from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
 from hearthlog.analyzer.colours import colour_on_paper
+from hearthlog.analyzer.logs.spans import without
+from hearthlog.analyzer.report.headline import day_headline, week_headline
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
     ASSESSED_ITEMS,
     Account,
     FigureSection,
     ReportFigure,
+    counted_events,
     event_figure,
     minutes_figure,
     sections,
@@ -25,10 +29,17 @@ from hearthlog.analyzer.report.summary_text import (
     gist_of_day,
     gist_of_week,
     longest_quiet,
-    not_heard,
+    not_recorded,
     not_well,
     percent,
     plain,
+)
+from hearthlog.analyzer.report.timeline import (
+    HourBar,
+    Timeline,
+    heard_names,
+    hour_bars,
+    timeline_of,
 )
 from hearthlog.analyzer.report.wording import (
     clock_text,
@@ -38,36 +49,58 @@ from hearthlog.analyzer.report.wording import (
     short_day,
     times_in_words,
 )
-from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SHOWER, SILENCE, in_words
+from hearthlog.models.classes import (
+    COUGHING,
+    FLUSHING_WATER,
+    SHOWER,
+    SILENCE,
+    UNKNOWN,
+    in_words,
+    ordered,
+)
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import listed
 
 
 class Cell(NamedTuple):
-    """Table cell: a colour before the text, a change after it; `whole` forbids line breaks."""
+    """Table cell.
+
+    Attributes
+    ----------
+    change : str
+        How the figure differs from other days.
+    note : str
+        In small letters below the text.
+    whole : bool
+        Whether line breaks are forbidden.
+    """
 
     text: str
     change: str = ""
     colour: tuple[int, int, int] | None = None
     whole: bool = False
-
-
-class TableRow(NamedTuple):
-    """Table row with a head cell."""
-
-    cells: Sequence[Cell]
-    kind: str = ""
+    note: str = ""
 
 
 class PageTable(NamedTuple):
-    """Table and its CSS class."""
+    """Table and its CSS class; the first cell of a row is its head."""
 
     heads: Sequence[str]
-    rows: Sequence[TableRow]
+    rows: Sequence[Sequence[Cell]]
     kind: str = ""
 
 
-def fill_page(picture: bytes, **parts: Any) -> str:
-    """Fill the template; all text is escaped, and the picture is embedded.
+class Picture(NamedTuple):
+    """Timelines of a day or a week, and the hours of a day."""
+
+    title: str
+    description: str
+    days: Sequence[tuple[str, Timeline]]  # with their names
+    bars: Sequence[HourBar] = ()
+
+
+def fill_page(**parts: Any) -> str:
+    """Fill the template; all text is escaped.
 
     Parameters
     ----------
@@ -82,13 +115,13 @@ def fill_page(picture: bytes, **parts: Any) -> str:
         undefined=jinja2.StrictUndefined,
     )
     template = files("hearthlog.analyzer.report").joinpath("page.html").read_text("utf-8")
-    return environment.from_string(template).render(
-        picture=base64.b64encode(picture).decode(), **parts
-    )
+    return environment.from_string(template).render(**parts)
 
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
+_FEW = 5  # events of which every time is written
+_NOT_COUNTED = "not counted"
 
 
 class PageSection(NamedTuple):
@@ -99,39 +132,44 @@ class PageSection(NamedTuple):
     remarks: Sequence[str] = ()
 
 
-def day_page(account: Account, picture: bytes) -> str:
+def day_page(account: Account) -> str:
     """Return the page of a day."""
     day = account.days[0]
-    names = [name for name in account.classes if name != SILENCE]
+    timeline = timeline_of(day)
+    title = day_in_words(day.day)
+    bars = hour_bars(day, account.earlier if account.comparable else [])
     return _page(
         account,
-        picture,
-        title=day_in_words(day.day),
+        Picture(f"The sounds of {title}", _description(timeline), [("", timeline)], bars),
+        title=title,
+        headline=day_headline(day),
         gist=list(gist_of_day(account, day)),
         overview=[("What was heard", _sounds(account, day))],
-        absent=[name for name in names if not _was_heard(account, name)],
         parts=[_part(account, section, day) for section in sections(account.classes)],
     )
 
 
-def week_page(account: Account, picture: bytes) -> str:
+def week_page(account: Account) -> str:
     """Return the page of a week."""
     first, last = account.days[0].day, account.days[-1].day
     spoken = f"{date_in_words(first)} to {date_in_words(last)}"
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
+    drawn = heard_names(account.days)
+    days = [(short_day(day.day), timeline_of(day, drawn)) for day in account.days]
+    described = " ".join(f"{name}: {_description(each)}" for name, each in days)
     return _page(
         account,
-        picture,
+        Picture(f"The sounds of {spoken}", described, days),
         title=f"Week {first.isocalendar().week}, {spoken}",
+        headline=week_headline(account.days),
         gist=list(gist_of_week(account)),
         overview=[
+            ("How often it was heard", _week(account, list(map(event_figure, names)))),
             (
                 "How long it was heard, as labelled",
                 _week(account, list(map(minutes_figure, names))),
             ),
-            ("How often it was heard", _week(account, list(map(event_figure, names)))),
         ],
-        absent=[name for name in account.classes if name not in (*names, SILENCE)],
         parts=[
             PageSection(section, _week(account, section.figures))
             for section in sections(account.classes)
@@ -139,15 +177,39 @@ def week_page(account: Account, picture: bytes) -> str:
     )
 
 
-def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: Any) -> str:
+def _description(timeline: Timeline) -> str:
+    """Return the text alternative of a timeline."""
+    parts = []
+    for lane in timeline.lanes:
+        apart = f", and {len(lane.apart)} beside a television" if len(lane.apart) else ""
+        if not lane.empty:
+            parts.append(f"{lane.words} {len(lane.counted)}{apart}")
+    zone, spans = timeline.day.zone, without(timeline.day.span, timeline.day.coverage)
+    gaps = [
+        f"{clock_text(start, zone)} to {clock_text(end, zone)}"
+        for start, end in zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
+        if end - start >= HOUR
+    ]
+    text = f"{'; '.join(parts) or 'Nothing was heard'}."
+    return text + (f" Not recorded: {', '.join(gaps)}." if gaps else "")
+
+
+def _page(account: Account, picture: Picture, **parts: Any) -> str:
     days = [day for day in (*account.before, *account.days) if day.coverage.length]
+    names = [name for name in account.classes if name not in {SILENCE, UNKNOWN}]
+    absent = [name for name in names if _is_known(account, name) and not _was_heard(account, name)]
+    untold = [name for name in names if not _is_known(account, name)]
+    apart = [name for name in SET_APART if name in account.classes]
     return fill_page(
-        picture,
         account=account,
+        picture=picture,
         week=len(account.days) > 1,
         microphones=listed([plain(name) for name in account.microphones], "and"),
-        alerts=[*not_heard(account), *not_well(account)],
-        absent=listed([in_words(name).lower() for name in absent], "and"),
+        alerts=[*not_recorded(account), *not_well(account)],
+        absent=_listed(absent),
+        untold=_listed(untold),
+        unknown=_listed(account.unknown),
+        apart=_listed(apart),
         television=_television(account),
         scenarios=[(plain(name), _scenario(account, name)) for name in account.scenarios],
         days_before=BASELINE_DAYS,
@@ -156,6 +218,10 @@ def _page(account: Account, picture: bytes, *, absent: Sequence[str], **parts: A
         interrai_heard=_heard(days),
         **parts,
     )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return listed([in_words(name).lower() for name in names], "and")
 
 
 def _heard(days: Sequence[DayMetrics]) -> str:
@@ -169,28 +235,26 @@ def _television(account: Account) -> str:
     amounts = {
         name: sum(day.beside_television(name) for day in account.days) for name in account.classes
     }
-    several = (f"{several_in_words(name).lower()} {n}" for name, n in amounts.items() if n)
-    return listed(list(several), "and")
+    return listed([f"{in_words(name).lower()} {n}" for name, n in amounts.items() if n], "and")
 
 
 def _scenario(account: Account, name: str) -> PageTable:
     """Return the minutes of each class of a scenario, a row per class, a column per day."""
     days = account.scenarios[name]
-    classes = sorted({label for day in days for label in day})
+    classes = ordered(sorted({label for day in days for label in day}))
     rows = [
-        TableRow(
-            [
-                Cell(in_words(label), colour=colour_on_paper(label)),
-                *(
-                    Cell(_scenario_text(found.get(label, 0.0), day), whole=True)
-                    for found, day in zip(days, account.days, strict=True)
-                ),
-            ]
-        )
+        [
+            Cell(in_words(label), colour=colour_on_paper(label)),
+            *(
+                Cell(_scenario_text(found.get(label, 0.0), day), whole=True)
+                for found, day in zip(days, account.days, strict=True)
+            ),
+        ]
         for label in classes
     ]
-    dates = [short_day(day.day) for day in account.days]
-    return PageTable(["Sound", *(dates if len(days) > 1 else ["How long, as labelled"])], rows)
+    if len(days) == 1:
+        return PageTable(["Sound", "How long, as labelled"], rows)
+    return PageTable(["Sound", *_day_heads(account)], rows, "wide")
 
 
 def _scenario_text(minutes: float, day: DayMetrics) -> str:
@@ -199,50 +263,74 @@ def _scenario_text(minutes: float, day: DayMetrics) -> str:
 
 
 def _sounds(account: Account, day: DayMetrics) -> PageTable:
-    """Return minutes and events of each class with sound."""
-    usually = ["Usually"] * account.comparable
+    """Return how often, when and how long each class was heard."""
     often = "How often" if account.checked else "How often, as labelled"
-    how = ["How long, as labelled", *usually, often, *usually]
-    heads = ["Sound", *how, *["Right here"] * account.checked]
-    names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
+    heads = ["Sound", often, "When", "How long, as labelled"]
     rows = []
-    for name in [*names, *[SILENCE] * (SILENCE in account.classes)]:
-        cells = [Cell(in_words(name), colour=colour_on_paper(name))]
-        cells += _cells(account, minutes_figure(name), day)
+    for name in account.classes:
+        figure, lasting = event_figure(name), minutes_figure(name)
+        value, apart = figure.value(day), day.beside_television(name)
         if name == SILENCE:
-            cells += [Cell("")] * (1 + account.comparable)
+            cells = [Cell(""), Cell(""), _cell(account, lasting, day)]
+        elif _was_heard(account, name) and (value is not None or apart):
+            cell = _cell(account, figure, day)
+            notes = [f"{_NOT_COUNTED}: {apart}"] * bool(apart) + [cell.note] * bool(cell.note)
+            starts = counted_events(day, name, day.span)
+            cells = [
+                cell._replace(note=", ".join(notes)),
+                Cell(_times(day, starts)),
+                _cell(account, lasting, day),
+            ]
         else:
-            cells += _cells(account, event_figure(name), day)
-        rows.append(TableRow(cells + [Cell(account.rightness(name))] * account.checked))
-    return PageTable(heads, rows)
+            continue
+        right = [Cell(account.rightness(name))] * account.checked
+        rows.append([Cell(in_words(name), colour=colour_on_paper(name)), *cells, *right])
+    return PageTable([*heads, *["Right here"] * account.checked], rows, "sounds")
+
+
+def _times(day: DayMetrics, starts: Int64) -> str:
+    """Return the times of a few events, else the first and the last."""
+    if len(starts) <= _FEW:
+        return times_in_words(starts, day.zone)
+    return " to ".join(clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max()))
 
 
 def _was_heard(account: Account, name: str) -> bool:
     """Return whether a class has a value, now or in its usual range."""
     baseline = account.baseline(event_figure(name))
     values = [day.count(name) for day in account.days]
-    missing = all(value is None for value in values)
     apart = any(day.beside_television(name) for day in account.days)
     now = any(value and value.labelled for value in values)
-    return missing or apart or now or bool(baseline and baseline[0].highest)
+    return apart or now or bool(baseline and baseline[0].highest)
 
 
-def _cells(account: Account, figure: ReportFigure, day: DayMetrics) -> list[Cell]:
-    """Return a figure, and its usual range if there is a baseline."""
-    cells = [Cell(_text(figure.value(day)), whole=True)]
-    if account.comparable:
-        cells.append(Cell(account.usually(figure), account.change(figure, day)))
-    return cells
+def _is_known(account: Account, name: str) -> bool:
+    """Whether enough was recorded on some of the days to tell how often a class was heard."""
+    return any(day.count(name) is not None or day.beside_television(name) for day in account.days)
+
+
+def _cell(account: Account, figure: ReportFigure, day: DayMetrics) -> Cell:
+    """Return a figure, how it differs, and its usual range if there is a baseline."""
+    value = figure.value(day)
+    if not account.comparable:
+        return Cell(_text(value), whole=True)
+    usual = account.usually(figure)
+    note = f"usually {usual}" if usual else ""
+    return Cell(_text(value), account.change(figure, day), whole=True, note=note)
 
 
 def _text(value: Value | None) -> str:
-    return "not known" if value is None else value.text
+    return _NOTHING if value is None else value.text
 
 
 def _part(account: Account, section: FigureSection, day: DayMetrics) -> PageSection:
-    heads = ["", "This day", *["Usually"] * account.comparable]
-    rows = [TableRow([Cell(f.title), *_cells(account, f, day)]) for f in section.figures]
-    return PageSection(section, PageTable(heads, rows), list(_remarks(section, day)))
+    known = [figure for figure in section.figures if figure.value(day) is not None]
+    rows = [[Cell(figure.title), _cell(account, figure, day)] for figure in known]
+    remarks = [*_remarks(section, day)]
+    if len(known) < len(section.figures):
+        more = "more" if known else "anything"
+        remarks.append(f"Too little was recorded to tell {more}.")
+    return PageSection(section, PageTable(["", "This day"], rows), remarks)
 
 
 def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
@@ -261,34 +349,49 @@ def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
 
 
 def _coughing(day: DayMetrics) -> str:
-    """Return the hours of the night with labelled coughing."""
+    """Return when coughing was labelled in the night, hour by hour if it was often."""
     starts = day.night_events(COUGHING)
-    if not len(starts) or not day.night_hours:
+    if not len(starts):
         return ""
-    hours = [clock_text(time, day.zone)[:2] for time in starts.tolist()]
-    each = [f"{hours.count(hour)} from {hour}:00" for hour in dict.fromkeys(hours)]
-    rate = len(starts) / day.night_hours
-    return f"Coughing as labelled: {', '.join(each)}. {rate:.1f} an hour."
+    if len(starts) <= _FEW:
+        return f"Coughing in the night, as labelled, at {times_in_words(starts, day.zone)}."
+    hours = [clock_text(time, day.zone)[:2] for time in np.sort(starts).tolist()]
+    each = [f"{hours.count(hour)} after {hour}:00" for hour in dict.fromkeys(hours)]
+    return f"Bouts of coughing in the night, as labelled, hour by hour: {', '.join(each)}."
 
 
 def _week(account: Account, figures: Sequence[ReportFigure]) -> PageTable:
-    """Return the figures of seven days, their total, and the usual daily value."""
-    rows = []
-    for day in account.days:
-        share = _share(figures, day)
-        share_text = percent(share) if share else "not heard"
-        values = [figure.value(day) if day.coverage.length else None for figure in figures]
-        rows.append(_row(short_day(day.day), share_text, *map(_short, values)))
-    totals = (_total(account.days, figure) for figure in figures)
-    rows.append(_row("All days", "", *totals, kind="sum"))
-    if account.comparable:
-        usually = (_dense(account.usually(figure)) for figure in figures)
-        rows.append(_row("Usual day", "", *usually, kind="usual"))
-    return PageTable(["Day", "Heard", *(figure.short for figure in figures)], rows, "wide")
+    """Return the figures of seven days, a column for each, and their total."""
+    shares = [_share(figures, day) for day in account.days]
+    recorded = [Cell(percent(share) if share else _NOTHING) for share in shares]
+    rows = [[Cell("Recorded"), *recorded, Cell("")]]
+    for figure in figures:
+        values = [figure.value(day) if day.coverage.length else None for day in account.days]
+        apart = [day.beside_television(figure.name) * figure.counts for day in account.days]
+        usual = _dense(account.usually(figure)) if account.comparable else ""
+        total = sum(apart)
+        rows.append(
+            [
+                Cell(
+                    figure.short,
+                    colour=colour_on_paper(figure.name) if figure.name else None,
+                    note=f"usually {usual} a day" if usual else "",
+                ),
+                *map(Cell, map(_short, values)),
+                Cell(
+                    _total(account.days, figure), note=f"{_NOT_COUNTED}: {total}" if total else ""
+                ),
+            ]
+        )
+    return PageTable(["", *_day_heads(account), "All"], rows, "wide")
 
 
-def _row(*texts: str, kind: str = "") -> TableRow:
-    return TableRow([Cell(text) for text in texts], kind)
+def _day_heads(account: Account) -> list[str]:
+    return [short_day(day.day).rpartition(" ")[0] for day in account.days]
+
+
+def _row(*texts: str) -> list[Cell]:
+    return [Cell(text) for text in texts]
 
 
 def _share(figures: Sequence[ReportFigure], day: DayMetrics) -> float:
@@ -297,8 +400,10 @@ def _share(figures: Sequence[ReportFigure], day: DayMetrics) -> float:
 
 
 def _short(value: Value | None) -> str:
-    """Return a figure in short form, with a dash for `to`."""
-    return _NOTHING if value is None else _dense(value.text)
+    """Return a figure in short form, with a dash for `to`, and without what was labelled."""
+    if value is None:
+        return _NOTHING
+    return _dense(re.sub(r" \(\d+ labelled\)", "", value.text))
 
 
 def _dense(text: str) -> str:
@@ -308,7 +413,8 @@ def _dense(text: str) -> str:
 
 def _total(days: Sequence[DayMetrics], figure: ReportFigure) -> str:
     values = [figure.value(day) for day in days if day.coverage.length]
-    return _short(_sum(values)) if figure.sums else ""
+    total = _sum(values) if figure.sums else None
+    return _dense(total.text) if total is not None else _NOTHING * figure.sums
 
 
 def _sum(values: Sequence[Value | None]) -> Count | Duration | None:
@@ -323,17 +429,19 @@ def _sum(values: Sequence[Value | None]) -> Count | Duration | None:
 
 
 def _interrai(account: Account, days: Sequence[DayMetrics]) -> PageTable:
-    """Return the interRAI items that sound can inform."""
+    """Return the interRAI items that sound can inform, as far as they are known."""
     rows = []
     for item in ASSESSED_ITEMS:
-        audible = not item.needs or item.needs in account.classes
         number = _sum([item.value(day) for day in days])
-        text = _text(number) if audible else "this model does not know the sound"
-        if account.checked and number is not None and not _is_checked(number):
+        if number is None or item.needs not in ("", *account.classes):
+            continue
+        text = _text(number)
+        if account.checked and not _is_checked(number):
             text += ", as labelled"
         rows.append(_row(item.topic, item.heard, text, item.limits))
     count = "Count" if account.checked else "Count, as labelled"
-    return PageTable(["The form asks about", "Heard here", count, "What sound cannot tell"], rows)
+    heads = ["The form asks about", "Heard here", count, "What sound cannot tell"]
+    return PageTable(heads, rows, "stack")
 
 
 def _is_checked(value: Count | Duration) -> bool:

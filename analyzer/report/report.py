@@ -1,13 +1,20 @@
 """Report of a home: from logs to a page and a picture."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.activity.checked_minutes import read_checked_minutes
-from hearthlog.analyzer.activity.daily_metrics import HOUR, day_of, home_sound, whole_home
+from hearthlog.analyzer.activity.daily_metrics import (
+    HOUR,
+    DayMetrics,
+    day_of,
+    home_sound,
+    whole_home,
+)
 from hearthlog.analyzer.activity.day_anomaly import Routines
 from hearthlog.analyzer.activity.day_profile import Profiles
 from hearthlog.analyzer.activity.home_data import (
@@ -25,12 +32,14 @@ from hearthlog.analyzer.logs.spans import common, joined, one
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import Account
-from hearthlog.analyzer.report.timeline_plot import save_day, save_week
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.schemas.new_files import check_new, new_file
 
 WEEK = 7
+
+
+Draw = Callable[[Path, Sequence[DayMetrics], Sequence[DayMetrics]], None]
 
 
 class Period(NamedTuple):
@@ -46,25 +55,30 @@ class WrittenReport:
     """A written page, and the read errors."""
 
     page: Path
-    picture: Path
+    picture: Path | None
     losses: Sequence[str]
 
 
-def make_report(
+def make_report(  # noqa: PLR0913
     logs: HomeLogs,
     period: Period,
     page: Path,
     labelling: str = LIVE,
     progress: Progress = ignore_progress,
+    *,
+    draw: Draw | None = None,
 ) -> WrittenReport:
     """Write the report of a day or a week.
 
     Parameters
     ----------
     page : Path
-        The HTML file; the picture has the same path with suffix `.png`. Neither may exist.
+        The HTML file; a picture has the same path with suffix `.png`. Neither may exist.
     progress : callable, optional
         Receives the share of the logs read, 0 to 1.
+    draw : callable, optional
+        Writes the picture, from the days of the report and those that they are compared with:
+        `save_timelines`, which needs matplotlib. By default there is only the page.
 
     Raises
     ------
@@ -74,9 +88,10 @@ def make_report(
         If segments are invalid, or a file exists or cannot be written.
     """
     picture = page.with_suffix(".png")
-    if picture == page:
+    if draw is not None and picture == page:
         raise LogError(f"{page}: that is the name of the picture; name the page *.html")
-    for path in (page, picture):
+    paths = [page] if draw is None else [page, picture]
+    for path in paths:
         check_new(path)
     first, count, zone = period
     days = [first + timedelta(days=number) for number in range(count)]
@@ -110,16 +125,15 @@ def make_report(
         scenarios=_scenarios(logs, days, zone, data) if labelling == LIVE else {},
         unread=len(data.losses),
         networks=network_changes(logs.between(since, close[1]), zone),
+        hidden=data.never_told,
     )
-    with new_file(page) as html, new_file(picture) as png:
-        if count == 1:
-            save_day(png, account.days[0], account.earlier)
-            text = day_page(account, png.read_bytes())
-        else:
-            save_week(png, account.days)
-            text = week_page(account, png.read_bytes())
+    text = day_page(account) if count == 1 else week_page(account)
+    with ExitStack() as files:
+        html, *png = [files.enter_context(new_file(path)) for path in paths]
         html.write_text(text, "utf-8")
-    return WrittenReport(page, picture, data.losses)
+        if draw is not None:
+            draw(png[0], account.days, account.earlier)
+    return WrittenReport(page, None if draw is None else picture, data.losses)
 
 
 def _model(logs: HomeLogs, close: tuple[int, int]) -> str:

@@ -22,6 +22,7 @@ from hearthlog.analyzer.activity.values import (
     usual_range,
 )
 from hearthlog.analyzer.logs.recorder_info import Trouble
+from hearthlog.analyzer.logs.spans import Spans
 from hearthlog.analyzer.report.wording import several_in_words
 from hearthlog.models.classes import (
     COUGHING,
@@ -35,7 +36,9 @@ from hearthlog.models.classes import (
     UNKNOWN,
     YELLING,
     in_words,
+    ordered,
 )
+from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import listed
 
 BATHROOM = (FLUSHING_WATER, SHOWER, TAP_WATER)
@@ -49,26 +52,30 @@ class ReportFigure(NamedTuple):
     value: Callable[[DayMetrics], Value | None]  # None if unknown
     name: str = ""  # class name, for a figure of one class
     sums: bool = True  # whether a total over days is meaningful
+    counts: bool = False  # whether these are the events of a day
 
 
 class FigureSection(NamedTuple):
-    """Related figures; `missing` explains an empty section."""
+    """Related figures."""
 
     title: str
     figures: Sequence[ReportFigure]
     note: str
-    missing: str = ""
+
+
+def counted_events(day: DayMetrics, name: str, span: Spans) -> Int64:
+    """Return the event starts of a class in a span that count, in nanoseconds of UTC."""
+    return day.home.minutes.counted(name, day.home.events_in(name, span))
 
 
 def sections(classes: Sequence[str]) -> list[FigureSection]:
     """Return the tables for the classes of a home's model."""
-    return [
-        FigureSection(
-            "Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE, _missing(classes, BATHROOM)
-        ),
+    found = [
+        FigureSection("Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE),
         FigureSection("Night", list(_night(classes)), _NIGHT_NOTE),
         FigureSection("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
     ]
+    return [section for section in found if section.figures]
 
 
 def minutes_figure(name: str) -> ReportFigure:
@@ -80,7 +87,7 @@ def minutes_figure(name: str) -> ReportFigure:
 def event_figure(name: str, title: str = "") -> ReportFigure:
     """Return the figure of a class's event count."""
     title = title or in_words(name)
-    return ReportFigure(title, title, lambda day: day.count(name), name)
+    return ReportFigure(title, title, lambda day: day.count(name), name, counts=True)
 
 
 def _at_night(name: str, title: str, short: str) -> ReportFigure:
@@ -113,8 +120,8 @@ def _night(classes: Sequence[str]) -> Iterator[ReportFigure]:
 
 _ACTIVITY = (
     ReportFigure("Time with sound", "Time with sound", lambda day: day.sound),
-    ReportFigure("First lively time", "First lively time", lambda day: day.first, sums=False),
-    ReportFigure("Last lively time", "Last lively time", lambda day: day.last, sums=False),
+    ReportFigure("Sound from", "Sound from", lambda day: day.first, sums=False),
+    ReportFigure("Sound until", "Sound until", lambda day: day.last, sums=False),
     ReportFigure(
         "Longest quiet stretch, 07:00 to 22:00", "Longest quiet", lambda day: day.quiet, sums=False
     ),
@@ -125,16 +132,9 @@ _NIGHT_NOTE = (
     "half a minute of sound, and ten quiet minutes before the next one."
 )
 _ACTIVITY_NOTE = (
-    "Lively: ten minutes with at least one minute of sound, from 04:00 on. Quiet can mean rest, "
-    "reading, a nap, or nobody at home."
+    "“Sound from” and “until” are the first and the last ten minutes with at least one minute of "
+    "sound, from 04:00 on. Quiet can mean rest, reading, a nap, or nobody at home."
 )
-
-
-def _missing(classes: Sequence[str], needed: Sequence[str]) -> str:
-    if any(name in classes for name in needed):
-        return ""
-    names = listed([in_words(name).lower() for name in needed], "and")
-    return f"Cannot be told: the model of this home does not know these sounds ({names})."
 
 
 _CHANGES = {
@@ -168,6 +168,7 @@ class Account:
     scenarios: ScenarioMinutes  # of `days`; live labels only
     unread: int  # number of logs that could not be read completely
     networks: Sequence[str]  # network changes in these weeks, one line per microphone
+    hidden: frozenset[str]  # classes that nobody is told of
 
     @property
     def home(self) -> str:
@@ -178,6 +179,12 @@ class Account:
     def classes(self) -> list[str]:
         """Classes that can occur."""
         return self.days[0].home.classes
+
+    @property
+    def unknown(self) -> list[str]:
+        """Classes that a report is asked about, and the model of the home does not know."""
+        wanted = [*BATHROOM, *(item.needs for item in ASSESSED_ITEMS if item.needs)]
+        return ordered(set(wanted) - {*self.classes, *self.hidden})
 
     @property
     def checked(self) -> bool:

@@ -9,13 +9,13 @@ from hearthlog.analyzer.activity.day_anomaly import FEWEST
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import joined, without
+from hearthlog.analyzer.logs.spans import common, joined, without
+from hearthlog.analyzer.report.headline import amount
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.analyzer.report.wording import (
     WEEK,
     clock_text,
     judgement_text,
-    several_in_words,
     short_day,
     too_few_text,
 )
@@ -24,26 +24,30 @@ from hearthlog.schemas.errors import listed
 
 _MOST = 6  # kinds of gaps or troubles
 _MINUTE = HOUR // 60
+_PAUSE = 20 * _MINUTE  # shorter pauses of a television are not told
+_TIMES = 3
+_HALF = 0.5  # hours
 
 
 def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
     """Summarise a day in a few sentences, compared with earlier days."""
     minutes = Duration(day.coverage.length / _MINUTE).text
-    yield f"Heard: {minutes} of the day ({percent(day.share)}). {_loudest(day)}".strip()
-    yield _changes(account, day)
+    yield f"Recorded: {minutes} of the day ({percent(day.share)}). {_loudest(day)}".strip()
+    yield _television(day)
+    if account.comparable:
+        yield _changes(account, day)
     if day.night_hours:
         yield _night(day)
     if day.first is not None and day.last is not None:
-        yield f"Active from {day.first.text} to {day.last.text}. {longest_quiet(day)}".strip()
+        yield f"There was sound on and off from {day.first.text} to {day.last.text}."
 
 
 def gist_of_week(account: Account) -> Iterator[str]:
     """Summarise a week in a few sentences, compared with earlier days."""
     days = [day for day in account.days if day.coverage.length]
     share = sum(day.coverage.length for day in days) / sum(day.span.length for day in account.days)
-    yield f"Heard: {len(days)} of {len(account.days)} days, {percent(share)} of the time."
+    yield f"Recorded: {len(days)} of {len(account.days)} days, {percent(share)} of the time."
     if not account.comparable:
-        yield account.too_few
         return
     if max(account.beside.values()) < FEWEST:
         yield too_few_text(max(account.beside.values()))
@@ -56,7 +60,7 @@ def gist_of_week(account: Account) -> Iterator[str]:
         yield f"{short_day(day)}: {judgement_text(judged)}"
 
 
-def not_heard(account: Account) -> Iterator[str]:
+def not_recorded(account: Account) -> Iterator[str]:
     """Yield sentences on missing coverage and its reasons.
 
     Yields
@@ -68,11 +72,12 @@ def not_heard(account: Account) -> Iterator[str]:
     missing = length - sum(day.coverage.length for day in account.days)
     if missing >= _MINUTE:
         text = Duration(missing / _MINUTE).text
-        yield f"Not heard: {text} ({percent(missing / length)}). The report knows nothing of it."
+        share = percent(missing / length)
+        yield f"Not recorded: {text} ({share}). The report knows nothing of that time."
     for microphone, hours in account.unheard.items():
         if hours * HOUR > missing + _MINUTE:  # another microphone covers this time
             text = Duration(hours * 60).text
-            yield f"The microphone {plain(microphone)} heard nothing for {text}."
+            yield f"The microphone {plain(microphone)} did not record for {text}."
     if (unsaid := _unexplained(account)) >= _MINUTE:
         text = Duration(unsaid / _MINUTE).text
         yield f"Nothing was recorded for {text}: the recorder was off, or its logs are not here."
@@ -108,7 +113,7 @@ def longest_quiet(day: DayMetrics) -> str:
     if day.quiet is None or day.quiet.minutes < 1:
         return ""
     start, end = (clock_text(int(edge[0]), day.zone) for edge in quiet)
-    return f"Longest quiet stretch by day: {day.quiet.text}, {start} to {end}."
+    return f"The longest quiet stretch by day lasted from {start} to {end}."
 
 
 def percent(share: float) -> str:
@@ -134,15 +139,30 @@ def _loudest(day: DayMetrics) -> str:
     return f"Most of the sound, as labelled: {sounds}." if most else quiet
 
 
+def _television(day: DayMetrics) -> str:
+    """Return when something like a television sounded."""
+    minutes = day.home.minutes
+    starts = minutes.starts[minutes.television]
+    spans = common(joined(starts, starts + _MINUTE, _PAUSE), day.span)
+    if not len(spans.starts):
+        return ""
+    longest = np.sort(np.argsort(spans.starts - spans.ends, kind="stable")[:_TIMES])
+    times = [
+        f"{clock_text(int(spans.starts[row]), day.zone)} to "
+        f"{clock_text(int(spans.ends[row]), day.zone)}"
+        for row in longest.tolist()
+    ]
+    more = "at other times, too, " if len(spans.starts) > _TIMES else ""
+    return f"Something like a television, a radio or company sounded {more}{listed(times, 'and')}."
+
+
 def _changes(account: Account, day: DayMetrics) -> str:
-    if not account.comparable:
-        return account.too_few
     judged = account.judged[day.day]
     if judged is not None:
         return judgement_text(judged)
     if account.beside[day.day] < FEWEST:
         return too_few_text(account.beside[day.day])
-    return "Too little was heard to compare it with other days."
+    return "Too little was recorded to compare it with other days."
 
 
 def _night(day: DayMetrics) -> str:
@@ -150,12 +170,16 @@ def _night(day: DayMetrics) -> str:
     for name in (FLUSHING_WATER, COUGHING):
         count = day.night_count(name)
         if count is not None:
-            parts.append(f"{several_in_words(name).lower()} {count.text}")
+            parts.append(amount(name, count))
     if day.night_sound is not None:
         parts.append(f"{day.night_sound.text} of sound in all")
-    parts = parts or ["nothing can be told of it"]
-    partly = "" if day.night_hours > 8.5 else f" Only {day.night_hours:.1f} hours of it were heard."
-    return f"Night before, 22:00 to 07:00: {'; '.join(parts)}.{partly}"
+    if not parts:
+        return "Too little of the night was recorded to tell anything of it."
+    hours = day.night.length / HOUR
+    partly = ""
+    if day.night_hours < hours - _HALF:
+        partly = f" Only {day.night_hours:.1f} of its {hours:.0f} hours were recorded."
+    return f"In the night, 22:00 to 07:00, as labelled: {', '.join(parts)}.{partly}"
 
 
 def _unexplained(account: Account) -> int:

@@ -49,6 +49,22 @@ def short_day(day: date) -> str:
     return f"{_WEEKDAYS[day.weekday()][:3]} {day.day} {_MONTHS[day.month - 1][:3]}"
 
 
+def weekday(day: date) -> str:
+    """Return the name of a day: `Sunday`."""
+    return _WEEKDAYS[day.weekday()]
+
+
+def number_in_words(number: int) -> str:
+    """Return a number up to twelve as a word."""
+    return _NUMBERS[number] if number < len(_NUMBERS) else f"{number}"
+
+
+_NUMBERS = (
+    *("no", "one", "two", "three", "four", "five", "six"),
+    *("seven", "eight", "nine", "ten", "eleven", "twelve"),
+)
+
+
 def clock_text(nanoseconds: int, zone: tzinfo) -> str:
     """Format the local time of day of a time in nanoseconds of UTC: `07:05`."""
     return f"{local_time(nanoseconds, zone):%H:%M}"

@@ -35,12 +35,18 @@ def report(
             "picture is written next to it.",
         ),
     ] = None,
+    picture: Annotated[
+        bool,
+        typer.Option(
+            help="Also write the picture of the page as PNG; the page contains it anyway."
+        ),
+    ] = True,
     labels: Annotated[
         str, typer.Option(help="Labelling: live, or the model of a relabel layer.")
     ] = "live",
     timezone: Timezone = None,
 ) -> None:
-    """Write a page and a picture of a day or a week, for a carer.
+    """Write a page about a day or a week, for a carer, and its picture.
 
     Exit status 3: a log is damaged or unfinished; the page shows its time as not recorded.
     """
@@ -50,7 +56,7 @@ def report(
         wrong_use(f"--output {output}: a page is named *.html")
     from hearthlog.analyzer.extras import require
 
-    require("jinja2", "matplotlib")
+    require("jinja2", *["matplotlib"] * picture)
     if week is not None:
         first: date | None = read_date("--week", week)
         assert first is not None
@@ -61,6 +67,11 @@ def report(
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.report.report import WEEK, Period, make_report
 
+    draw = None
+    if picture:
+        from hearthlog.analyzer.report.timeline_plot import save_timelines
+
+        draw = save_timelines
     home_logs = find_home_logs(logs)
     zone = home_zone(timezone, home_logs.records())
     if first is None:
@@ -68,9 +79,11 @@ def report(
     count = 1 if week is None else WEEK
     page = output or Path(_name(home_logs, first, count))
     with share_done("reading the labels") as progress:
-        result = make_report(home_logs, Period(first, count, zone), page, labels, progress)
+        period = Period(first, count, zone)
+        result = make_report(home_logs, period, page, labels, progress, draw=draw)
     print(result.page)
-    print(result.picture)
+    if result.picture is not None:
+        print(result.picture)
     end_with_warnings(result.losses)
 
 

@@ -1,0 +1,156 @@
+"""Headline of a report: what a day or a week was like, in two or three short sentences."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
+from hearthlog.analyzer.activity.values import Count, whole
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
+from hearthlog.analyzer.logs.spans import common, one
+from hearthlog.analyzer.report.report_data import counted_events
+from hearthlog.analyzer.report.wording import (
+    clock_text,
+    number_in_words,
+    several_in_words,
+    short_day,
+    times_in_words,
+    weekday,
+)
+from hearthlog.models.classes import COUGHING, CRYING, YELLING, in_words
+from hearthlog.schemas.arrays import Bool
+from hearthlog.schemas.errors import listed
+
+LIVELY_MINUTES = 5  # minutes with sound of a lively hour
+QUIET_HOURS = 6  # most lively hours of a quiet day
+_RUNS = 3  # most times of day that are named
+_TIMES = 3
+_WORRYING = COUGHING, CRYING, YELLING
+_MISSING_HOURS = 1.0  # fewer hours without a record are not in the headline
+_ONE_MORE = 2
+
+
+def day_headline(day: DayMetrics) -> str:
+    """Return the headline of a day: whether it was quiet, coughing, crying and shouting.
+
+    A day is quiet if three quarters of it, and of the time from 07:00 to 22:00, were recorded,
+    and if at most six of its hours have five minutes of sound or more.
+    """
+    return " ".join([_day(day), *_sounds(day)])
+
+
+def week_headline(days: Sequence[DayMetrics]) -> str:
+    """Return the headline of a week: its quiet days; coughing, crying and shouting."""
+    known = [day for day in days if day.coverage.length]
+    whole_days = [day for day in known if _is_known(day)]
+    quiet = sum(is_quiet(day) for day in whole_days)
+    parts = []
+    if len(whole_days) < len(days):
+        number = number_in_words(len(whole_days)) if whole_days else "none"
+        parts.append(f"{number.capitalize()} of {len(days)} days could be judged.")
+    if whole_days:
+        of = f"of {'them' if parts else f'{number_in_words(len(days))} days'}"
+        all_of = "All" if quiet == len(whole_days) and quiet else number_in_words(quiet)
+        was = "was" if quiet == 1 else "were"
+        parts.append(f"{all_of.capitalize()} {of} {was} quiet.")
+    for name in _WORRYING:
+        counts = [(count, day) for day in known if (count := day.count(name)) and count.labelled]
+        if counts:
+            total = sum((count for count, _ in counts), Count())
+            text = f"{amount(name, total)} on {number_in_words(len(counts))} of {len(days)} days"
+            most, day = max(counts, key=lambda pair: pair[0].labelled)
+            if len(counts) > 1 and most.labelled > total.labelled / len(days):
+                text += f", most on {short_day(day.day)} ({most.labelled})"
+            parts.append(f"{_capital(text)}.")
+    return " ".join(parts)
+
+
+def is_quiet(day: DayMetrics) -> bool:
+    """Whether a day was quiet; false if too little of it was recorded."""
+    return _is_known(day) and int(_lively(day).sum()) <= QUIET_HOURS
+
+
+def amount(name: str, count: Count, *, named: bool = True) -> str:
+    """Return a number of events in words: `two bouts of coughing`, `crying once`.
+
+    Parameters
+    ----------
+    named : bool, optional
+        Whether to name the class; else `two`, `once`.
+    """
+    several, number = several_in_words(name).lower(), number_in_words(count.labelled)
+    if count.range is not None and count.range != (count.labelled, count.labelled):
+        low, high = count.range
+        noun = f" {several}" if named else ""
+        return f"{low} to {high}{noun} ({count.labelled} labelled)"
+    if several.startswith("times of "):
+        often = _REPEATED.get(count.labelled, f"{number} times")
+        return f"{in_words(name).lower()} {often}" if named else often
+    if count.labelled == 1:
+        several = several.replace("bouts", "bout", 1)
+    return f"{number} {several}" if named else number
+
+
+_REPEATED = {1: "once", 2: "twice"}
+
+
+def _day(day: DayMetrics) -> str:
+    """Return whether a day was quiet, and how much of it is known."""
+    name = weekday(day.day)
+    hours = day.coverage.length / HOUR
+    whole_hours = whole(day.span.length / HOUR)
+    if not _is_known(day):
+        number = "Less than one" if hours < 1 else f"Only {int(hours)}"
+        were = "was" if hours < _ONE_MORE else "were"
+        return f"{number} of the {whole_hours} hours of {name} {were} recorded."
+    lively = _lively(day)
+    partly = ""
+    if day.span.length / HOUR - hours >= _MISSING_HOURS:
+        partly = f", as far as it was recorded ({int(hours)} of {whole_hours} hours)"
+    if not is_quiet(day):
+        return f"{name} had sound in {lively.sum()} of {whole_hours} hours{partly}."
+    if not lively.any():
+        return f"{name} was quiet{partly}."
+    runs = _runs(day, lively)
+    but = (
+        listed(runs, "and") if len(runs) <= _RUNS else f"{number_in_words(int(lively.sum()))} hours"
+    )
+    return f"{name} was quiet but for {but}{partly}."
+
+
+def _is_known(day: DayMetrics) -> bool:
+    """Whether three quarters of the day, and of its waking hours, were recorded."""
+    waking = one(*(at_hour(day.day, hour, day.zone) for hour in (MORNING, EVENING)))
+    return min(day.share, common(day.coverage, waking).length / waking.length) >= MOST
+
+
+def _lively(day: DayMetrics) -> Bool:
+    lively: Bool = day.sound_by_hour >= LIVELY_MINUTES
+    return lively
+
+
+def _runs(day: DayMetrics, lively: Bool) -> list[str]:
+    """Return the times of successive lively hours: `19:00 to 22:00`."""
+    bounds = np.flatnonzero(np.diff(np.concatenate([[False], lively, [False]]).astype(int)))
+    texts = [clock_text(int(day.hours[place]), day.zone) for place in bounds.tolist()]
+    texts[1::2] = ["24:00" if text == "00:00" else text for text in texts[1::2]]
+    return [f"{a} to {b}" for a, b in zip(texts[::2], texts[1::2], strict=True)]
+
+
+def _sounds(day: DayMetrics) -> Iterator[str]:
+    """Yield sentences on coughing, crying and shouting, as far as they count."""
+    after = one(int(day.night.ends[0]), int(day.span.ends[0]))
+    for name in _WORRYING:
+        parts: list[str] = []
+        for span, when in ((day.night, "in the night"), (after, "after 07:00")):
+            starts = counted_events(day, name, span)
+            if len(starts):
+                count = day.home.minutes.between(span).count(name, day.home.rates.get(name))
+                times = f" ({times_in_words(starts, day.zone)})" if len(starts) <= _TIMES else ""
+                parts.append(f"{amount(name, count, named=not parts)} {when}{times}")
+        if parts:
+            yield f"{_capital(' and '.join(parts))}."
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
