@@ -347,8 +347,8 @@ def test_the_page_says_of_a_night_what_its_table_counts(tmp_path):
         check(logs, at(f"02:{minute:02}"))
     make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), tmp_path / "day.html")
     text = (tmp_path / "day.html").read_text()
-    assert "Coughing as labelled: 1 from 05:00. 0.1 an hour." in text
-    assert "bouts of coughing 2, as labelled. In how long they are." in text
+    assert "Coughing in the night, as labelled, at 05:00." in text
+    assert "sounded: coughing 2, as labelled. In how long they are." in text
     assert "Coughing, crying, laughing and shouting are left out of 5 of these minutes" in text
     assert "Counts over 3 days, up to this one (1 of them heard)" in text
     assert "Most of the sound, as labelled: talking." in text

@@ -44,20 +44,22 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
     known = [day for day in days if day.coverage.length]
     whole_days = [day for day in known if _is_known(day)]
     quiet = sum(is_quiet(day) for day in whole_days)
-    parts = []
-    if len(whole_days) < len(days):
-        number = number_in_words(len(whole_days)) if whole_days else "none"
-        parts.append(f"{number.capitalize()} of {len(days)} days could be judged.")
-    if whole_days:
-        of = f"of {'them' if parts else f'{number_in_words(len(days))} days'}"
-        all_of = "All" if quiet == len(whole_days) and quiet else number_in_words(quiet)
-        was = "was" if quiet == 1 else "were"
-        parts.append(f"{all_of.capitalize()} {of} {was} quiet.")
+    number, of = number_in_words(len(whole_days)), number_in_words(len(days))
+    which = {0: "none", len(whole_days): "all" if len(whole_days) > _ONE_MORE else "both"}
+    was = which.get(quiet, number_in_words(quiet))
+    if len(whole_days) == len(days):
+        parts = [f"{_capital(was)} of the {of} days {_were(quiet)} quiet."]
+    elif len(whole_days) > 1:
+        parts = [f"{_capital(number)} of {of} days could be judged, {was} of them quiet."]
+    elif whole_days:
+        parts = [f"One of {of} days could be judged, and was {'' if quiet else 'not '}quiet."]
+    else:
+        parts = [f"Too little was recorded to judge any of the {of} days."]
     for name in _WORRYING:
         counts = [(count, day) for day in known if (count := day.count(name)) and count.labelled]
         if counts:
             total = sum((count for count, _ in counts), Count())
-            text = f"{amount(name, total)} on {number_in_words(len(counts))} of {len(days)} days"
+            text = f"{amount(name, total)} on {number_in_words(len(counts))} days"
             most, day = max(counts, key=lambda pair: pair[0].labelled)
             if len(counts) > 1 and most.labelled > total.labelled / len(days):
                 text += f", most on {short_day(day.day)} ({most.labelled})"
@@ -100,9 +102,10 @@ def _day(day: DayMetrics) -> str:
     hours = day.coverage.length / HOUR
     whole_hours = whole(day.span.length / HOUR)
     if not _is_known(day):
-        number = "Less than one" if hours < 1 else f"Only {int(hours)}"
-        were = "was" if hours < _ONE_MORE else "were"
-        return f"{number} of the {whole_hours} hours of {name} {were} recorded."
+        if hours < 1:
+            return f"Less than an hour of {name} was recorded."
+        were = _were(int(hours))
+        return f"Only {int(hours)} of the {whole_hours} hours of {name} {were} recorded."
     lively = _lively(day)
     partly = ""
     if day.span.length / HOUR - hours >= _MISSING_HOURS:
@@ -150,6 +153,10 @@ def _sounds(day: DayMetrics) -> Iterator[str]:
                 parts.append(f"{amount(name, count, named=not parts)} {when}{times}")
         if parts:
             yield f"{_capital(' and '.join(parts))}."
+
+
+def _were(number: int) -> str:
+    return "were" if number > 1 else "was"
 
 
 def _capital(text: str) -> str:

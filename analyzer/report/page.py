@@ -369,18 +369,14 @@ def _week(account: Account, figures: Sequence[ReportFigure]) -> PageTable:
         values = [figure.value(day) if day.coverage.length else None for day in account.days]
         apart = [day.beside_television(figure.name) * figure.counts for day in account.days]
         usual = _dense(account.usually(figure)) if account.comparable else ""
-        total = sum(apart)
+        notes = [f"{_NOT_COUNTED}: {sum(apart)}"] * any(apart)
+        notes += [f"usually {usual} a day"] * bool(usual)
+        colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(
             [
-                Cell(
-                    figure.short,
-                    colour=colour_on_paper(figure.name) if figure.name else None,
-                    note=f"usually {usual} a day" if usual else "",
-                ),
+                Cell(figure.short, colour=colour, note=", ".join(notes)),
                 *map(Cell, map(_short, values)),
-                Cell(
-                    _total(account.days, figure), note=f"{_NOT_COUNTED}: {total}" if total else ""
-                ),
+                Cell(_total(account.days, figure)),
             ]
         )
     return PageTable(["", *_day_heads(account), "All"], rows, "wide")

@@ -114,7 +114,9 @@ def _night(classes: Sequence[str]) -> Iterator[ReportFigure]:
     for name in (COUGHING, CRYING):
         if name in classes:
             yield _at_night(name, several_in_words(name), in_words(name))
-    yield ReportFigure("Times with sound", "Times with sound", lambda day: day.night_stretches)
+    yield ReportFigure(
+        "Times with half a minute of sound", "Times with sound", lambda day: day.night_stretches
+    )
     yield ReportFigure("Time with sound", "Time with sound", lambda day: day.night_sound)
 
 
@@ -128,8 +130,8 @@ _ACTIVITY = (
 )
 _BATHROOM_NOTE = "Night is 22:00 to 07:00. A person, not the report, knows who used the bathroom."
 _NIGHT_NOTE = (
-    "22:00 to 07:00, counted to the day on which the night ends. A “time with sound” has at least "
-    "half a minute of sound, and ten quiet minutes before the next one."
+    "22:00 to 07:00, counted to the day on which the night ends. Ten quiet minutes part one "
+    "time with sound from the next."
 )
 _ACTIVITY_NOTE = (
     "“Sound from” and “until” are the first and the last ten minutes with at least one minute of "

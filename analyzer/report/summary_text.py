@@ -39,7 +39,7 @@ def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
     if day.night_hours:
         yield _night(day)
     if day.first is not None and day.last is not None:
-        yield f"There was sound on and off from {day.first.text} to {day.last.text}."
+        yield f"By day there was sound on and off from {day.first.text} to {day.last.text}."
 
 
 def gist_of_week(account: Account) -> Iterator[str]:
@@ -152,8 +152,9 @@ def _television(day: DayMetrics) -> str:
         f"{clock_text(int(spans.ends[row]), day.zone)}"
         for row in longest.tolist()
     ]
-    more = "at other times, too, " if len(spans.starts) > _TIMES else ""
-    return f"Something like a television, a radio or company sounded {more}{listed(times, 'and')}."
+    more = "at other times and " if len(spans.starts) > _TIMES else ""
+    when = more + f"from {listed(times, 'and')}"
+    return f"Something like a television, a radio or company sounded {when}."
 
 
 def _changes(account: Account, day: DayMetrics) -> str:

@@ -108,13 +108,11 @@ class Timeline(NamedTuple):
         return bool(self.unheard) or any(lane.unheard for lane in self.lanes)
 
     @property
-    def backdrop(self) -> str:
-        """The night as a CSS background."""
-        stops = ["transparent 0"]
-        for left, width in self.nights:
-            stops += [f"transparent {left:.2f}%", f"var(--night) {left:.2f}%"]
-            stops += [f"var(--night) {left + width:.2f}%", f"transparent {left + width:.2f}%"]
-        return f"linear-gradient(90deg, {', '.join(stops)})"
+    def night_path(self) -> str:
+        """SVG path of the night."""
+        share = self.minutes / 100
+        spans = [(block.left * share, block.width * share) for block in self.nights]
+        return "".join(f"M{left:g} 0h{width:g}v1h{-width:g}z" for left, width in spans)
 
     @property
     def hour_lines(self) -> str:
