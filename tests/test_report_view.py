@@ -1,5 +1,9 @@
 """A report in a browser, as it opens: what one sees of a day without scrolling."""
 
+import base64
+import json
+import re
+from datetime import timedelta
 from itertools import pairwise
 from zoneinfo import ZoneInfo
 
@@ -26,21 +30,27 @@ def browser(tmp_path_factory):
         yield page
 
 
+def report_of(logs, folder, days=1, first=DAY):
+    """Write a page, and return its address."""
+    output = folder / "report.html"
+    make_report(find_home_logs([logs]), Period(first, days, ZoneInfo("UTC")), output)
+    return output.as_uri()
+
+
+def set_size(browser, width, height, *, mobile=False):
+    """Make the window of a browser as large as that of a device."""
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile}
+    browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+
+
 class Report:
     """The opening view of a report on a day."""
 
     def __init__(self, browser, logs, size, folder):
-        output = folder / "report.html"
-        make_report(find_home_logs([logs]), Period(DAY, 1, ZoneInfo("UTC")), output)
+        address = report_of(logs, folder)
         width, height = size
-        browser.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=False,
-        )
-        browser.open(output.as_uri())
+        set_size(browser, width, height)
+        browser.open(address)
         png = browser.picture()
         (folder / "seen.png").write_bytes(png)
         self.image = pixels(png)
@@ -92,13 +102,13 @@ def test_every_short_sound_of_a_day_is_seen_in_its_lane(browser, short_sounds, s
     assert all(one[1] < other[0] for one, other in pairwise(lanes))
 
 
-def test_two_sounds_that_are_two_pixels_apart_are_two_marks(browser, size, tmp_path):
-    times = [at("10:00:01"), at("10:04:05"), at("15:01:59"), at("15:06:03")]
+def test_two_sounds_that_are_five_pixels_apart_are_two_marks(browser, size, tmp_path):
+    times = [at("10:00:01"), at("10:10:20"), at("15:01:59"), at("15:12:18")]
     events = [(time, 1, "yelling", 0.9) for time in times]
     write_day(tmp_path / "logs", DAY, events, classes=GENERAL)
     report = Report(browser, tmp_path / "logs", size, tmp_path)
     for one, other in (times[:2], times[2:]):
-        assert 2 <= report.place(other) - report.place(one) < 2.1
+        assert 5 <= report.place(other) - report.place(one) < 5.2
     columns = report.marks("yelling").any(axis=0)
     assert np.count_nonzero(np.diff(columns.astype(int)) == 1) == len(times)
 
@@ -107,7 +117,8 @@ def test_the_hours_of_a_day_are_written_below_it(browser, short_sounds, size, tm
     report = Report(browser, short_sounds, size, tmp_path)
     dark = report.image.max(axis=2) < 120
     bars = (report.image == NIGHT).all(axis=2)[:, int(report.place(HOUR))]
-    line = np.flatnonzero(bars)[-1]
+    rows = np.flatnonzero(bars)
+    line = rows[np.argmax(np.diff(rows))]  # the next night is that of the bars
     below = dark[line + 2 : line + 20]
     places = [report.place(hour * HOUR) for hour in range(0, 24, 2)]
     for place in places:
@@ -117,3 +128,120 @@ def test_the_hours_of_a_day_are_written_below_it(browser, short_sounds, size, tm
         assert 8 <= np.ptp(columns) <= 16, "two digits, and nothing at their sides"
     between = [round((one + other) / 2) for one, other in pairwise(places)]
     assert not below[:, between].any()
+
+
+PHONE = 390, 844
+_BOXES = """JSON.stringify([...document.querySelectorAll("%s")].filter(e => e.checkVisibility())
+    .map(e => [e.textContent.trim(), e.getBoundingClientRect().left,
+        e.getBoundingClientRect().width, parseFloat(getComputedStyle(e).fontSize)]))"""
+
+
+def boxes(browser, selector):
+    """Text, left edge, width and letter size of the elements that can be seen."""
+    return json.loads(browser.evaluate(_BOXES % selector))
+
+
+@pytest.mark.parametrize("days", [1, 7], ids=["day", "week"])
+def test_on_a_phone_a_page_is_as_wide_as_the_screen_and_its_picture_can_be_read(
+    browser, short_sounds, days, tmp_path
+):
+    set_size(browser, *PHONE, mobile=True)
+    browser.open(report_of(short_sounds, tmp_path, days, DAY - timedelta(days=days - 1)))
+    assert browser.evaluate("document.documentElement.scrollWidth") == PHONE[0]
+    hours = boxes(browser, ".hours span")
+    assert [text for text, *_ in hours] == ["00", "06", "12", "18"]
+    names = boxes(browser, ".row .name")
+    assert min(letters for *_, letters in hours + names if letters) >= 14
+    assert len(boxes(browser, ".day > .row")) <= 14, "twelve lanes, hours and bars"
+    assert all(width > PHONE[0] * 0.85 for _, _, width, _ in boxes(browser, ".strip"))
+
+
+def test_a_phone_shows_twelve_lanes_and_those_that_were_heard(browser, tmp_path):
+    classes = [*GENERAL, *(f"thing_{number}" for number in range(9))]
+    write_day(tmp_path / "logs", DAY, [(at("10:00"), 5, "thing_8", 0.9)], classes=classes)
+    address = report_of(tmp_path / "logs", tmp_path)
+    counts = []
+    for width, height in (PHONE, SIZES[0]):
+        set_size(browser, width, height)
+        browser.open(address)
+        names = [text for text, *_ in boxes(browser, ".day .row:not(.axis, .bars) .name")]
+        assert "Thing 8" in names
+        counts.append(len(names))
+    assert counts == [12, 17]
+
+
+@pytest.mark.parametrize("width", [390, 1366])
+def test_a_short_sound_is_three_pixels_wide_and_a_long_one_as_long_as_it_was(
+    browser, width, tmp_path
+):
+    events = [(at("03:00"), 1, "phone_ring", 0.9), (at("12:00"), 2 * HOUR, "phone_ring", 0.9)]
+    write_day(tmp_path / "logs", DAY, events)
+    set_size(browser, width, 1000)
+    browser.open(report_of(tmp_path / "logs", tmp_path))
+    (strip,) = {width for _, _, width, _ in boxes(browser, ".day .row:not(.axis, .bars) .strip")}
+    image = pixels(browser.picture())
+    yellow = (image[..., 0] > 180) & (image[..., 2] < 150) & (image[..., 1] > 180)
+    row = yellow[:, int(width * 0.3) if width > 600 else 40 :]
+    columns = row[np.argmax(row.sum(axis=1))]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], columns.astype(int), [0]])))
+    short, long = np.diff(edges.reshape(-1, 2)).ravel()
+    assert 2 <= short <= 4
+    assert long == pytest.approx((strip - 2) * 2 / 24, abs=1.5)
+
+
+def test_what_sounded_beside_a_television_is_pale_and_the_table_says_so(browser, tmp_path):
+    talking = [(at("10:00") + 20 * i, 15, "speech", 0.9) for i in range(60)]
+    coughs = [(at(t), 2, "coughing", 0.9) for t in ("10:05:16", "16:00:00")]
+    write_day(tmp_path / "logs", DAY, [*talking, *coughs])
+    report = Report(browser, tmp_path / "logs", SIZES[0], tmp_path)
+    columns = np.flatnonzero(report.marks("coughing")[: report.image.shape[0]].any(axis=0))
+    assert np.ptp(columns) <= 4, "only the cough that counts has the full colour"
+    assert abs(columns.mean() - report.place(at("16:00"))) < 4
+    text = browser.evaluate("document.body.textContent")
+    assert "beside a television: not counted" in text
+    assert "not counted: 1" in text
+    assert "One bout of coughing after 07:00 (16:00)." in text
+
+
+def test_a_printed_day_has_two_sheets_with_the_assessment(browser, short_sounds, tmp_path):
+    browser.open(report_of(short_sounds, tmp_path))
+    assert not boxes(browser, "details table")
+    browser.call("Emulation.setEmulatedMedia", media="print")
+    try:
+        assert boxes(browser, "details table")
+    finally:
+        browser.call("Emulation.setEmulatedMedia", media="")
+    sheet = browser.call("Page.printToPDF", preferCSSPageSize=True)["data"]
+    assert len(re.findall(rb"/Type\s*/Page\b", base64.b64decode(sheet))) == 2
+
+
+_CONTRAST = """(() => {
+    const channel = v => (v /= 255) <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4;
+    const numbers = text => text.match(/[\\d.]+/g).map(Number);
+    const light = ([r, g, b]) => .2126 * channel(r) + .7152 * channel(g) + .0722 * channel(b);
+    const ground = e => {
+        for (; e; e = e.parentElement) {
+            const colour = numbers(getComputedStyle(e).backgroundColor);
+            if (colour.length === 3) return colour;
+        }
+    };
+    let least = 21;
+    for (const e of document.querySelectorAll("h1, h2, p, td, th, small, b, .name, .hours span")) {
+        const [a, b] = [numbers(getComputedStyle(e).color), ground(e)].map(light);
+        least = Math.min(least, (Math.max(a, b) + .05) / (Math.min(a, b) + .05));
+    }
+    return least;
+})()"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_all_words_of_a_page_stand_out_by_day_and_by_night(browser, short_sounds, scheme, tmp_path):
+    feature = {"name": "prefers-color-scheme", "value": scheme}
+    browser.call("Emulation.setEmulatedMedia", features=[feature])
+    try:
+        browser.open(report_of(short_sounds, tmp_path))
+        ground = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (ground == "rgb(255, 255, 255)") == (scheme == "light")
+        assert browser.evaluate(_CONTRAST) >= 4.5
+    finally:
+        browser.call("Emulation.setEmulatedMedia", features=[])
