@@ -33,6 +33,7 @@ from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
+from hearthlog.analyzer.logs.never_tell import write_list
 from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
@@ -400,7 +401,103 @@ def test_the_last_whole_day_is_that_which_the_logs_reach_to_the_end_of(tmp_path)
     assert find_home_logs([tmp_path]).last_complete_day(UTC) == DAY + timedelta(days=1)
 
 
+# The headline
+
+
+def headline(root, tmp_path, **period) -> str:
+    return re.search('<p class="headline">([^<]*)</p>', page_of(root, tmp_path, **period))[1]
+
+
+def test_the_headline_of_a_quiet_day_names_its_coughs(tmp_path):
+    coughs = [(at(t), 2, "coughing", 0.9) for t in ("06:13", "15:26", "15:30")]
+    write_day(tmp_path / "logs", DAY, [*coughs, (at("16:00"), 5, "yelling", 0.9)])
+    assert headline(tmp_path / "logs", tmp_path) == (
+        "Sunday was quiet. One bout of coughing in the night (06:13) and two after 07:00 "
+        "(15:26, 15:30). Shouting once after 07:00 (16:00)."
+    )
+
+
+@pytest.mark.parametrize(
+    ("lively", "text"),
+    [
+        ([19, 20, 21], "Sunday was quiet but for 19:00 to 22:00."),
+        ([8, 22, 23], "Sunday was quiet but for 08:00 to 09:00 and 22:00 to 24:00."),
+        ([8, 10, 12, 14], "Sunday was quiet but for four hours."),
+        (range(9, 16), "Sunday had sound in 7 of 24 hours."),
+    ],
+)
+def test_a_day_is_quiet_if_at_most_six_of_its_hours_have_five_minutes_of_sound(
+    tmp_path, lively, text
+):
+    sounds = [(at(f"{hour:02}:20"), 300, "music", 0.9) for hour in lively]
+    write_day(tmp_path / "logs", DAY, [*sounds, (at("07:00"), 290, "music", 0.9)])
+    assert headline(tmp_path / "logs", tmp_path) == text
+
+
+@pytest.mark.parametrize(
+    ("hours", "text"),
+    [
+        (range(5, 24), "Sunday was quiet, as far as it was recorded (19 of 24 hours)."),
+        (range(6, 18), "Only 12 of the 24 hours of Sunday were recorded."),
+        ([*range(8), *range(13, 24)], "Only 19 of the 24 hours of Sunday were recorded."),
+    ],
+)
+def test_a_day_is_not_called_quiet_where_nobody_listened(tmp_path, hours, text):
+    write_day(tmp_path / "logs", DAY, hours=hours)
+    assert headline(tmp_path / "logs", tmp_path) == text
+
+
+def test_a_week_has_a_headline_of_its_days(tmp_path):
+    for ago in range(7):
+        coughs = [(at("03:00") + 60 * n, 2, "coughing", 0.9) for n in range(ago)]
+        hours = [12] if ago in {1, 2} else range(24)
+        write_day(tmp_path / "logs", DAY - timedelta(days=ago), coughs, hours=hours)
+    first = DAY - timedelta(days=6)
+    assert headline(tmp_path / "logs", tmp_path, first=first, days=7) == (
+        "Five of seven days could be judged, all of them quiet. 18 bouts of coughing on four "
+        "days, most on Mon 23 Feb (6)."
+    )
+
+
 # The page
+
+
+def test_times_of_up_to_five_sounds_are_written_and_of_more_the_first_and_the_last(tmp_path):
+    rings = [(at(t), 5, "phone_ring", 0.9) for t in ("09:58", "10:08", "15:26")]
+    words = [(at("08:00") + 600 * n, 4, "speech", 0.9) for n in range(6)]
+    write_day(tmp_path / "logs", DAY, [*rings, *words])
+    rows = rows_of(page_of(tmp_path / "logs", tmp_path))
+    assert rows["Telephone ringing"] == ["3", "09:58, 10:08, 15:26", "under 1 min"]
+    assert rows["Talking"] == ["6", "08:00 to 08:50", "under 1 min"]
+    assert list(rows)[1:3] == ["Telephone ringing", "Talking"], "what matters comes first"
+
+
+def test_a_hidden_class_is_not_among_those_that_a_model_does_not_know(tmp_path):
+    write_day(tmp_path / "logs", DAY, [(at("10:00"), 5, "crying", 0.9)])
+    write_list(tmp_path / "logs", ["crying"])
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert "tells nothing of them: toilet flush, shower and water tap." in page
+    assert "rying" not in page
+
+
+def test_the_picture_has_a_title_and_tells_in_words_what_it_shows(tmp_path):
+    coughs = [(at("10:00"), 5, "coughing", 0.9), (at("15:00"), 5, "coughing", 0.9)]
+    write_day(tmp_path / "logs", DAY, coughs, hours=range(20))
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert page.count('role="img"') == 1
+    assert '<title id="picture-title">The sounds of Sunday, 1 March 2026</title>' in page
+    assert '<desc id="picture-text">Coughing 2. Not recorded: 20:00 to 00:00.</desc>' in page
+
+
+def test_a_page_of_a_restless_week_is_small(tmp_path):
+    names = [name for name in GENERAL if name != "silence"]
+    steps = range(0, 24 * HOUR, 30)
+    restless = [(float(t), 12, names[t // 30 % len(names)], 0.9) for t in steps]
+    for ago in range(7):
+        write_day(tmp_path / "logs", DAY - timedelta(days=ago), restless)
+    assert len(page_of(tmp_path / "logs", tmp_path)) < 100_000
+    week = page_of(tmp_path / "logs", tmp_path, first=DAY - timedelta(days=6), days=7)
+    assert len(week) < 200_000
 
 
 class Outline(HTMLParser):
@@ -562,11 +659,19 @@ def test_the_command_makes_a_page_of_the_last_whole_day(hearthlog, tmp_path):
     page = (tmp_path / "day.html").read_text()
     assert "Sunday, 1 March 2026" in page
     assert "Europe/Vienna" in page
+    alone = hearthlog("report", tmp_path / "logs", "--no-picture", "-o", tmp_path / "page.html")
+    assert alone.stdout.split() == [str(tmp_path / "page.html")]
+    assert (tmp_path / "page.html").read_text() == page
     again = hearthlog("report", tmp_path / "logs", "-o", tmp_path / "day.html")
     assert again.returncode == 1
     assert "exists already" in again.stderr
     assert (tmp_path / "day.html").read_text() == page
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["day.html", "day.png", "logs"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "day.html",
+        "day.png",
+        "logs",
+        "page.html",
+    ]
 
 
 def test_a_damaged_log_is_not_heard_and_the_command_says_so(hearthlog, tmp_path):

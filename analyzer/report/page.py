@@ -9,10 +9,10 @@ import jinja2
 import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
-from hearthlog.analyzer.activity.event_counts import SET_APART
+from hearthlog.analyzer.activity.event_counts import MINUTE, SET_APART
 from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
 from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.analyzer.logs.spans import without
+from hearthlog.analyzer.logs.spans import common, without
 from hearthlog.analyzer.report.headline import day_headline, week_headline
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
@@ -24,6 +24,7 @@ from hearthlog.analyzer.report.report_data import (
     event_figure,
     minutes_figure,
     sections,
+    television_spans,
 )
 from hearthlog.analyzer.report.summary_text import (
     gist_of_day,
@@ -279,13 +280,22 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
             cells = [
                 cell._replace(note=", ".join(notes)),
                 Cell(_times(day, starts)),
-                _cell(account, lasting, day),
+                _beside_television(_cell(account, lasting, day), name, day),
             ]
         else:
             continue
         right = [Cell(account.rightness(name))] * account.checked
         rows.append([Cell(in_words(name), colour=colour_on_paper(name)), *cells, *right])
     return PageTable([*heads, *["Right here"] * account.checked], rows, "sounds")
+
+
+def _beside_television(cell: Cell, name: str, day: DayMetrics) -> Cell:
+    """Add how long a class sounded beside a television, from a minute on."""
+    minutes = common(day.home.spans[name], television_spans(day)).length / MINUTE
+    if minutes < 1:
+        return cell
+    notes = [f"{Duration(minutes).text} beside a television", *[cell.note] * bool(cell.note)]
+    return cell._replace(note=", ".join(notes))
 
 
 def _times(day: DayMetrics, starts: Int64) -> str:

@@ -9,6 +9,7 @@ from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
 from hearthlog.analyzer.activity.daily_metrics import DayMetrics
 from hearthlog.analyzer.activity.day_anomaly import DayAnomaly
 from hearthlog.analyzer.activity.event_counts import FEWEST as FEWEST_CHECKED
+from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import ScenarioMinutes
 from hearthlog.analyzer.activity.values import (
     BASELINE_DAYS,
@@ -22,7 +23,7 @@ from hearthlog.analyzer.activity.values import (
     usual_range,
 )
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import Spans
+from hearthlog.analyzer.logs.spans import Spans, common, joined
 from hearthlog.analyzer.report.wording import several_in_words
 from hearthlog.models.classes import (
     COUGHING,
@@ -66,6 +67,12 @@ class FigureSection(NamedTuple):
 def counted_events(day: DayMetrics, name: str, span: Spans) -> Int64:
     """Return the event starts of a class in a span that count, in nanoseconds of UTC."""
     return day.home.minutes.counted(name, day.home.events_in(name, span))
+
+
+def television_spans(day: DayMetrics, pause: int = 0) -> Spans:
+    """Return when something like a television sounded, with short pauses closed."""
+    starts = day.home.minutes.starts[day.home.minutes.television]
+    return common(joined(starts, starts + MINUTE, pause), day.span)
 
 
 def sections(classes: Sequence[str]) -> list[FigureSection]:

@@ -9,9 +9,9 @@ from hearthlog.analyzer.activity.day_anomaly import FEWEST
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import common, joined, without
+from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.report.headline import amount
-from hearthlog.analyzer.report.report_data import Account
+from hearthlog.analyzer.report.report_data import Account, television_spans
 from hearthlog.analyzer.report.wording import (
     WEEK,
     clock_text,
@@ -27,19 +27,22 @@ _MINUTE = HOUR // 60
 _PAUSE = 20 * _MINUTE  # shorter pauses of a television are not told
 _TIMES = 3
 _HALF = 0.5  # hours
+_MORNING, _MIDNIGHT = 4 * 60 + 30, 23 * 60 + 30  # minutes
 
 
 def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
     """Summarise a day in a few sentences, compared with earlier days."""
-    minutes = Duration(day.coverage.length / _MINUTE).text
-    yield f"Recorded: {minutes} of the day ({percent(day.share)}). {_loudest(day)}".strip()
+    recorded = "The whole day was recorded."
+    if day.span.length - day.coverage.length >= _MINUTE:
+        minutes = Duration(day.coverage.length / _MINUTE).text
+        recorded = f"Recorded: {minutes} of the day ({percent(day.share)})."
+    yield f"{recorded} {_loudest(day)}".strip()
     yield _television(day)
     if account.comparable:
         yield _changes(account, day)
     if day.night_hours:
         yield _night(day)
-    if day.first is not None and day.last is not None:
-        yield f"By day there was sound on and off from {day.first.text} to {day.last.text}."
+    yield _still(day)
 
 
 def gist_of_week(account: Account) -> Iterator[str]:
@@ -141,9 +144,7 @@ def _loudest(day: DayMetrics) -> str:
 
 def _television(day: DayMetrics) -> str:
     """Return when something like a television sounded."""
-    minutes = day.home.minutes
-    starts = minutes.starts[minutes.television]
-    spans = common(joined(starts, starts + _MINUTE, _PAUSE), day.span)
+    spans = television_spans(day, _PAUSE)
     if not len(spans.starts):
         return ""
     longest = np.sort(np.argsort(spans.starts - spans.ends, kind="stable")[:_TIMES])
@@ -155,6 +156,16 @@ def _television(day: DayMetrics) -> str:
     more = "at other times and " if len(spans.starts) > _TIMES else ""
     when = more + f"from {listed(times, 'and')}"
     return f"Something like a television, a radio or company sounded {when}."
+
+
+def _still(day: DayMetrics) -> str:
+    """Return the time before the first and after the last lively ten minutes."""
+    if day.first is None or day.last is None:
+        return ""
+    first = f"until {day.first.text}" if day.first.minutes > _MORNING else ""
+    last = f"after {day.last.text}" if day.last.minutes < _MIDNIGHT else ""
+    times = listed([time for time in (first, last) if time], "and")
+    return f"There were only short sounds, if any, {times}, as labelled." if times else ""
 
 
 def _changes(account: Account, day: DayMetrics) -> str:
