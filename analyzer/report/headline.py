@@ -89,7 +89,8 @@ def amount(name: str, count: Count, *, named: bool = True) -> str:
         often = _REPEATED.get(count.labelled, f"{number} times")
         return f"{in_words(name).lower()} {often}" if named else often
     if count.labelled == 1:
-        several = several.replace("bouts", "bout", 1)
+        bouts = several.startswith("bouts ")
+        several = several.replace("bouts", "bout", 1) if bouts else in_words(name).lower()
     return f"{number} {several}" if named else number
 
 

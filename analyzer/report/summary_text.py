@@ -165,7 +165,9 @@ def _still(day: DayMetrics) -> str:
     first = f"until {day.first.text}" if day.first.minutes > _MORNING else ""
     last = f"after {day.last.text}" if day.last.minutes < _MIDNIGHT else ""
     times = listed([time for time in (first, last) if time], "and")
-    return f"There were only short sounds, if any, {times}, as labelled." if times else ""
+    partly = day.span.length - day.coverage.length >= _MINUTE
+    known = "as far as it was recorded" if partly else "as labelled"
+    return f"There were only short sounds, if any, {times}, {known}." if times else ""
 
 
 def _changes(account: Account, day: DayMetrics) -> str:

@@ -27,6 +27,24 @@ class Block(NamedTuple):
     width: float
 
 
+class MarkPaths(NamedTuple):
+    """SVG paths in a box as wide as the minutes of a day, and 1 high.
+
+    Attributes
+    ----------
+    long : str
+        Filled.
+    short : str
+        Upright lines, to be drawn three pixels wide: events too short to be seen otherwise.
+    many : str
+        Level lines through many short events, between which no screen has room; to be dashed.
+    """
+
+    long: str
+    short: str
+    many: str
+
+
 class Lane(NamedTuple):
     """Events of a class on a day, in minutes since midnight.
 
@@ -51,16 +69,13 @@ class Lane(NamedTuple):
         return not (len(self.counted) or len(self.apart))
 
     @property
-    def paths(self) -> tuple[str, str]:
-        """SVG paths of the events that count, in a box as wide as the minutes, and 1 high.
-
-        The first is to be filled, the second to be drawn by a line of three pixels.
-        """
+    def paths(self) -> MarkPaths:
+        """Marks of the events that count."""
         return _paths(self.counted)
 
     @property
-    def pale_paths(self) -> tuple[str, str]:
-        """SVG paths of the events beside a television, as in `paths`."""
+    def pale_paths(self) -> MarkPaths:
+        """Marks of the events beside a television."""
         return _paths(self.apart)
 
 
@@ -207,20 +222,17 @@ def _percent(day: DayMetrics, times: Int64) -> Float64:
     return (times - day.span.starts[0]) / day.span.length * 100
 
 
-def _paths(events: Float64) -> tuple[str, str]:
-    """Return paths of rectangles, and of upright lines where these are too narrow to be seen.
-
-    The lines of short events that touch each other on every screen become a rectangle between
-    the first and the last, so that the size of a page does not grow with the number of sounds.
-    """
+def _paths(events: Float64) -> MarkPaths:
+    """Return the marks of events; their size does not grow with the number of short ones."""
     widths = events[:, 1] - events[:, 0]
-    short = events[widths < _SHORT].mean(axis=1)
-    places = np.unique(np.round(short).astype(np.int64))
-    new = np.concatenate([[True], np.diff(places) > _TOUCHING]) if len(places) else places > 0
-    firsts = places[new]
-    lasts = places[np.concatenate([new[1:], [True]])] if len(places) else places
-    long = events[widths >= _LONG]
-    bounds = [*long.round(1).tolist(), *zip(firsts.tolist(), lasts.tolist(), strict=True)]
-    filled = "".join(f"M{a:g} 0h{b - a:g}v1h{a - b:g}z" for a, b in bounds if b > a)
-    ends = np.unique(np.concatenate([firsts, lasts]))
-    return filled, "".join(f"M{place} 0v1" for place in ends.tolist())
+    long = events[widths >= _LONG].round(1).tolist()
+    places = np.unique(np.round(events[widths < _SHORT].mean(axis=1)).astype(np.int64))
+    apart = np.diff(places, prepend=-_TOUCHING - 1) > _TOUCHING
+    firsts, lasts = places[apart], places[np.roll(apart, -1)]
+    runs = zip(firsts.tolist(), lasts.tolist(), strict=True)
+    ends = np.unique(np.concatenate([firsts, lasts])).tolist()
+    return MarkPaths(
+        "".join(f"M{a:g} 0h{b - a:g}v1h{a - b:g}z" for a, b in long),
+        "".join(f"M{place} 0v1" for place in ends),
+        "".join(f"M{a} .5H{b}" for a, b in runs if b > a),
+    )
