@@ -35,12 +35,10 @@ def report(
             "picture is written next to it.",
         ),
     ] = None,
-    picture: Annotated[
+    no_picture: Annotated[
         bool,
-        typer.Option(
-            help="Also write the picture of the page as PNG; the page contains it anyway."
-        ),
-    ] = True,
+        typer.Option("--no-picture", help="Write no PNG; the page contains the picture anyway."),
+    ] = False,
     labels: Annotated[
         str, typer.Option(help="Labelling: live, or the model of a relabel layer.")
     ] = "live",
@@ -56,7 +54,7 @@ def report(
         wrong_use(f"--output {output}: a page is named *.html")
     from hearthlog.analyzer.extras import require
 
-    require("jinja2", *["matplotlib"] * picture)
+    require("jinja2", *[] if no_picture else ["matplotlib"])
     if week is not None:
         first: date | None = read_date("--week", week)
         assert first is not None
@@ -68,7 +66,7 @@ def report(
     from hearthlog.analyzer.report.report import WEEK, Period, make_report
 
     draw = None
-    if picture:
+    if not no_picture:
         from hearthlog.analyzer.report.timeline_plot import save_timelines
 
         draw = save_timelines
