@@ -36,10 +36,10 @@ from hearthlog.analyzer.report.summary_text import (
     plain,
 )
 from hearthlog.analyzer.report.timeline import (
+    DayTimeline,
     HourBar,
-    Timeline,
-    heard_names,
     hour_bars,
+    occurring_classes,
     timeline_of,
 )
 from hearthlog.analyzer.report.wording import (
@@ -91,12 +91,12 @@ class PageTable(NamedTuple):
     kind: str = ""
 
 
-class Picture(NamedTuple):
+class PagePicture(NamedTuple):
     """Timelines of a day or a week, and the hours of a day."""
 
     title: str
     description: str
-    days: Sequence[tuple[str, Timeline]]  # with their names
+    days: Sequence[tuple[str, DayTimeline]]  # with their names
     bars: Sequence[HourBar] = ()
 
 
@@ -141,7 +141,7 @@ def day_page(account: Account) -> str:
     bars = hour_bars(day, account.earlier if account.comparable else [])
     return _page(
         account,
-        Picture(f"The sounds of {title}", _description(timeline), [("", timeline)], bars),
+        PagePicture(f"The sounds of {title}", _description(timeline), [("", timeline)], bars),
         title=title,
         headline=day_headline(day),
         gist=list(gist_of_day(account, day)),
@@ -155,12 +155,12 @@ def week_page(account: Account) -> str:
     first, last = account.days[0].day, account.days[-1].day
     spoken = f"{date_in_words(first)} to {date_in_words(last)}"
     names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
-    drawn = heard_names(account.days)
+    drawn = occurring_classes(account.days)
     days = [(short_day(day.day), timeline_of(day, drawn)) for day in account.days]
     described = " ".join(f"{name}: {_description(each)}" for name, each in days)
     return _page(
         account,
-        Picture(f"The sounds of {spoken}", described, days),
+        PagePicture(f"The sounds of {spoken}", described, days),
         title=f"Week {first.isocalendar().week}, {spoken}",
         headline=week_headline(account.days),
         gist=list(gist_of_week(account)),
@@ -178,13 +178,15 @@ def week_page(account: Account) -> str:
     )
 
 
-def _description(timeline: Timeline) -> str:
+def _description(timeline: DayTimeline) -> str:
     """Return the text alternative of a timeline."""
     parts = []
     for lane in timeline.lanes:
-        apart = f", and {len(lane.apart)} beside a television" if len(lane.apart) else ""
+        uncounted = (
+            f", and {len(lane.uncounted)} beside a television" if len(lane.uncounted) else ""
+        )
         if not lane.empty:
-            parts.append(f"{lane.words} {len(lane.counted)}{apart}")
+            parts.append(f"{lane.words} {len(lane.counted)}{uncounted}")
     zone, spans = timeline.day.zone, without(timeline.day.span, timeline.day.coverage)
     gaps = [
         f"{clock_text(start, zone)} to {clock_text(end, zone)}"
@@ -195,12 +197,12 @@ def _description(timeline: Timeline) -> str:
     return text + (f" Not recorded: {', '.join(gaps)}." if gaps else "")
 
 
-def _page(account: Account, picture: Picture, **parts: Any) -> str:
+def _page(account: Account, picture: PagePicture, **parts: Any) -> str:
     days = [day for day in (*account.before, *account.days) if day.coverage.length]
     names = [name for name in account.classes if name not in {SILENCE, UNKNOWN}]
     absent = [name for name in names if _is_known(account, name) and not _was_heard(account, name)]
-    untold = [name for name in names if not _is_known(account, name)]
-    apart = [name for name in SET_APART if name in account.classes]
+    uncertain = [name for name in names if not _is_known(account, name)]
+    uncounted = [name for name in SET_APART if name in account.classes]
     return fill_page(
         account=account,
         picture=picture,
@@ -208,9 +210,9 @@ def _page(account: Account, picture: Picture, **parts: Any) -> str:
         microphones=listed([plain(name) for name in account.microphones], "and"),
         alerts=[*not_recorded(account), *not_well(account)],
         absent=_listed(absent),
-        untold=_listed(untold),
+        uncertain=_listed(uncertain),
         unknown=_listed(account.unknown),
-        apart=_listed(apart),
+        uncounted=_listed(uncounted),
         television=_television(account),
         scenarios=[(plain(name), _scenario(account, name)) for name in account.scenarios],
         days_before=BASELINE_DAYS,
@@ -270,17 +272,19 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
     rows = []
     for name in account.classes:
         figure, lasting = event_figure(name), minutes_figure(name)
-        value, apart = figure.value(day), day.beside_television(name)
+        value, uncounted = figure.value(day), day.beside_television(name)
         if name == SILENCE:
             cells = [Cell(""), Cell(""), _cell(account, lasting, day)]
-        elif _was_heard(account, name) and (value is not None or apart):
+        elif _was_heard(account, name) and (value is not None or uncounted):
             cell = _cell(account, figure, day)
-            notes = [f"{_NOT_COUNTED}: {apart}"] * bool(apart) + [cell.note] * bool(cell.note)
+            notes = [f"{_NOT_COUNTED}: {uncounted}"] * bool(uncounted) + [cell.note] * bool(
+                cell.note
+            )
             starts = counted_events(day, name, day.span)
             cells = [
                 cell._replace(note=", ".join(notes)),
                 Cell(_times(day, starts)),
-                _beside_television(_cell(account, lasting, day), name, day),
+                _with_television(_cell(account, lasting, day), name, day),
             ]
         else:
             continue
@@ -289,7 +293,7 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
     return PageTable([*heads, *["Right here"] * account.checked], rows, "sounds")
 
 
-def _beside_television(cell: Cell, name: str, day: DayMetrics) -> Cell:
+def _with_television(cell: Cell, name: str, day: DayMetrics) -> Cell:
     """Add how long a class sounded beside a television, from a minute on."""
     minutes = common(day.home.spans[name], television_spans(day)).length / MINUTE
     if minutes < 1:
@@ -309,9 +313,9 @@ def _was_heard(account: Account, name: str) -> bool:
     """Return whether a class has a value, now or in its usual range."""
     baseline = account.baseline(event_figure(name))
     values = [day.count(name) for day in account.days]
-    apart = any(day.beside_television(name) for day in account.days)
+    uncounted = any(day.beside_television(name) for day in account.days)
     now = any(value and value.labelled for value in values)
-    return apart or now or bool(baseline and baseline[0].highest)
+    return uncounted or now or bool(baseline and baseline[0].highest)
 
 
 def _is_known(account: Account, name: str) -> bool:
@@ -377,9 +381,9 @@ def _week(account: Account, figures: Sequence[ReportFigure]) -> PageTable:
     rows = [[Cell("Recorded"), *recorded, Cell("")]]
     for figure in figures:
         values = [figure.value(day) if day.coverage.length else None for day in account.days]
-        apart = [day.beside_television(figure.name) * figure.counts for day in account.days]
+        uncounted = [day.beside_television(figure.name) * figure.counts for day in account.days]
         usual = _dense(account.usually(figure)) if account.comparable else ""
-        notes = [f"{_NOT_COUNTED}: {sum(apart)}"] * any(apart)
+        notes = [f"{_NOT_COUNTED}: {sum(uncounted)}"] * any(uncounted)
         notes += [f"usually {usual} a day"] * bool(usual)
         colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(

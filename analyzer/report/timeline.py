@@ -1,4 +1,4 @@
-"""Timeline of a day: a lane of events for each class, night, hours, time without a record."""
+"""DayTimeline of a day: a lane of events for each class, night, hours, time without a record."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -20,7 +20,7 @@ _LEAST_HATCHED = 2  # minutes
 _TOUCHING, _SHORT, _LONG = 5, 16.0, 2.0  # minutes
 
 
-class Block(NamedTuple):
+class TimelineBlock(NamedTuple):
     """Part of a day, in per cent of its width."""
 
     left: float
@@ -45,14 +45,14 @@ class MarkPaths(NamedTuple):
     many: str
 
 
-class Lane(NamedTuple):
+class TimelineLane(NamedTuple):
     """Events of a class on a day, in minutes since midnight.
 
     Attributes
     ----------
-    counted, apart : np.ndarray [shape=(n, 2)], float64
+    counted, uncounted : np.ndarray [shape=(n, 2)], float64
         Start and end of the events: those that count, and those beside a television.
-    unheard : list of Block
+    gaps : list of TimelineBlock
         Time in which the class could not have been heard, though others could.
     """
 
@@ -60,13 +60,13 @@ class Lane(NamedTuple):
     words: str
     colour: Colour
     counted: Float64
-    apart: Float64
-    unheard: Sequence[Block]
+    uncounted: Float64
+    gaps: Sequence[TimelineBlock]
 
     @property
     def empty(self) -> bool:
         """Whether nothing of the class was heard."""
-        return not (len(self.counted) or len(self.apart))
+        return not (len(self.counted) or len(self.uncounted))
 
     @property
     def paths(self) -> MarkPaths:
@@ -76,10 +76,10 @@ class Lane(NamedTuple):
     @property
     def pale_paths(self) -> MarkPaths:
         """Marks of the events beside a television."""
-        return _paths(self.apart)
+        return _paths(self.uncounted)
 
 
-class Tick(NamedTuple):
+class HourTick(NamedTuple):
     """An hour on the axis; `coarse` ones are also on a phone."""
 
     text: str
@@ -96,15 +96,15 @@ class HourBar(NamedTuple):
     usual: UsualRange | None
 
 
-class Timeline(NamedTuple):
+class DayTimeline(NamedTuple):
     """Picture of a day, without its form."""
 
     day: DayMetrics
     minutes: int  # 1440, but for days on which the clock is changed
-    lanes: Sequence[Lane]
-    unheard: Sequence[Block]  # nobody listened
-    nights: Sequence[Block]
-    ticks: Sequence[Tick]
+    lanes: Sequence[TimelineLane]
+    gaps: Sequence[TimelineBlock]  # nobody listened
+    nights: Sequence[TimelineBlock]
+    ticks: Sequence[HourTick]
 
     @property
     def phone_lanes(self) -> frozenset[str]:
@@ -113,14 +113,14 @@ class Timeline(NamedTuple):
         return frozenset(names[:PHONE_LANES])
 
     @property
-    def has_apart(self) -> bool:
+    def has_uncounted(self) -> bool:
         """Whether there are events beside a television."""
-        return any(len(lane.apart) for lane in self.lanes)
+        return any(len(lane.uncounted) for lane in self.lanes)
 
     @property
     def has_gaps(self) -> bool:
         """Whether there is time without a record, at least of a class."""
-        return bool(self.unheard) or any(lane.unheard for lane in self.lanes)
+        return bool(self.gaps) or any(lane.gaps for lane in self.lanes)
 
     @property
     def night_path(self) -> str:
@@ -141,7 +141,7 @@ class Timeline(NamedTuple):
         return "".join(f"M{tick.left / 100 * self.minutes:g} 0v1" for tick in coarse)
 
 
-def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> Timeline:
+def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimeline:
     """Return the timeline of a day.
 
     Parameters
@@ -153,25 +153,25 @@ def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> Timeline
         names = [name for name in day.home.classes if name != SILENCE]
     clock = [local_time(int(time), day.zone).hour for time in day.hours[:-1]]
     lefts = _percent(day, day.hours)
-    return Timeline(
+    return DayTimeline(
         day,
         int(day.span.length // MINUTE),
         [_lane(day, name) for name in names],
         list(_blocks(day, without(day.span, day.coverage))),
         list(_nights(lefts, clock)),
         [
-            Tick(f"{hour:02}", left, hour % 6 == 0)
+            HourTick(f"{hour:02}", left, hour % 6 == 0)
             for hour, left in zip(clock, lefts.tolist(), strict=False)
             if hour % 2 == 0
         ],
     )
 
 
-def heard_names(days: Sequence[DayMetrics]) -> list[str]:
+def occurring_classes(days: Sequence[DayMetrics]) -> list[str]:
     """Return the classes that were heard on some of the days; all if there are none."""
     names = [name for name in days[0].home.classes if name != SILENCE]
-    heard = [n for n in names if any(common(d.home.spans[n], d.span).length for d in days)]
-    return heard or names
+    occurring = [n for n in names if any(common(d.home.spans[n], d.span).length for d in days)]
+    return occurring or names
 
 
 def hour_bars(day: DayMetrics, earlier: Sequence[DayMetrics]) -> list[HourBar]:
@@ -185,18 +185,18 @@ def hour_bars(day: DayMetrics, earlier: Sequence[DayMetrics]) -> list[HourBar]:
     return [HourBar(*row) for row in zip(*columns, strict=True)]
 
 
-def _lane(day: DayMetrics, name: str) -> Lane:
+def _lane(day: DayMetrics, name: str) -> TimelineLane:
     spans = day.home.spans[name]
     events = joined(spans.starts, spans.ends, EVENT_PAUSE)
     counts = np.isin(events.starts, day.home.minutes.counted(name, events.starts))
-    unheard = without(without(day.span, day.home.listened[name]), without(day.span, day.coverage))
-    return Lane(
+    gaps = without(without(day.span, day.home.listened[name]), without(day.span, day.coverage))
+    return TimelineLane(
         name,
         in_words(name),
         colour_on_paper(name),
         _in_minutes(day, events, counts),
         _in_minutes(day, events, ~counts),
-        list(_blocks(day, unheard)),
+        list(_blocks(day, gaps)),
     )
 
 
@@ -205,17 +205,17 @@ def _in_minutes(day: DayMetrics, events: Spans, which: Bool) -> Float64:
     return (np.stack(own, axis=1) - day.span.starts[0]) / MINUTE
 
 
-def _blocks(day: DayMetrics, spans: Spans) -> Iterable[Block]:
+def _blocks(day: DayMetrics, spans: Spans) -> Iterable[TimelineBlock]:
     long = spans.ends - spans.starts >= _LEAST_HATCHED * MINUTE
     lefts, rights = (_percent(day, edges[long]).tolist() for edges in spans)
-    return (Block(left, right - left) for left, right in zip(lefts, rights, strict=True))
+    return (TimelineBlock(left, right - left) for left, right in zip(lefts, rights, strict=True))
 
 
-def _nights(lefts: Float64, clock: Sequence[int]) -> Iterable[Block]:
+def _nights(lefts: Float64, clock: Sequence[int]) -> Iterable[TimelineBlock]:
     night = np.array([not MORNING <= hour < EVENING for hour in clock])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], night, [False]]).astype(int)))
     bounds = lefts[edges].reshape(-1, 2).tolist()
-    return (Block(left, right - left) for left, right in bounds)
+    return (TimelineBlock(left, right - left) for left, right in bounds)
 
 
 def _percent(day: DayMetrics, times: Int64) -> Float64:

@@ -11,12 +11,12 @@ from matplotlib.patches import Patch
 
 from hearthlog.analyzer.activity.daily_metrics import DayMetrics
 from hearthlog.analyzer.report.timeline import (
-    Block,
+    DayTimeline,
     HourBar,
-    Lane,
-    Timeline,
-    heard_names,
+    TimelineBlock,
+    TimelineLane,
     hour_bars,
+    occurring_classes,
     timeline_of,
 )
 from hearthlog.analyzer.report.wording import short_day
@@ -26,12 +26,12 @@ _INK, _HATCH, _NIGHT, _LINE = "#1d2733", "#8a94a0", "#e9ecf1", "#c5ccd4"
 _DOTS = 150  # per inch
 _LEAST = 4.0  # minutes: three pixels of the picture
 _PALE = 0.36
-_BESIDE = (210 / 255, 94 / 255, 1 / 255, _PALE)
+_UNCOUNTED = (210 / 255, 94 / 255, 1 / 255, _PALE)
 
 
 def save_timelines(path: Path, days: Sequence[DayMetrics], earlier: Sequence[DayMetrics]) -> None:
     """Draw a day, with the minutes with sound of each hour, or the days of a week."""
-    names = heard_names(days) if len(days) > 1 else None
+    names = occurring_classes(days) if len(days) > 1 else None
     timelines = [timeline_of(day, names) for day in days]
     lanes = [lane for timeline in timelines for lane in timeline.lanes]
     lane_height = 0.3 if len(days) == 1 else 0.11
@@ -46,16 +46,16 @@ def save_timelines(path: Path, days: Sequence[DayMetrics], earlier: Sequence[Day
     figure.savefig(path, format="png", dpi=_DOTS, metadata={"Software": None})
 
 
-def _draw_lanes(axes: Any, timelines: Sequence[Timeline]) -> None:
+def _draw_lanes(axes: Any, timelines: Sequence[DayTimeline]) -> None:
     """Draw lanes from top to bottom, those of a day together."""
     each = len(timelines[0].lanes)
     height = max(each, 1) * len(timelines)
     for number, timeline in enumerate(timelines):
         top = number * each
         _draw_blocks(axes, timeline, timeline.nights, (top, max(each, 1)), color=_NIGHT)
-        _draw_gaps(axes, timeline, timeline.unheard, (top, max(each, 1)))
+        _draw_gaps(axes, timeline, timeline.gaps, (top, max(each, 1)))
         for place, lane in enumerate(timeline.lanes):
-            _draw_gaps(axes, timeline, lane.unheard, (top + place, 1))
+            _draw_gaps(axes, timeline, lane.gaps, (top + place, 1))
             _draw_lane(axes, lane, top + place)
         axes.axhline(top, color=_LINE, linewidth=0.8)
     if len(timelines) == 1:
@@ -69,14 +69,14 @@ def _draw_lanes(axes: Any, timelines: Sequence[Timeline]) -> None:
     _draw_axis(axes, max(timelines, key=lambda timeline: timeline.minutes))
 
 
-def _draw_lane(axes: Any, lane: Lane, top: int) -> None:
+def _draw_lane(axes: Any, lane: TimelineLane, top: int) -> None:
     colour = _shade(lane)
     band = top + 0.12, 0.76
-    axes.broken_barh(_at_least(lane.apart), band, facecolor=(*colour, _PALE), lw=0, zorder=2)
+    axes.broken_barh(_at_least(lane.uncounted), band, facecolor=(*colour, _PALE), lw=0, zorder=2)
     axes.broken_barh(_at_least(lane.counted), band, facecolor=colour, lw=0, zorder=2)
 
 
-def _shade(lane: Lane) -> tuple[float, float, float]:
+def _shade(lane: TimelineLane) -> tuple[float, float, float]:
     red, green, blue = lane.colour
     return red / 255, green / 255, blue / 255
 
@@ -89,7 +89,11 @@ def _at_least(events: Float64) -> list[tuple[float, float]]:
 
 
 def _draw_blocks(
-    axes: Any, timeline: Timeline, blocks: Sequence[Block], band: tuple[float, float], **look: Any
+    axes: Any,
+    timeline: DayTimeline,
+    blocks: Sequence[TimelineBlock],
+    band: tuple[float, float],
+    **look: Any,
 ) -> None:
     share = timeline.minutes / 100
     spans = [(block.left * share, block.width * share) for block in blocks]
@@ -97,16 +101,16 @@ def _draw_blocks(
 
 
 def _draw_gaps(
-    axes: Any, timeline: Timeline, blocks: Sequence[Block], band: tuple[float, float]
+    axes: Any, timeline: DayTimeline, blocks: Sequence[TimelineBlock], band: tuple[float, float]
 ) -> None:
     look = {"facecolor": "white", "edgecolor": _HATCH, "hatch": "////", "zorder": 1}
     _draw_blocks(axes, timeline, blocks, band, **look)
 
 
-def _draw_hours(axes: Any, timeline: Timeline, bars: Sequence[HourBar]) -> None:
+def _draw_hours(axes: Any, timeline: DayTimeline, bars: Sequence[HourBar]) -> None:
     """Draw the minutes with sound in each hour."""
     _draw_blocks(axes, timeline, timeline.nights, (0, 75), color=_NIGHT)
-    _draw_gaps(axes, timeline, timeline.unheard, (0, 75))
+    _draw_gaps(axes, timeline, timeline.gaps, (0, 75))
     share = timeline.minutes / 100
     for bar in bars:
         left, width = bar.left * share, bar.width * share
@@ -129,7 +133,7 @@ def _draw_hours(axes: Any, timeline: Timeline, bars: Sequence[HourBar]) -> None:
 _NUMBERED = 0.5
 
 
-def _draw_axis(axes: Any, timeline: Timeline) -> None:
+def _draw_axis(axes: Any, timeline: DayTimeline) -> None:
     axes.set_xlim(0, timeline.minutes)
     places = [tick.left / 100 * timeline.minutes for tick in timeline.ticks]
     axes.set_xticks(places, [tick.text for tick in timeline.ticks])
@@ -140,7 +144,7 @@ def _draw_axis(axes: Any, timeline: Timeline) -> None:
         side.set_color(_LINE)
 
 
-def _draw_legend(figure: Any, timelines: Sequence[Timeline]) -> None:
+def _draw_legend(figure: Any, timelines: Sequence[DayTimeline]) -> None:
     """Write what colours and hatching mean; the lanes of a day have their names beside them."""
     lanes = timelines[0].lanes if len(timelines) > 1 else []
     entries = [Patch(color=_shade(lane), label=_plain(lane.words)) for lane in lanes]
@@ -148,8 +152,8 @@ def _draw_legend(figure: Any, timelines: Sequence[Timeline]) -> None:
     if any(timeline.has_gaps for timeline in timelines):
         gap = Patch(facecolor="white", edgecolor=_HATCH, hatch="////", label="not recorded")
         entries.append(gap)
-    if any(timeline.has_apart for timeline in timelines):
-        entries.append(Patch(color=_BESIDE, label="beside a television: not counted"))
+    if any(timeline.has_uncounted for timeline in timelines):
+        entries.append(Patch(color=_UNCOUNTED, label="beside a television: not counted"))
     figure.legend(handles=entries, loc="outside lower left", ncols=6, fontsize=8.5, frameon=False)
 
 
