@@ -60,6 +60,7 @@ RUNS = (
     "config",
     "install-service --user",
     "bridge logs --config page.toml",
+    "watch logs --text",
 )
 NEEDS = {
     "headless": (
@@ -105,7 +106,7 @@ def stop(*_):
 def run(command):
     for number, name in ((1, "../out"), (2, "../err")):
         os.dup2(os.open(name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY), number)
-    if command.startswith("bridge"):
+    if command.startswith(("bridge", "watch logs --text")):
         signal.signal(signal.SIGALRM, stop)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.setitimer(signal.ITIMER_REAL, 0.5, 0.5)

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import shlex
 import shutil
 import stat
@@ -13,7 +14,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import typer
 
@@ -30,9 +31,9 @@ _MOST_TOLD = 100  # recent texts kept
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print lines with texts from untrusted files."""
+    """Print lines with texts from untrusted files, wrapped by words on a terminal."""
     for line in lines:
-        print(printable(line))
+        print(wrapped(printable(line), sys.stdout))
 
 
 def print_json(result: dict[str, Any]) -> None:
@@ -42,7 +43,71 @@ def print_json(result: dict[str, Any]) -> None:
 
 def print_notice(text: str) -> None:
     """Write a line to standard error, for anything but results."""
-    print(f"hearthlog: {printable(text)}", file=sys.stderr)
+    print(wrapped(f"hearthlog: {printable(text)}", sys.stderr), file=sys.stderr)
+
+
+_WORD = re.compile(r"\s*(?:`[^`]*`\S*|\S+)")  # a command in backticks is never broken
+_NARROWEST = 20  # columns to wrap at
+
+
+def wrapped(text: str, stream: TextIO) -> str:
+    """Break a line between words at the width of a terminal; unchanged without a terminal."""
+    if not stream.isatty():
+        return text
+    from rich.cells import cell_len
+
+    width = max(terminal_width(), _NARROWEST)
+    lines, used = [""], 0
+    for word in _WORD.findall(text):
+        if used and used + cell_len(word) > width:
+            lines.append("")
+            used, word = 0, f"  {word.lstrip()}"  # noqa: PLW2901
+        lines[-1] += word
+        used += cell_len(word)
+    return "\n".join(lines)
+
+
+def cropped(line: str) -> str:
+    """Crop a line to the width of the terminal."""
+    from rich.cells import cell_len, set_cell_size
+
+    width = terminal_width()
+    return set_cell_size(line, width - 1) if cell_len(line) >= width else line
+
+
+_BLOCKS = "▁▂▃▄▅▆▇█"
+
+
+def bar_of(share: float) -> str:
+    """Return a block whose height is a share, 0 to 1."""
+    place = round(min(max(share, 0.0), 1.0) * (len(_BLOCKS) - 1))
+    return _BLOCKS[place] if _prints(_BLOCKS) else str(place + 1)
+
+
+def long_bar(share: float, width: int) -> str:
+    """Return a bar of a share, 0 to 1, of a width; something above 0 is at least a thin block."""
+    least = 1 if share > 0 else 0
+    eighths = max(round(min(share, 1.0) * width * 8), least)
+    if not _prints(_FULL + _EIGHTHS):
+        return "#" * -(-eighths // 8)
+    return _FULL * (eighths // 8) + (_EIGHTHS[eighths % 8 - 1] if eighths % 8 else "")
+
+
+_FULL, _EIGHTHS = "█", "▏▎▍▌▋▊▉"
+
+
+def _prints(characters: str) -> bool:
+    """Whether standard output has characters in its encoding."""
+    try:
+        characters.encode(sys.stdout.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True
+
+
+def terminal_width() -> int:
+    """Return the columns of the terminal, or of COLUMNS; 160 if neither is known."""
+    return shutil.get_terminal_size((_PLAIN_WIDTH, 24)).columns
 
 
 class ReportOnce:
@@ -136,7 +201,7 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
         )
     for row in cells:
         table.add_row(*row)
-    console = Console(highlight=False, markup=False, emoji=False, width=_width())
+    console = Console(highlight=False, markup=False, emoji=False, width=terminal_width())
     with console.capture() as text:
         console.print(table)
     print(*(line.rstrip() for line in text.get().splitlines()), sep="\n")
@@ -155,16 +220,12 @@ def _print_plainly(rows: Sequence[Sequence[str]], words: int) -> None:
 def print_confusion(classes: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
     """Print a confusion matrix, unless it is too wide."""
     widths = [max(map(len, column)) + _GAP for column in zip(*rows, strict=True)]
-    if NAME_WIDTH + sum(widths) > _width():
+    if NAME_WIDTH + sum(widths) > terminal_width():
         print("confusion: too many classes for a table; --json has it")
         return
     print(title)
     named = zip(classes, rows, strict=True)
     print_table((), [(shortened(name, NAME_WIDTH), *row) for name, row in named])
-
-
-def _width() -> int:
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else _PLAIN_WIDTH
 
 
 class OutputClosedError(Exception):

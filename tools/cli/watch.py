@@ -1,4 +1,4 @@
-"""`hearthlog watch`: a home live, in Rerun or Foxglove."""
+"""`hearthlog watch`: a home live, in Rerun, in Foxglove, or as lines of text."""
 
 import secrets
 import signal
@@ -124,6 +124,9 @@ def watch(
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Wait for Foxglove or Lichtblick instead of Rerun.")
     ] = False,
+    text: Annotated[
+        bool, typer.Option("--text", help="Print the current sounds as lines in the terminal.")
+    ] = False,
     port: Annotated[
         int | None,
         typer.Option(min=1, max=65535, help="Port for viewers, or, with --web, of the page."),
@@ -165,10 +168,15 @@ def watch(
         wrong_use("--web opens a viewer here, --serve opens none: choose one")
     if bind is not None and not (serve or foxglove):
         wrong_use("--bind goes with --serve or --foxglove")
+    if text:
+        others = {"web": web, "serve": serve, "foxglove": foxglove, "port": port, "bind": bind}
+        _check_given("does not go with --text", **others, minutes=minutes)
     if foxglove:
-        _check_given("does not go with", web=web, serve=serve, minutes=minutes, timezone=timezone)
+        _check_given(
+            "does not go with --foxglove", web=web, serve=serve, minutes=minutes, timezone=timezone
+        )
     else:
-        _check_given("goes with", origin=origin, start=start, end=end)
+        _check_given("goes with --foxglove", origin=origin, start=start, end=end)
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
@@ -180,7 +188,11 @@ def watch(
     newest = last_time(logs)
     if newest is None and start is None and end is None:
         print_notice(f"no log in {logs} yet; waiting for a recorder")
-    if foxglove:
+    if text:
+        from hearthlog.tools.cli.sound_lines import print_sounds
+
+        troubled = print_sounds(logs, newest, timezone, stop)
+    elif foxglove:
         span = parse_span(start, end)
         troubled = show_in_foxglove(logs, port, bind, origin, span, stop)
     else:
@@ -193,7 +205,7 @@ def watch(
 def _check_given(how: str, **options: object) -> None:
     for name, value in options.items():
         if value:
-            wrong_use(f"--{name} {how} --foxglove")
+            wrong_use(f"--{name} {how}")
 
 
 def _show_in_rerun(
