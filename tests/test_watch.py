@@ -9,11 +9,13 @@ import subprocess
 import time
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC
 from itertools import islice, takewhile
 
 import numpy as np
 import psutil
 import pytest
+import rerun as rr
 from conftest import HEARTHLOG
 from PIL import Image
 from rerun.experimental import ViewerClient
@@ -23,6 +25,8 @@ from waiting import wait_for
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
+from hearthlog.analyzer.logs.never_tell import write_list
+from hearthlog.analyzer.review.current_sounds import AWAY_SECONDS, CurrentSound, CurrentSounds
 from hearthlog.analyzer.review.lanes import (
     FEATURES,
     FLOOR,
@@ -38,6 +42,7 @@ from hearthlog.analyzer.review.live_timeline import LiveTimeline, last_time
 from hearthlog.analyzer.review.timeline import LogLines, Plot
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import LiveServer
+from hearthlog.models.classes import ordered
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -173,7 +178,7 @@ def test_a_lane_has_the_colour_of_what_is_heard_where_it_is_heard(logs):
         tint = colour(segments["label"][longest])
         share = 1 - (last_time(logs) - middle) / (MINUTES * 60 * SECOND)
         wait_for(lambda: is_there(eye.picture(), tint, round(share * 1599)))
-        assert [view.reports for view in eye.views(6)] == [[]] * 6
+        assert [view.reports for view in eye.views(7)] == [[]] * 7
         for process in (psutil.Process(watcher.pid), eye.pid):
             found = [c.laddr.ip for c in process.net_connections() if c.status == "LISTEN"]
             assert [ip.split(".")[0] for ip in found] == ["127"]
@@ -242,6 +247,67 @@ def test_lanes_are_sent_at_once_and_plots_every_few_seconds():
         wait_for(lambda: eye.newest() == begin + 5 * SECOND)
 
 
+class Letters(list):
+    """The texts that a server shows in large letters."""
+
+    def __init__(self, monkeypatch):
+        send = rr.RecordingStream.send_columns
+
+        def note(recording, entity, indexes, columns):
+            columns = [*columns]
+            if entity == "current":
+                texts = (each for each in columns if "text" in str(each.component_descriptor()))
+                self.append(next(texts).as_arrow_array().to_pylist()[0][0])
+            return send(recording, entity, indexes, columns)
+
+        monkeypatch.setattr(rr.RecordingStream, "send_columns", note)
+
+
+def heard_now(sounds, label, begin, count, **about):
+    """Add labels of now."""
+    microphone, confidence = about.get("microphone", "mic"), about.get("confidence", 0.87)
+    own = sounds.microphones.setdefault(microphone, CurrentSound(microphone))
+    own.seen = time.monotonic()
+    times = begin + FRAME_NANOSECONDS * np.arange(count)
+    own.push(times, np.full(count, label, object), np.full(count, confidence, np.float32))
+    return own
+
+
+def test_large_letters_say_what_is_heard_now_how_sure_and_since_when(tmp_path, monkeypatch):
+    letters, sounds = Letters(monkeypatch), CurrentSounds(tmp_path, pytest.fail)
+    begin = 1_772_348_400 * SECOND
+    with LiveServer(free_port(), "127.0.0.1", MINUTES) as server:
+        heard_now(sounds, "silence", begin, 100)
+        heard_now(sounds, "coughing", begin + 5 * SECOND, 40)
+        server.show_current(sounds, UTC)
+        other = heard_now(sounds, "music", begin, 1, microphone="living_room [](x:/y)")
+        other.seen -= AWAY_SECONDS + 1
+        server.show_current(sounds, UTC)
+        write_list(tmp_path, ["coughing"])
+        sounds.hide()
+        server.show_current(sounds, UTC)
+    assert letters[0] == "# Coughing · 87 % · for 2 s"
+    assert letters[1].splitlines() == [
+        "# Living room (xy) · Nobody listens since 2026-03-01 07:00",
+        "",
+        "# Mic · Coughing · 87 % · for 2 s",
+    ]
+    assert letters[2].endswith("# Mic · A sound · 87 % · for 2 s")
+    assert len(letters) == 3
+
+
+def test_large_letters_change_once_a_minute_while_the_sound_does_not(tmp_path, monkeypatch):
+    letters, sounds = Letters(monkeypatch), CurrentSounds(tmp_path, pytest.fail)
+    begin = 1_772_348_400 * SECOND
+    with LiveServer(free_port(), "127.0.0.1", MINUTES) as server:
+        for second in range(3600):
+            confidence = 0.87 + 0.04 * (second % 2)
+            heard_now(sounds, "silence", begin + second * SECOND, 20, confidence=confidence)
+            server.show_current(sounds, UTC)
+    assert 60 <= len(letters) <= 80
+    assert letters[-1] == "# Quiet · 91 % · for over 1 h 0 min"
+
+
 def test_a_window_hardly_grows_with_what_it_paints(display, monkeypatch):
     monkeypatch.setenv("DISPLAY", display)
     names, shades = tuple(map(str, range(9))), np.random.default_rng(1).random((180, 9))
@@ -277,13 +343,16 @@ def test_a_lane_ends_as_the_segments_say_and_is_filled_until_they_do(logs):
     assert np.diff(times).max() <= SECOND
 
 
-def test_means_are_those_of_the_frames_of_a_second(logs):
+def test_means_are_those_of_the_frames_of_a_second(logs, model_file):
     found = [each for each in news(logs) if isinstance(each, Plot)]
     columns = read_columns(find_logs(logs))
     stamps, values = (columns["/mic/label"][name] for name in ("header.stamp", "probabilities"))
     shares = [each for each in found if each.kind is SHARES]
     times = np.concatenate([each.times for each in shares])
     means = np.concatenate([each.values for each in shares])
+    names = load_model(model_file).classes
+    assert list(shares[0].names) == ordered(names)
+    values = values[:, [names.index(name) for name in shares[0].names]]
     second = times[40] // SECOND
     assert np.allclose(means[40], values[stamps // SECOND == second].mean(axis=0), atol=1e-6)
     assert len(times) < len(stamps) / 15

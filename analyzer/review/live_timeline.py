@@ -15,6 +15,7 @@ from hearthlog.analyzer.review.lanes import (
     FLOOR,
     GAP_STATE,
     GAPS,
+    LEVEL,
     RECORDER,
     SHARES,
     TROUBLE,
@@ -29,6 +30,7 @@ from hearthlog.analyzer.review.lanes import (
     state_lane,
 )
 from hearthlog.analyzer.review.timeline import LabelledSpans, LogLines, Plot, PlotKind
+from hearthlog.models.classes import ordered
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
@@ -119,7 +121,12 @@ class LiveTimeline:
             scale = self._scales.setdefault((rows.microphone, *rows.names), _Scale())
             yield rows._replace(times=times[present], values=scale(means[present]))
             return
-        yield rows._replace(times=times, values=rows.kind.of_means(means))
+        if rows.kind is SHARES:
+            names = ordered(rows.names)
+            means = means[:, [rows.names.index(name) for name in names]]
+            rows = rows._replace(names=tuple(names))
+        values = rows.kind.of_means(means)
+        yield rows._replace(times=times, values=values.round(1) if rows.kind is LEVEL else values)
         if rows.kind is SHARES:
             best = np.where(present, np.nan_to_num(means).argmax(axis=1), len(rows.names))
             states = np.array([*rows.names, None], object)[best]

@@ -289,18 +289,26 @@ def _follow(
 ) -> bool:
     """Draw new data until stopped; return whether something could not be read."""
     from hearthlog.analyzer.logs.layers import zone_of
+    from hearthlog.analyzer.review.current_sounds import CurrentSounds
     from hearthlog.analyzer.review.live_timeline import LiveTimeline
     from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.follow import follow_messages
 
     damaged = ReportOnce()
-    live, zone = LiveTimeline(), None
-    for path, batch in follow_messages(logs, start=start, stop=stop, damaged=damaged):
-        zone = zone or zone_of([logs], timezone)
+    live, sounds, zone = LiveTimeline(), CurrentSounds(logs, damaged), None
+    for path, batch in follow_messages(logs, start=start, stop=stop, damaged=damaged, ticks=True):
         try:
-            server.show(live.take(path, batch), zone)
+            if path == logs:
+                sounds.is_live = True
+            else:
+                zone = zone or zone_of([logs], timezone)
+                server.show(live.take(path, batch), zone)
+                sounds.push(path, batch)
         except LogError as error:
             damaged(error)
+        if zone is not None and sounds.is_live:
+            sounds.hide()
+            server.show_current(sounds, zone)
         if stop.is_set():
             break
     return bool(damaged)

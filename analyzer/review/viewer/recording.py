@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, tzinfo
 from pathlib import Path
@@ -16,7 +16,14 @@ import rerun.blueprint as rrb
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
-from hearthlog.analyzer.review.lanes import PLOTS, Checked, StateLane
+from hearthlog.analyzer.review.current_sounds import (
+    CurrentSound,
+    CurrentSounds,
+    lasting,
+    microphone_words,
+    silent_since,
+)
+from hearthlog.analyzer.review.lanes import DIRECTION, FEATURES, NOVELTY, PLOTS, Checked, StateLane
 from hearthlog.analyzer.review.live_timeline import Update
 from hearthlog.analyzer.review.timeline import LogLines, Plot, Timeline, home_clock
 from hearthlog.analyzer.review.timeline_reader import read_frames
@@ -40,6 +47,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
     tabs,
     write_checked,
 )
+from hearthlog.models.classes import ordered
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS, time_text
 from hearthlog.schemas.new_files import check_new, new_file
@@ -123,6 +131,12 @@ _TOGETHER = 4 * NANOSECONDS  # minimum per plot message: each costs a viewer kil
 _MOST_STROKES = 1_200  # maximum of a band on the screen
 _STATES = "lanes"  # entity of all lanes
 _HEAD_HEIGHT, _LANE_HEIGHT = 90, 48
+_CURRENT = "current"  # entity of the text of the current sounds
+_TEXT_HEIGHT, _TEXT_LINE = 20, 44
+_DETAILS, _DETAILS_HEIGHT = {DIRECTION, NOVELTY, FEATURES}, 160  # plots in tabs
+_STEP_SECONDS = 1, 10, 60  # between updates of a sound: in the first 10 s, the first minute, later
+_LEAST_CHANGE = 0.1  # of a confidence, for an update
+_MOST_NAMED = 8  # microphones in the text
 _MOST_STATES = 2_000  # maximum of a lane's states with their own colours
 
 Plots = dict[str, list[Plot]]  # by entity: the first plot of each set of names
@@ -159,6 +173,7 @@ class LiveServer:
         self._waiting: dict[str, list[Plot]] = {}  # by entity: plots too short to be sent yet
         self._lanes: dict[str, dict[str, Colour]] = {}
         self._is_laid_out = True  # there is nothing to lay out
+        self._current: dict[str, tuple[str, int, float]] = {}  # by microphone: what was last shown
 
     def __enter__(self) -> Self:
         return self
@@ -178,6 +193,23 @@ class LiveServer:
             layout = _layout(self._plots, self._minutes, self._canvas.clock.name)
             self._recording.send_blueprint(layout, make_active=True, make_default=True)
             self._is_laid_out = True
+
+    def show_current(self, sounds: CurrentSounds, zone: tzinfo) -> None:
+        """Show in large letters what is heard now, if it has changed enough.
+
+        Each update costs a viewer some kilobytes that it never drops.
+        """
+        named = [one for _, one in sorted(sounds.microphones.items()) if one.time][:_MOST_NAMED]
+        current = {one.microphone: _step(one, sounds) for one in named}
+        if not named or not _differ(self._current, current):
+            return
+        self._current = current
+        time = max(one.time for one in named)
+        clock = self._canvas_at(time, zone).clock
+        lines = [_line(one, sounds, zone, several=len(named) > 1) for one in named]
+        column = rr.TimeColumn(clock.name, timestamp=[np.datetime64(clock.shown(time), "ns")])
+        text = rr.TextDocument.columns(text=["\n\n".join(lines)], media_type=["text/markdown"])
+        self._recording.send_columns(_CURRENT, [column], text)
 
     def _canvas_at(self, time: int, zone: tzinfo) -> Canvas:
         clock = home_clock(zone, time, time + 1)
@@ -201,7 +233,7 @@ class LiveServer:
             return  # a lane appears with its first state
         colours = self._lanes.get(entity) or lane.kind.colours(lane.kind.states)
         if entity not in self._lanes or (states - colours.keys() and len(colours) < _MOST_STATES):
-            self._lanes[entity] = lane.kind.colours(sorted(states)) | colours
+            self._lanes[entity] = lane.kind.colours(ordered(states)) | colours
             canvas.configure_states(entity, self._lanes[entity])
         canvas.change_states(entity, lane.times, lane.states)
 
@@ -223,6 +255,35 @@ class LiveServer:
             self._waiting[entity] = waiting
 
 
+def _step(sound: CurrentSound, sounds: CurrentSounds) -> tuple[str, int, float]:
+    """Return the words of a sound, the step of its length, and its confidence."""
+    if not sound.is_listening():
+        return "", 0, 0.0
+    seconds = (sound.time - sound.since) / NANOSECONDS
+    first, second, third = _STEP_SECONDS
+    step = first if seconds < 10 else second if seconds < 60 else third
+    return sounds.words(sound), int(seconds // step) + sound.since, sound.confidence
+
+
+def _differ(
+    one: Mapping[str, tuple[str, int, float]], other: Mapping[str, tuple[str, int, float]]
+) -> bool:
+    if one.keys() != other.keys():
+        return True
+    pairs = [(one[name], other[name]) for name in one]
+    return any(a[:2] != b[:2] or abs(a[2] - b[2]) >= _LEAST_CHANGE for a, b in pairs)
+
+
+def _line(sound: CurrentSound, sounds: CurrentSounds, zone: tzinfo, *, several: bool) -> str:
+    """Return a heading of Markdown for a microphone."""
+    if sound.is_listening():
+        confidence = f"{100 * sound.confidence:.0f} %"
+        parts = [sounds.words(sound), confidence, lasting(sound)]
+    else:
+        parts = [silent_since(sound, zone)]
+    return f"# {' · '.join([microphone_words(sound.microphone)] * several + parts)}"
+
+
 def _joined(parts: Sequence[Plot]) -> Plot:
     times = np.concatenate([part.times for part in parts])
     return parts[0]._replace(times=times, values=np.concatenate([part.values for part in parts]))
@@ -231,10 +292,12 @@ def _joined(parts: Sequence[Plot]) -> Plot:
 def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
     """Lay out the views, whose time axes end with the newest data."""
     microphones = sorted({same[0].microphone for same in plots.values()})
+    current = rrb.TextDocumentView(origin=_CURRENT, name="Now", titlebar=False)
     rows: list[Row] = [
+        (_TEXT_HEIGHT + _TEXT_LINE * min(len(microphones), _MOST_NAMED), current),
         (_HEAD_HEIGHT + _LANE_HEIGHT * len(microphones), states_view(_STATES, "What is heard")),
         (580, tabs(_stack_plots(name, plots) for name in microphones)),
-        (160, lines_view()),
+        (140, lines_view()),
     ]
     panel = rrb.TimePanel(state="collapsed", timeline=clock, play_state="following")
     ends = (Boundary.cursor_relative(seconds=seconds) for seconds in (-60 * minutes, 0.0))
@@ -242,16 +305,23 @@ def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
 
 
 def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
-    """Show the plots of a microphone; kinds with the same title share a view."""
+    """Show the plots of a microphone; kinds with the same title share a view, some share tabs."""
     rows: list[Row] = []
+    details = []
     for title in dict.fromkeys(kind.title for kind in PLOTS):
         shown = {
             root: same
             for root, same in plots.items()
             if same[0].kind.title == title and same[0].microphone == microphone
         }
-        if shown:
-            first = [plot for same in shown.values() for plot in same]
-            view = plot_view(first, list(shown), live=True)
+        if not shown:
+            continue
+        first = [plot for same in shown.values() for plot in same]
+        view = plot_view(first, list(shown), live=True)
+        if first[0].kind in _DETAILS:
+            details.append(view)
+        else:
             rows.append((first[0].kind.height, view))
+    if details:
+        rows.append((_DETAILS_HEIGHT, tabs(details)))
     return stack(rows, microphone)
