@@ -1,4 +1,4 @@
-"""Tables of the command: whole where they are piped, as wide as the terminal on one."""
+"""Tables and messages of the command: whole where they are piped, as wide as a terminal on one."""
 
 import os
 import pty
@@ -7,17 +7,17 @@ import sys
 
 import pytest
 
-from hearthlog.tools.cli.terminal import print_confusion, print_table
+from hearthlog.tools.cli.terminal import print_confusion, print_notice, print_table
 
 HEAD = ("class", "support", "false alarms/day")
 ROWS = [("objects_activity", "123", "5019.8"), ("a\x1b[31m\nb", "7", "-")]
 CODE = f"from hearthlog.tools.cli.terminal import print_table; print_table({HEAD!r}, {ROWS!r})"
 
 
-def printed_on_a_terminal(columns):
+def printed_on_a_terminal(columns, code=CODE, stream="stdout"):
     shown, terminal = pty.openpty()
     env = {k: v for k, v in os.environ.items() if k != "NO_COLOR"} | {"COLUMNS": str(columns)}
-    with subprocess.Popen([sys.executable, "-c", CODE], stdout=terminal, env=env) as process:
+    with subprocess.Popen([sys.executable, "-c", code], env=env, **{stream: terminal}) as process:
         os.close(terminal)
         text = b""
         while part := _read(shown):
@@ -62,6 +62,50 @@ def test_a_table_is_no_wider_than_the_terminal_and_figures_stay_whole(columns):
     assert max(map(len, lines)) <= columns
     assert "5019.8" in text
     assert "\x1b[31m" not in text
+
+
+WIDE = ("class", "support", "precision", "recall", "F1", "95 %", "1-s F1", "false alarms/day")
+FIGURES = ("Telephone ringing", "1234", "0.5", "0.5", "0.5", "0.521-0.734", "0.5", "100.1")
+
+
+@pytest.mark.parametrize("columns", range(20, 120, 7))
+def test_no_word_of_a_table_is_broken(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    print_table(WIDE, [FIGURES, FIGURES])
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= columns
+    assert {word for cell in (*WIDE[1:], *FIGURES) for word in cell.split()} <= {
+        word.strip(",") for word in text.split()
+    }
+
+
+def test_a_table_that_fits_no_terminal_is_a_list_with_the_heads_beside_the_figures(
+    monkeypatch, capsys
+):
+    monkeypatch.setenv("COLUMNS", "40")
+    print_table(WIDE, [FIGURES])
+    assert capsys.readouterr().out == (
+        "Telephone ringing\n"
+        "    support 1234, precision 0.5, recall\n"
+        "    0.5, F1 0.5, 95 % 0.521-0.734, 1-s\n"
+        "    F1 0.5, false alarms/day 100.1\n"
+    )
+
+
+@pytest.mark.parametrize("columns", [30, 60])
+def test_a_message_on_a_terminal_breaks_between_words_and_in_no_command(columns):
+    text = "a message for people who read it; next: `hearthlog review logs --queue`, or wait"
+    code = f"from hearthlog.tools.cli.terminal import print_notice; print_notice({text!r})"
+    lines = printed_on_a_terminal(columns, code, "stderr").splitlines()
+    assert max(map(len, lines)) <= max(columns, 40)
+    assert " ".join(" ".join(lines).split()) == f"hearthlog: {text}"
+    assert any("`hearthlog review logs --queue`" in line for line in lines)
+
+
+def test_a_message_that_is_piped_is_one_line(capfd):
+    text = "a message for people " * 20
+    print_notice(text)
+    assert capfd.readouterr().err == f"hearthlog: {text}\n"
 
 
 def test_a_confusion_matrix_that_is_too_wide_is_not_drawn(capsys):

@@ -157,7 +157,7 @@ models = typer.Typer(
 )
 models.command()(fetch)
 
-_HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "size")
+_HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "MB")
 
 
 class _ClassShare(NamedTuple):
@@ -556,7 +556,7 @@ def _is_here(network: str) -> bool:
 
 def _row(entry: "ModelEntry") -> tuple[str, ...]:
     alias = ", ".join((*entry.aliases, *["starter"] * entry.starter))
-    size = f"{entry.size / 1e6:.2f} MB"
+    size = f"{entry.size / 1e6:.2f}"
     if entry.model is None:
         return ascii(entry.name)[1:-1], alias, "cannot be used", "", "", "", "", size
     description = entry.model.description

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import stat
 import sys
+import textwrap
 import threading
 import time
 from collections import deque
@@ -190,21 +191,78 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     if len(cells) > _MANY:
         _print_plainly([list(head)] * bool(head) + cells, words)
         return
-    table = Table(box=None, pad_edge=False, show_header=bool(head))
-    for place in range(len(cells[0])):
-        least = max(len(row[place]) for row in cells) if place >= words else None
+    widths, gap = _fitted(head, cells, words)
+    if not widths:
+        _print_records(head, cells)
+        return
+    table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0), show_header=bool(head))
+    for place, width in enumerate(widths):
         table.add_column(
             head[place] if head else "",
             justify="left" if place < words else "right",
-            min_width=least,
+            width=width,
             overflow="fold",
         )
     for row in cells:
         table.add_row(*row)
-    console = Console(highlight=False, markup=False, emoji=False, width=terminal_width())
+    # A terminal narrower than a table without heads breaks its lines.
+    whole = max(terminal_width(), sum(widths) + gap * len(widths))
+    console = Console(highlight=False, markup=False, emoji=False, width=whole)
     with console.capture() as text:
         console.print(table)
     print(*(line.rstrip() for line in text.get().splitlines()), sep="\n")
+
+
+_LONGEST_WORD = 36  # of a text column that is not broken
+_RECORD_INDENT = "    "
+
+
+def _fitted(
+    head: Sequence[str], cells: Sequence[Sequence[str]], words: int
+) -> tuple[list[int], int]:
+    """Return the widths and the gap of columns that break no word; no widths if none fit."""
+    from rich.cells import cell_len
+
+    def longest_word(texts: Iterable[str]) -> int:
+        return max((cell_len(word) for text in texts for word in text.split()), default=1)
+
+    columns = list(zip(*cells, strict=True))
+    heads = list(head) or [""] * len(columns)
+    widths, least = [], []
+    for place, (title, column) in enumerate(zip(heads, columns, strict=True)):
+        widest = max(cell_len(cell) for cell in column)
+        widths.append(max(widest, cell_len(title), 1))
+        kept = widest if place >= words else min(longest_word(column), _LONGEST_WORD)
+        least.append(max(kept, longest_word([title])))
+    for gap in (_GAP, 1):
+        room = terminal_width() - gap * (len(widths) - 1)
+        if sum(least) <= room or not head:
+            break
+    else:
+        return [], 0
+    order = [range(words), range(words, len(widths))]  # figures are wrapped last
+    while sum(widths) > room:
+        wide = [[i for i in places if widths[i] > least[i]] for places in order]
+        if not any(wide):
+            break
+        widths[max(wide[0] or wide[1], key=widths.__getitem__)] -= 1
+    return widths, gap
+
+
+def _print_records(head: Sequence[str], cells: Iterable[Sequence[str]]) -> None:
+    """Print each row as its first cell, and below it the others with their heads."""
+    for first, *rest in cells:
+        print(first)
+        named = [f"{name} {cell}" for name, cell in zip(head[1:], rest, strict=True) if cell]
+        for line in textwrap.wrap(
+            ", ".join(named),
+            max(terminal_width(), 2 * len(_RECORD_INDENT)),
+            initial_indent=_RECORD_INDENT,
+            subsequent_indent=_RECORD_INDENT,
+            break_long_words=False,
+            break_on_hyphens=False,
+        ):
+            print(line)
 
 
 def _print_plainly(rows: Sequence[Sequence[str]], words: int) -> None:
