@@ -197,7 +197,7 @@ def test_a_layer_is_a_log_that_says_what_made_it_and_doctor_is_content(logs, log
     info = hearthlog("info", layer)
     assert info.returncode == 0
     assert f"layer: {layer}" in info.stdout
-    assert f"layer: {layer}" in hearthlog("info", logs).stdout
+    assert f"layer: {layer}" in hearthlog("info", logs, "--verbose").stdout
 
 
 def test_a_log_with_a_layer_replays_as_without_it(logs, log, zero, hearthlog, model_file):

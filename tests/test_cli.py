@@ -6,13 +6,17 @@ import re
 import shutil
 import subprocess
 import sys
+from datetime import date
 
 import numpy as np
 import pytest
 import soundfile
 from conftest import HEARTHLOG
+from homelife import at, write_day
 from mcap.writer import Writer as McapWriter
 
+from hearthlog.analyzer.logs.never_tell import write_list
+from hearthlog.models.classes import SILENCE, in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
@@ -20,6 +24,7 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import Topic
 
 needs_setpriv = pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv")
+DAY = date(2026, 3, 2)
 HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow", "pandas"}
 
 
@@ -51,27 +56,59 @@ def test_info_tells_span_topics_rates_labels_and_model(logs, hearthlog, model_fi
 
 
 def test_info_for_people_has_the_same_figures(logs, hearthlog):
-    text = hearthlog("info", logs).stdout
+    text = hearthlog("info", logs, "--verbose").stdout
     assert "2 files" in text
-    assert "2026-03-01T06:59:00.000Z to 2026-03-01T07:02:00.000Z" in text
+    assert "2026-03-01T06:59:00.000Z to 2026-03-01T07:02:00.000Z in UTC" in text
     assert "hearthlog_msgs/msg/AudioFeatures" in text
 
 
 def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(logs, hearthlog):
     figures = json.loads(hearthlog("info", logs, "--json").stdout)
-    heard, unsure, *_, last = hearthlog("info", logs).stdout.splitlines()
-    minutes = figures["segment_minutes"]["hall"].values()
-    assert sum(minutes) == pytest.approx(3, abs=0.1)
-    assert re.findall(r"([\d.]+) min", heard) == [f"{each:.1f}" for each in minutes]
-    assert heard.startswith("hall, as labelled (segments): ")
-    rattles = figures["segments"]["hall"]["objects_activity"]
-    assert re.search(rf"household sounds [\d.]+ min \({rattles}\)", heard)
-    amounts = figures["unsure"]["hall"]
-    doubt = f"{amounts['minutes']:.1f} min ({amounts['segments']})"
-    assert unsure.startswith(f"hall is unsure of: {doubt} of these, and 0.0 min (0) of no class")
-    assert last == f"next: {figures['next']}"
-    assert last == f"next: review ten spans: hearthlog review {logs} --queue"
+    what, heard, state, title, *rest = hearthlog("info", logs).stdout.splitlines()
+    assert what.startswith("Home flat, microphone hall: 3.0 min, 2026-0")
+    assert heard.startswith("Listened: 3.0 min of 3.0 min; heard most: ")
+    assert state == f"All is well; next: {figures['next']}"
+    assert state.endswith(f"review ten spans: hearthlog review {logs} --queue")
+    assert title == "hall: time with each sound, and number of segments"
+    minutes, segments = figures["segment_minutes"]["hall"], figures["segments"]["hall"]
+    rows = rest[: len(minutes)]
+    assert [row.split("  ")[1] for row in rows] == [in_words(name) for name in ordered(minutes)]
+    for row, name in zip(rows, ordered(minutes), strict=True):
+        amount, number, unit, count = row.split()[-4:]
+        length = 60 * float(number) if unit == "min" else float(number)
+        assert length == pytest.approx(60 * minutes[name], abs=3)
+        assert int(count) == segments[name]
+        assert set(amount) <= (set("█▏▎▍▌▋▊▉") if name != SILENCE else set(in_words(name)))
+    longest = max(rows, key=lambda row: row.count("█"))
+    assert longest.count("█") == 24
+    doubt = figures["unsure"]["hall"]
+    assert rest[len(rows)].startswith("hall is unsure of ")
+    assert rest[len(rows)].endswith(f"({doubt['segments']}) of these")
+    assert len(re.findall(r"minutes|frame", "".join(rest))) == 0, "one set of amounts"
     assert figures["streams"][0]["starter"] is False
+
+
+def test_info_tells_times_of_the_home_and_trouble_and_names_no_class_that_is_hidden(
+    hearthlog, tmp_path
+):
+    events = [
+        (at("09:00"), 600.0, "music", 0.9),
+        (at("10:00"), 90.0, "coughing", 0.8),
+        (at("11:00"), 9000.0, "speech", 0.8),
+    ]
+    gap = (at("20:00"), 3600.0, "paused")
+    write_day(tmp_path, DAY, events, gaps=[gap], timezone="Europe/Vienna")
+    write_list(tmp_path, ["music"])
+    result = hearthlog("info", tmp_path)
+    assert result.returncode == 3
+    what, heard, state, _, *rest = result.stdout.splitlines()
+    assert re.search(r"2026-03-02 02:00:00 to 2026-03-03 01:00:00 \(Europe/Vienna\)", what)
+    assert heard.endswith("; heard most: talking 2 h 30 min and coughing 1.5 min")
+    assert state.startswith("Not heard: 1 gap, together 3600.000 s")
+    assert [row.split()[0] for row in rest[:3]] == ["Coughing", "Talking", "Quiet"]
+    assert "gap: mic 2026-03-02 21:00:00 3600.000 s" in result.stdout
+    assert "usic" not in result.stdout
+    assert "music" in json.loads(hearthlog("info", tmp_path, "--json").stdout)["segments"]["mic"]
 
 
 def test_info_says_that_a_starter_labelled_and_leads_on_to_a_model_of_the_home(
@@ -81,22 +118,23 @@ def test_info_says_that_a_starter_labelled_and_leads_on_to_a_model_of_the_home(
     hearthlog("record", day, "--model", "general", "-o", logs)
     found = hearthlog("info", logs).stdout
     assert re.search(r"model general \(\w{12}\), a starter model, not trained on this home", found)
-    assert found.splitlines()[-1].endswith(f"hearthlog review {logs} --queue")
+    assert found.splitlines()[2].endswith(f"hearthlog review {logs} --queue")
     hearthlog("export", logs, "-o", labels, "--topics", "/mic/segment")
     hearthlog("annotate", "import", logs, labels)
-    assert hearthlog("info", logs).stdout.splitlines()[-1] == (
-        "next: train a model on the marks of this home (keep recording: the check needs ten "
-        f"minutes that it was not trained on): hearthlog train --home {logs}"
+    assert hearthlog("info", logs).stdout.splitlines()[2] == (
+        "All is well; next: train a model on the marks of this home (keep recording: the check "
+        f"needs ten minutes that it was not trained on): hearthlog train --home {logs}"
     )
     soundfile.write(tmp_path / "quiet.wav", np.zeros(16_000 * 20), 16_000)
     hearthlog("record", tmp_path / "quiet.wav", "--model", "general", "-o", tmp_path / "quiet")
-    assert hearthlog("info", tmp_path / "quiet").stdout.splitlines()[-1] == (
-        "next: only silence was recorded so far: leave it recording, or test the microphone"
+    assert hearthlog("info", tmp_path / "quiet").stdout.splitlines()[2] == (
+        "All is well; next: only silence was recorded so far: leave it recording, or test the "
+        "microphone"
     )
     (bare := tmp_path / "bare").mkdir()
     hearthlog("record", day, "--model", "none", "-o", bare)
-    assert hearthlog("info", bare).stdout.splitlines()[-1] == (
-        f"next: nothing is labelled: hearthlog relabel {bare} --model general"
+    assert hearthlog("info", bare).stdout.splitlines()[2] == (
+        f"All is well; next: nothing is labelled: hearthlog relabel {bare} --model general"
     )
 
 
@@ -135,10 +173,10 @@ def test_info_lists_the_first_gaps_and_json_all_of_them_with_status_3(hearthlog,
     log = gaps(tmp_path / "a.mcap", 15)
     text = hearthlog("info", log)
     assert text.returncode == 3
-    total, *_ = text.stdout.splitlines()
-    assert total == "not heard: 15 gaps, together 3.750 s"
-    first, *_, more = text.stdout.splitlines()[-11:]
-    assert first == "gap: hall 2026-03-01T07:00:00.000Z 0.250 s, 5 frames: overrun"
+    _, total, first, *lines = text.stdout.splitlines()
+    assert total == "Not heard: 15 gaps, together 3.750 s"
+    assert first == "gap: hall 2026-03-01 07:00:00 0.250 s, 5 frames: overrun"
+    more = lines[9]
     assert more == "gap: and 5 more (--json lists all)"
     result = hearthlog("info", log, "--json")
     assert result.returncode == 3
@@ -214,7 +252,7 @@ def test_info_of_a_foreign_log_shows_its_topics(hearthlog, tmp_path):
     result = hearthlog("info", path)
     assert result.returncode == 0
     assert "written by someone else's" in result.stdout.splitlines()
-    assert "1970-01-01T00:00:00.000Z to 1970-01-01T00:00:04.000Z (0:00:04)" in result.stdout
+    assert "1970-01-01T00:00:00.000Z to 1970-01-01T00:00:04.000Z in UTC (0:00:04)" in result.stdout
     topic = json.loads(hearthlog("info", path, "--json").stdout)["topics"]["/reading"]
     assert topic == {"type": "", "encoding": "json", "messages": 5, "rate_hz": 1.0, "bytes": None}
 
@@ -222,7 +260,7 @@ def test_info_of_a_foreign_log_shows_its_topics(hearthlog, tmp_path):
 def test_info_sends_nothing_of_a_file_to_the_terminal_that_would_steer_it(hearthlog, tmp_path):
     log = gaps(tmp_path / "a.mcap", 1, reason="\x1b[2J[red]gone\r\n")
     result = hearthlog("info", log)
-    assert result.stdout.splitlines()[-1].endswith(" 5 frames:  [2J[red]gone  ")
+    assert result.stdout.splitlines()[2].endswith(" 5 frames:  [2J[red]gone  ")
 
 
 def test_recording_imports_nothing_of_the_analyzer_but_its_tables(day, model_file, tmp_path):

@@ -1,19 +1,21 @@
 """`hearthlog info` and `hearthlog catalog`: contents of logs, and of a folder of homes."""
 
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from datetime import UTC, tzinfo
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.errors import LogError, Progress, printable
+from hearthlog.schemas.errors import HearthlogError, LogError, Progress, printable
+from hearthlog.schemas.logs.metadata import NEVER_TELL
 from hearthlog.tools.cli.options import Json, Log, Scheduler, log_location, logs_folder
 from hearthlog.tools.cli.terminal import (
     first_of,
+    long_bar,
     moment,
     number,
     print_lines,
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.logs.summary import LogSummary
     from hearthlog.schemas.logs.contents import Status
     from hearthlog.schemas.logs.metadata import RecordedScenario
-    from hearthlog.tools.cli.info_summary import Accuracy
+    from hearthlog.tools.cli.info_summary import Accuracy, Overview
 
 
 _LEVELS = ("ok", "warning", "error", "stale")  # levels of diagnostic_msgs/DiagnosticStatus
@@ -37,10 +39,14 @@ _LEVELS = ("ok", "warning", "error", "stale")  # levels of diagnostic_msgs/Diagn
 def info(
     path: Log,
     *,
+    verbose: Annotated[
+        bool,
+        typer.Option("--verbose", help="Also show the files, their topics, rates and metadata."),
+    ] = False,
     catalog: Annotated[bool, typer.Option("--catalog", hidden=True)] = False,
     as_json: Json = False,
 ) -> None:
-    """Show the contents of a log: span, topics, rates, gaps, labels, model, sizes.
+    """Show what was heard, for how long, and whether all is well.
 
     Exit status 3: a file is unfinished or damaged, or sound is missing.
     """
@@ -49,7 +55,7 @@ def info(
     from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.models.modelfile.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
-    from hearthlog.tools.cli.info_summary import next_step
+    from hearthlog.tools.cli.info_summary import Overview, next_step
 
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
@@ -70,12 +76,17 @@ def info(
         }
         print(json.dumps(_as_json(summary) | said, indent=2))
     else:
-        _print(summary)
+        overview = Overview(summary, *_zone_and_hidden(path))
+        print_lines(overview.lines(following))
+        _print_amounts(overview)
+        print_lines(_stream_lines(summary))
         print_lines(_model_lines(summary, path, scenarios))
-        for line in () if accuracy is None else accuracy.lines():
-            print(printable(line))
-        if following is not None:
-            print(printable(f"next: {following}"))
+        print_lines(() if accuracy is None else accuracy.lines())
+        print_lines(_gap_lines(summary, overview))
+        if verbose or not summary.streams:
+            _print_files(summary)
+        else:
+            print("more about the files and their topics: --verbose")
     if summary.unfinished or summary.damaged or summary.gaps:
         raise typer.Exit(3)
 
@@ -209,10 +220,45 @@ def _health(health: "Status | None") -> dict[str, str] | None:
     }
 
 
-def _print(summary: "LogSummary") -> None:
-    from hearthlog.tools.cli.info_summary import gist
+def _zone_and_hidden(path: Path) -> "tuple[tzinfo, frozenset[str]]":
+    """Return the time zone of the home, and the classes that no output shows."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.logs.local_time import home_zone
 
-    print_lines(gist(summary))
+    try:
+        logs = find_home_logs([path])
+        hidden = logs.never_tell()
+    except LogError as error:  # of no home
+        if NEVER_TELL in str(error):
+            print_notice(str(error))
+        return UTC, frozenset()
+    try:
+        return home_zone(None, logs.records()), hidden
+    except HearthlogError as error:
+        print_notice(str(error))
+        return UTC, hidden
+
+
+_BAR_WIDTH = 24
+
+
+def _print_amounts(overview: "Overview") -> None:
+    """Print a bar for each class, by microphone."""
+    from hearthlog.tools.cli.info_summary import amount_text
+
+    for microphone, amounts in overview.bars():
+        texts = [amount_text(one) for one in amounts]
+        lengths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+        name = max((len(one.words) for one in amounts), default=0)
+        print(printable(f"{microphone}: time with each sound, and number of segments"))
+        for one, (minutes, segments) in zip(amounts, texts, strict=True):
+            bar = long_bar(one.share, _BAR_WIDTH)
+            figures = f"{minutes:>{lengths[0]}}  {segments:>{lengths[1]}}"
+            print(printable(f"  {one.words:{name}}  {bar:{_BAR_WIDTH}}  {figures}"))
+    print_lines(overview.doubts())
+
+
+def _print_files(summary: "LogSummary") -> None:
     print_lines(_lines(summary))
     topics = [
         (
@@ -225,9 +271,7 @@ def _print(summary: "LogSummary") -> None:
         for name, topic in sorted(summary.topics.items())
     ]
     print_table(("topic", "type", "messages", "per second", "MB raw"), topics, words=2)
-    heads = "microphone", "label", "minutes by frame", "segments"
-    print_table(heads, _label_rows(summary), words=2)
-    print_lines(_gap_lines(summary))
+    print_table(("labelling", "label", "segments"), _layer_rows(summary), words=2)
 
 
 def _lines(summary: "LogSummary") -> Iterator[str]:
@@ -240,7 +284,7 @@ def _lines(summary: "LogSummary") -> Iterator[str]:
         yield "no messages"
     else:
         start, end = map(moment, summary.span)
-        yield f"{start} to {end} ({_duration(summary.seconds)})"
+        yield f"{start} to {end} in UTC ({_duration(summary.seconds)})"
     origins = {
         "written by": summary.libraries,
         "profile": summary.profiles,
@@ -253,6 +297,14 @@ def _lines(summary: "LogSummary") -> Iterator[str]:
     )
     yield from first_of("unfinished", [str(path) for path in summary.unfinished])
     yield from first_of("layer", [str(path) for path in summary.layers])
+    latest, worst = _health(summary.latest_health), _health(summary.health)
+    for what, one in (("health", latest), ("health, worst status", worst)):
+        if one is not None and not (one is worst and worst == latest):
+            yield f"{what}: {one['level']}, {one['time']} {one['name']}: {one['message']}"
+
+
+def _stream_lines(summary: "LogSummary") -> Iterator[str]:
+    """Yield device, feature set and model of each microphone."""
     for stream in summary.streams:
         model = f"{stream['model']} ({stream['model_sha256'][:12]})" if stream["model"] else "none"
         device = stream["device"] or "no microphone"
@@ -260,29 +312,25 @@ def _lines(summary: "LogSummary") -> Iterator[str]:
             f"{stream['microphone']}: {device}, features {stream['feature_set']}, model "
             f"{model}{', a starter model, not trained on this home' * stream['starter']}"
         )
-    latest, worst = _health(summary.latest_health), _health(summary.health)
-    for what, one in (("health", latest), ("health, worst status", worst)):
-        if one is not None and not (one is worst and worst == latest):
-            yield f"{what}: {one['level']}, {one['time']} {one['name']}: {one['message']}"
 
 
-def _gap_lines(summary: "LogSummary") -> Iterator[str]:
+def _gap_lines(summary: "LogSummary", overview: "Overview") -> Iterator[str]:
     lines = [
-        f"{gap.microphone} {moment(gap.start)} {gap.seconds:.3f} s, "
+        f"{gap.microphone} {overview.local(gap.start)} {gap.seconds:.3f} s, "
         f"{number(gap.frames_lost, 'frame')}: {gap.reason}"
         for gap in summary.gaps
     ]
     yield from first_of("gap", lines)
 
 
-def _label_rows(summary: "LogSummary") -> Iterator[tuple[str, ...]]:
+def _layer_rows(summary: "LogSummary") -> Iterator[tuple[str, ...]]:
+    """Yield the segments of layers, scenarios and reviews."""
     from hearthlog.models.classes import in_words, ordered
 
-    for microphone in dict.fromkeys([*summary.label_seconds, *summary.segments]):
-        seconds = summary.label_seconds.get(microphone, Counter())
-        segments = summary.segments.get(microphone, Counter())
-        for label in ordered([*seconds, *segments]):
-            yield microphone, in_words(label), f"{seconds[label] / 60:.2f}", str(segments[label])
+    for labelling, segments in summary.segments.items():
+        if "/" in labelling:
+            for label in ordered(segments):
+                yield labelling, in_words(label), str(segments[label])
 
 
 def _duration(seconds: float) -> str:

@@ -2,8 +2,10 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from datetime import tzinfo
 from pathlib import Path
+from typing import NamedTuple
 
 from hearthlog.analyzer.activity.checked_minutes import (
     CheckedMinutes,
@@ -14,41 +16,183 @@ from hearthlog.analyzer.activity.checked_minutes import (
     read_reviewed_labels,
 )
 from hearthlog.analyzer.activity.event_counts import FEWEST, SET_APART
+from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.summary import LogSummary
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, in_words
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, in_words, ordered
 from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.errors import listed
+from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.files import REVIEW_LAYER, log_name
-from hearthlog.schemas.messages.topics import LIVE, REVIEW
+from hearthlog.schemas.messages.topics import LIVE, REVIEW, is_scenario, topic
 from hearthlog.tools.cli.options import models_folder
 from hearthlog.tools.cli.terminal import JUDGED_BY, number
 
+_DAY = 86_400  # seconds
+_NO_SOUNDS = {SILENCE, UNKNOWN}
+_MOST_NAMED = 3  # classes in the line of what was heard most
 
-def gist(summary: LogSummary) -> Iterator[str]:
-    """Yield sentences on what was recorded, how much is in doubt, and what is missing."""
-    for microphone, seconds in summary.segment_seconds.items():
-        if "/" in microphone:  # a layer's topic
-            continue
-        segments = summary.segments.get(microphone, Counter())
-        unsure = summary.unsure.get(microphone, Counter())
-        known = [label for label, _ in seconds.most_common() if class_name(label) != UNKNOWN]
-        amounts = (
-            f"{in_words(label).lower()} {seconds[label] / 60:.1f} min"
-            f"{f' ({segments[label]})' * (class_name(label) != SILENCE)}"
-            for label in known
+
+class ClassAmount(NamedTuple):
+    """Segments of a class; `share` is their length relative to the longest, 0 for silence."""
+
+    words: str
+    minutes: float
+    segments: int
+    share: float
+
+
+class Overview:
+    """What people want to know of logs: whose they are, what was heard, and whether all is well.
+
+    Parameters
+    ----------
+    hidden : collection of str
+        Classes that no output shows.
+    """
+
+    def __init__(self, summary: LogSummary, zone: tzinfo, hidden: Collection[str] = ()) -> None:
+        self._summary, self._zone, self._hidden = summary, zone, hidden
+
+    def lines(self, following: str | None) -> Iterator[str]:
+        """Yield three lines: what this is; what was heard; whether all is well, the next step."""
+        yield self._what()
+        if self._microphones():
+            yield self._heard()
+        state = self._trouble() or "All is well"
+        yield f"{state}{f'; next: {following}' * (following is not None)}"
+
+    def bars(self) -> Iterator[tuple[str, list[ClassAmount]]]:
+        """Yield the amounts of each class by microphone; silence has no bar."""
+        of_scenarios = {
+            name: each for name, each in self._summary.segment_seconds.items() if _scenario(name)
+        }
+        for microphone, seconds in (self._segments() | of_scenarios).items():
+            segments = self._summary.segments.get(microphone, Counter())
+            sounds = [name for name in seconds if class_name(name) != SILENCE]
+            longest = max((seconds[name] for name in sounds), default=0.0)
+            yield (
+                _scenario(microphone) or microphone,
+                [
+                    ClassAmount(
+                        in_words(name),
+                        seconds[name] / 60,
+                        segments[name],
+                        seconds[name] / longest if name in sounds and longest else 0.0,
+                    )
+                    for name in ordered(seconds)
+                    if class_name(name) not in self._hidden
+                ],
+            )
+
+    def doubts(self) -> Iterator[str]:
+        """Yield how much of the labels is in doubt, by microphone."""
+        for microphone, seconds in self._segments().items():
+            unsure = self._summary.unsure.get(microphone, Counter())
+            if seconds:
+                minutes = _minutes(unsure["seconds"] / 60)
+                yield f"{microphone} is unsure of {minutes} ({unsure['segments']}) of these"
+
+    def local(self, time: int) -> str:
+        """Format a time (ns of UTC) in the zone of the home."""
+        return f"{local_time(time, self._zone):%Y-%m-%d %H:%M:%S}"
+
+    def _what(self) -> str:
+        names = self._microphones()
+        nodes = (
+            sorted({log_name(path).node for path in self._summary.files} - {""}) if names else []
         )
-        yield f"{microphone}, as labelled (segments): {', '.join(amounts)}"
-        other = seconds.keys() - set(known)
-        yield (
-            f"{microphone} is unsure of: {unsure['seconds'] / 60:.1f} min ({unsure['segments']}) "
-            f"of these, and {sum(seconds[label] for label in other) / 60:.1f} min "
-            f"({sum(segments[label] for label in other)}) of no class that it knows"
-        )
-    if summary.gaps:
-        yield (
+        whose = f"Home {listed(nodes, 'and')}" if nodes else "Logs"
+        if names:
+            whose += (
+                f", {'microphone' if len(names) == 1 else 'microphones'} {listed(names, 'and')}"
+            )
+        if self._summary.span is None:
+            return f"{whose}: no messages"
+        first, last = self._summary.span
+        length = _hours(self._summary.seconds)
+        span = f"{self.local(first)} to {self.local(last)} ({_zone_name(self._zone)})"
+        return f"{whose}: {length}, {span}"
+
+    def _heard(self) -> str:
+        whole, listened = self._summary.seconds, self._listened()
+        hours = listed([f"{name} {_hours(listened[name])}" for name in sorted(listened)], "and")
+        if len(listened) == 1 or len(set(map(_hours, listened.values()))) == 1:
+            hours = _hours(next(iter(listened.values())))
+        text = f"Listened: {hours} of {_hours(whole)}"
+        total: Counter[str] = Counter()
+        for seconds in self._segments().values():
+            total.update(seconds)
+        sounds = [name for name, _ in total.most_common() if class_name(name) not in _NO_SOUNDS]
+        most = [
+            f"{in_words(name).lower()} {_minutes(total[name] / 60)}"
+            for name in sounds
+            if class_name(name) not in self._hidden
+        ][:_MOST_NAMED]
+        return f"{text}; heard most: {listed(most, 'and')}" if most else text
+
+    def _trouble(self) -> str:
+        summary = self._summary
+        lost = (
             f"not heard: {number(len(summary.gaps), 'gap')}, together {summary.gap_seconds:.3f} s"
         )
+        unfinished = number(len(summary.unfinished), "file")
+        health = summary.latest_health
+        troubles = [
+            *[lost] * bool(summary.gaps),
+            *[f"{number(len(summary.damaged), 'file')} damaged"] * bool(summary.damaged),
+            *[f"{unfinished} still being written, or cut off"] * bool(summary.unfinished),
+            *([f"the recorder reported: {health.message}"] if health and health.level else []),
+        ]
+        text = ", ".join(troubles)
+        return text[:1].upper() + text[1:]
+
+    def _microphones(self) -> list[str]:
+        own = [stream["microphone"] for stream in self._summary.streams]
+        return list(dict.fromkeys([*own, *self._segments()]))
+
+    def _segments(self) -> dict[str, Counter[str]]:
+        """Return the seconds in segments of the recorder's labels, by microphone and label."""
+        seconds = self._summary.segment_seconds
+        return {name: each for name, each in seconds.items() if "/" not in name}
+
+    def _listened(self) -> dict[str, float]:
+        lengths = {one["microphone"]: one["frame_seconds"] for one in self._summary.streams}
+        found = {}
+        for name in self._microphones():
+            features = self._summary.topics.get(topic(name, "features"))
+            frames = 0 if features is None else features.messages
+            own = sum(self._segments().get(name, Counter()).values())
+            found[name] = frames * lengths.get(name, FRAME_SECONDS) or own
+        return found
+
+
+def _scenario(labelling: str) -> str:
+    """Return microphone and scenario of a labelling in words; empty if it is of no scenario."""
+    microphone, _, rest = labelling.partition("/")
+    return f"{microphone}, {rest.replace('/', ' ')}" if is_scenario(rest) else ""
+
+
+def _zone_name(zone: tzinfo) -> str:
+    return "UTC" if str(zone) == "Etc/UTC" else str(zone)
+
+
+def _hours(seconds: float) -> str:
+    if seconds >= 2 * _DAY:
+        return f"{seconds / _DAY:.1f} days"
+    return f"{seconds / 3600:.1f} h" if seconds >= 2 * 3600 else _minutes(seconds / 60)
+
+
+def _minutes(minutes: float) -> str:
+    if minutes < 1:
+        return f"{60 * minutes:.0f} s"
+    return f"{minutes:.1f} min" if minutes < 100 else Duration.show(minutes)
+
+
+def amount_text(one: ClassAmount) -> tuple[str, str]:
+    """Format the minutes and the number of segments of a class."""
+    return _minutes(one.minutes), f"{one.segments:,}"
 
 
 def next_step(summary: LogSummary, path: Path) -> str | None:
