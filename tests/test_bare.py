@@ -61,6 +61,7 @@ RUNS = (
     "install-service --user",
     "bridge logs --config page.toml",
     "watch logs --text",
+    "watch logs --layout home.json",
 )
 NEEDS = {
     "headless": (

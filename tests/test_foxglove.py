@@ -20,6 +20,8 @@ import pytest
 from conftest import HEARTHLOG
 from foxglove import layouts
 from growing import GROWN, grown_definitions, write_as_later
+from homelife import GENERAL as GENERAL_HOME
+from livehome import LiveHome
 from logreader import LogReader
 from test_interoperability import plain
 from test_typescript import FOLDER, like, need_node
@@ -28,15 +30,19 @@ from waiting import wait_for
 from hearthlog.analyzer.foxglove.publisher import RecordedSpan
 from hearthlog.analyzer.foxglove.server import Admission, RefusedError
 from hearthlog.analyzer.http import free_port
+from hearthlog.analyzer.logs.never_tell import write_list
+from hearthlog.analyzer.logs.selection import array_names
+from hearthlog.models.classes import in_words, ordered
 from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.starter import GENERAL, starter_file
-from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
+from hearthlog.schemas.mcap.chunks import read_definitions
+from hearthlog.schemas.mcap.logfile import LogFile
+from hearthlog.schemas.messages.fields import fields_of
 from hearthlog.schemas.messages.message_types import FEATURES, LABEL
+from hearthlog.schemas.messages.type_definitions import message_type
 
 SECOND = 1_000_000_000
 START = 1_772_348_370 * SECOND  # half a minute before a full hour: two logs
-LAYOUTS = Path(__file__).parents[1] / "docs" / "layouts"
 GOLDEN = Path(__file__).parent / "golden"
 SILENT_SECONDS = 1.5  # in which what must not come would have come
 
@@ -681,55 +687,109 @@ def panels_of(tree):
 
 
 @pytest.fixture(scope="module")
-def columns(logs):
-    return read_columns(find_logs(logs))
+def rooms(tmp_path_factory):
+    """A home with two microphones, of which one class is hidden, and the columns of its log."""
+    folder = tmp_path_factory.mktemp("rooms")
+    names = ["living_room", "bath"]
+    write_list(folder, ["music"])
+    home = LiveHome(folder, names, minutes_ago=0)
+    home.says("recorder", 0, "listening")
+    for name in names:
+        home.hears("coughing", name)
+        home.heard("coughing", 0, microphone=name)
+    home.close()
+    return folder
 
 
-def check_path(columns, topic, field, index):
-    """Whether messages have what a layout wants to see."""
-    values = columns[topic][field]
-    assert index is None or int(index) < values.shape[1]
+def layout_of(folder, file):
+    """Write a layout with the command; return its text."""
+    command = [*map(str, [*HEARTHLOG, "watch", folder, "--layout", file])]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert result.stdout == f"{file}\n"
+    assert "open it in " in result.stderr
+    return file.read_text()
 
 
-def test_the_layout_for_foxglove_shows_what_logs_have(columns):
-    layout = json.loads((LAYOUTS / "foxglove.json").read_text())
+def check_path(folder, path, separator):
+    """Whether the log has what a path of a layout names, with so many elements."""
+    pattern = rf"(/\w+/\w+){re.escape(separator)}(\w+)(?:\[(\d+)\])?(?:\.@log10)?"
+    topic, field, index = re.fullmatch(pattern, path).groups()
+    for log in find_logs(folder):
+        with LogFile(log) as file:
+            read_definitions(file)
+            (channel,) = (each for each in file.channels.values() if each.topic == topic)
+            schema = file.schemas[channel.schema_id]
+            types = fields_of(message_type(schema.name, schema.encoding, schema.data))
+            assert field in types
+            names = array_names(channel.metadata, field)
+            assert index is None or int(index) < len(names)
+            name = None if index is None else names[int(index)]
+    return topic.split("/")[1], name
+
+
+def panels_in(layout, configs):
+    """The panels of a layout, with those in tabs."""
+    for panel in panels_of(layout):
+        yield panel
+        for tab in configs[panel].get("tabs", ()):
+            yield from panels_in(tab["layout"], configs)
+
+
+def test_a_layout_for_foxglove_has_the_microphones_and_classes_of_the_home(rooms, tmp_path):
+    layout = json.loads(layout_of(rooms, tmp_path / "home.json"))
     configs = layout["configById"]
-    assert sorted(panels_of(layout["layout"])) == sorted(configs)
+    assert sorted(panels_in(layout["layout"], configs)) == sorted(configs)
     kinds = {
         "Plot": (layouts.PlotConfig, layouts.PlotSeries),
         "StateTransitions": (layouts.StateTransitionsConfig, layouts.StateTransitionsSeries),
         "RosOut": (layouts.LogConfig, None),
         "DiagnosticSummary": (layouts.DiagnosticsSummaryConfig, None),
-        "RawMessages": (layouts.RawMessagesConfig, None),
     }
-    series = {}
+    series = []
     for panel, config in configs.items():
+        if panel == "Tab!microphones":
+            assert [tab["title"] for tab in config["tabs"]] == ["Bath", "Living room"]
+            continue
         of_panel, of_series = kinds[panel.partition("!")[0]]
         titles = {"foxglovePanelTitle", "lichtblickPanelTitle"}
         assert config.keys() - titles <= of_panel()._to_dict().keys()
         for path in config.get("paths", ()):
             assert path.keys() <= of_series()._to_dict().keys()
-            series[path["value"]] = path["label"]
-        shown = config.get("topicToRender", config.get("topicPath"))
-        assert shown is None or shown in columns
-    for value in series:
-        path = re.fullmatch(r"(/\w+/\w+)\.(\w+)(?:\[(\d+)\])?(?:\.@log10)?", value)
-        check_path(columns, *path.groups())
-    general = load_model(starter_file(GENERAL)).classes
-    for number, name in enumerate(general):
-        assert series.pop(f"/mic/label.probabilities[{number}]") == name
-    assert not any("probabilities" in value for value in series)
+            series.append((*check_path(rooms, path["value"], "."), path["label"]))
+        assert config.get("topicToRender", "/rosout") in {"/rosout", "/diagnostics"}
+    shown = [(name, label) for one, name, label in series if one == "bath" and name in GENERAL_HOME]
+    own = [name for name in ordered(GENERAL_HOME) if name != "music"]
+    assert shown == [(name, in_words(name)) for name in own]
+    assert {name for one, name, label in series if label == "level"} == {"energy"}
 
 
-def test_the_layout_for_plotjuggler_shows_what_logs_have(columns):
-    root = ET.parse(LAYOUTS / "plotjuggler.xml").getroot()
+def test_a_layout_for_plotjuggler_has_series_by_the_names_of_classes(rooms, tmp_path):
+    root = ET.fromstring(layout_of(rooms, tmp_path / "home.xml"))
+    assert [tab.get("tab_name") for tab in root.iter("Tab")] == ["Bath", "Living room"]
     made = {snippet.get("name"): snippet for snippet in root.iter("snippet")}
-    curves = {curve.get("name") for curve in root.iter("curve")}
-    sources = {snippet.findtext("linked_source") for snippet in made.values()}
-    for name in curves - made.keys() | sources:
-        path = re.fullmatch(r"(/\w+/\w+)/(\w+)(?:\[(\d+)\])?", name)
-        check_path(columns, *path.groups())
-    classes = load_model(starter_file(GENERAL)).classes
-    assert {f"/mic/label/probabilities[{number}]" for number in range(len(classes))} <= curves
-    (area,) = (a for a in root.iter("DockArea") if a.get("name").startswith("probabilities"))
-    assert area.get("name") == f"probabilities of {', '.join(classes)}"
+    curves = [curve.get("name") for curve in root.iter("curve")]
+    assert made.keys() <= set(curves)
+    for name in set(curves) - made.keys():
+        check_path(rooms, name, "/")
+    named = {
+        name: check_path(rooms, snippet.findtext("linked_source"), "/")
+        for name, snippet in made.items()
+    }
+    assert named.pop("Bath: level in dBFS") == ("bath", "energy")
+    assert named["Living room: Coughing"] == ("living_room", "coughing")
+    own = [name for name in ordered(GENERAL_HOME) if name != "music"]
+    of_bath = [curve for curve in curves if curve.startswith("Bath: ")][:-1]
+    assert of_bath == [f"Bath: {in_words(name)}" for name in own]
+
+
+def test_a_layout_of_one_microphone_has_no_tab_and_names_what_it_cannot_be(logs, refused, tmp_path):
+    layout = json.loads(layout_of(logs, tmp_path / "home.json"))
+    assert not any(panel.startswith("Tab") for panel in layout["configById"])
+    line = refused("watch", logs, "--layout", tmp_path / "home.json")
+    assert line.endswith("home.json: exists already; choose another name, or delete it first")
+    line = refused("watch", logs, "--layout", tmp_path / "home.txt", status=2)
+    assert line.endswith("must end in .json for Foxglove, or in .xml for PlotJuggler")
+    line = refused("watch", logs, "--layout", tmp_path / "a.json", "--web", status=2)
+    assert line == "--web does not go with --layout"
+    (tmp_path / "empty").mkdir()
+    assert "no log" in refused("watch", tmp_path / "empty", "--layout", tmp_path / "a.json")

@@ -18,13 +18,12 @@ from foxglove.websocket import (
 from mcap import records
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.foxglove.layouts import ChannelType, channels_of
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, log_name, time_span
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.logs.merged_reading import iterate_messages, time_spans
-from hearthlog.schemas.mcap.chunks import read_definitions
-from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages, in_order_of_time
 from hearthlog.schemas.messages.message_types import STREAM_INFO
 
@@ -88,17 +87,6 @@ _WINDOW = 3600 * NANOSECONDS  # logs of this span are read at once
 _RECENT = NANOSECONDS  # messages this long before a moment are still shown at it
 
 Damaged = Callable[[LogError], None]
-ChannelType = tuple[records.Channel, records.Schema | None]
-
-
-def channels_of(log: Path) -> list[ChannelType]:
-    """List the channels of a log with their schemas.
-
-    Raise `LogError` if it cannot be read, is not an MCAP file, or is damaged.
-    """
-    with LogFile(log) as file:
-        read_definitions(file)
-        return [(each, file.schemas.get(each.schema_id)) for each in file.channels.values()]
 
 
 class RecordedSpan:

@@ -2,7 +2,7 @@
 
 import secrets
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from ipaddress import ip_address
 from pathlib import Path
@@ -77,6 +77,7 @@ def _reported_address(admission: "Admission", port: int) -> Iterator[None]:
             file.write_text(f"{address}\n")  # only this account can read the folder
             address = f"ws://{place}/; its full address is in {file}"
         print_notice(f"open in Foxglove or Lichtblick: {address}")
+        print_notice("panels with the names of this home: `hearthlog watch --layout home.json`")
         _report_reach(admission, place)
         yield
 
@@ -153,6 +154,15 @@ def watch(
         str | None,
         typer.Option(help="With --foxglove: play the recording up to this log time."),
     ] = None,
+    layout: Annotated[
+        Path | None,
+        typer.Option(
+            dir_okay=False,
+            metavar="FILE",
+            help="Write a layout with the microphones and classes of this home: for Foxglove and "
+            "Lichtblick if FILE ends in .json, for PlotJuggler if in .xml.",
+        ),
+    ] = None,
     minutes: Annotated[
         int | None,
         typer.Option(min=1, max=120, help="Seconds to show.", show_default=str(_MINUTES)),
@@ -164,19 +174,14 @@ def watch(
     The recorder is not affected: only its logs are read. Exit status 3: some logs could not
     be read.
     """
-    if web and serve:
-        wrong_use("--web opens a viewer here, --serve opens none: choose one")
-    if bind is not None and not (serve or foxglove):
-        wrong_use("--bind goes with --serve or --foxglove")
-    if text:
-        others = {"web": web, "serve": serve, "foxglove": foxglove, "port": port, "bind": bind}
-        _check_given("does not go with --text", **others, minutes=minutes)
-    if foxglove:
-        _check_given(
-            "does not go with --foxglove", web=web, serve=serve, minutes=minutes, timezone=timezone
-        )
-    else:
-        _check_given("goes with --foxglove", origin=origin, start=start, end=end)
+    rerun = {"web": web, "serve": serve, "minutes": minutes, "timezone": timezone}
+    served = {"origin": origin, "start": start, "end": end}
+    network = {"port": port, "bind": bind}
+    _check_options(rerun, served, network, layout, text=text, foxglove=foxglove)
+    if layout is not None:
+        _write_layout(logs, layout, serves=foxglove)
+        if not foxglove:
+            return
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: stop.set())
@@ -200,6 +205,60 @@ def watch(
         troubled = _show_in_rerun(logs, newest, *shown, stop, web=web, serve=serve)
     if troubled:
         raise typer.Exit(3)
+
+
+def _check_options(
+    rerun: Mapping[str, object],
+    served: Mapping[str, object],
+    network: Mapping[str, object],
+    layout: Path | None,
+    *,
+    text: bool,
+    foxglove: bool,
+) -> None:
+    """Check that options of Rerun, of Foxglove's server, and of both fit what is shown."""
+    if rerun["web"] and rerun["serve"]:
+        wrong_use("--web opens a viewer here, --serve opens none: choose one")
+    if text:
+        others = {**rerun, **network, "foxglove": foxglove, "layout": layout, "timezone": None}
+        _check_given("does not go with --text", **others)
+    elif foxglove:
+        _check_given("does not go with --foxglove", **rerun)
+    elif layout is not None:
+        _check_given("does not go with --layout", **rerun, **network)
+    if network["bind"] is not None and not (rerun["serve"] or foxglove):
+        wrong_use("--bind goes with --serve or --foxglove")
+    if not foxglove:
+        _check_given("goes with --foxglove", **served)
+
+
+def _write_layout(logs: Path, file: Path, *, serves: bool) -> None:
+    from hearthlog.analyzer.foxglove.layouts import (
+        FOXGLOVE_SUFFIX,
+        PLOTJUGGLER_SUFFIX,
+        foxglove_layout,
+        microphones_to_lay_out,
+        plotjuggler_layout,
+    )
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.schemas.new_files import check_new, new_file
+
+    kinds = {
+        FOXGLOVE_SUFFIX: (foxglove_layout, "Foxglove or Lichtblick: Layouts, Import from file"),
+        PLOTJUGGLER_SUFFIX: (plotjuggler_layout, "PlotJuggler: Layout, after a log is opened"),
+    }
+    if file.suffix not in kinds:
+        wrong_use(f"--layout {file}: must end in .json for Foxglove, or in .xml for PlotJuggler")
+    check_new(file)
+    write, where = kinds[file.suffix]
+    text = write(microphones_to_lay_out(find_home_logs([logs])))
+    with new_file(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    if serves:
+        print_notice(f"layout: {file.resolve()}; open it in {where}")
+    else:
+        print(file.resolve())
+        print_notice(f"open it in {where}")
 
 
 def _check_given(how: str, **options: object) -> None:
