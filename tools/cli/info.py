@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.schemas.errors import HearthlogError, LogError, Progress, printable
-from hearthlog.schemas.logs.metadata import NEVER_TELL
 from hearthlog.tools.cli.options import Json, Log, Scheduler, log_location, logs_folder
 from hearthlog.tools.cli.terminal import (
     first_of,
@@ -224,6 +223,7 @@ def _zone_and_hidden(path: Path) -> "tuple[tzinfo, frozenset[str]]":
     """Return the time zone of the home, and the classes that no output shows."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
+    from hearthlog.schemas.logs.metadata import NEVER_TELL
 
     try:
         logs = find_home_logs([path])
@@ -342,7 +342,7 @@ def _duration(seconds: float) -> str:
 _HOMES_SHOWN = 40  # one page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
 _COUNTS = "logs", "layers", "unfinished", "damaged"
-_FIGURES = "MB", "hours", "gaps", "gap minutes", "from", "to"
+_FIGURES = "MB", "hours", "gaps", "gap minutes", "from (UTC)", "to (UTC)"
 
 
 def catalog(
@@ -472,6 +472,8 @@ def _home_row(name: str, homes: Sequence["HomeTotals"]) -> Sequence[str]:
 
 def _label_sums(labels: Sequence["LabelAmount"]) -> Iterator[Sequence[str]]:
     """Add up the labels of all homes by kind and model."""
+    from hearthlog.models.classes import in_words
+
     sums: dict[tuple[str, str, str], tuple[float, int]] = {}
     for one in labels:
         kind = f"{one.kind}, scenario {one.scenario}" if one.scenario else one.kind
@@ -481,4 +483,4 @@ def _label_sums(labels: Sequence["LabelAmount"]) -> Iterator[Sequence[str]]:
     for key, (minutes, segments) in sorted(
         sums.items(), key=lambda item: (item[0][:2], -item[1][0])
     ):
-        yield [*key, f"{minutes:.1f}", str(segments)]
+        yield [*key[:2], in_words(key[2]), f"{minutes:.1f}", str(segments)]
