@@ -19,7 +19,7 @@ from hearthlog.analyzer.activity.segments import read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.home_state import follow_home
 from hearthlog.analyzer.bridge.output import Totals
-from hearthlog.analyzer.bridge.page.home_page import day_picture
+from hearthlog.analyzer.bridge.page.day import day_picture
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs

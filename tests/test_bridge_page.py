@@ -26,16 +26,13 @@ from hearthlog.analyzer.bridge.commands import REVIEWER, EventCorrections, class
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page import server
-from hearthlog.analyzer.bridge.page.home_page import (
-    CurrentSounds,
-    HomePage,
-    day_picture,
-    health_list,
-)
+from hearthlog.analyzer.bridge.page.day import day_picture
+from hearthlog.analyzer.bridge.page.home_page import HomePage
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
+from hearthlog.analyzer.bridge.page.status import CurrentSounds, health_list
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
-from hearthlog.analyzer.bridge.wording import length, when
+from hearthlog.analyzer.bridge.wording import ENGLISH
 from hearthlog.analyzer.http import HttpServer
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import Mark, write_marks
@@ -558,12 +555,12 @@ def test_a_microphone_that_is_away_is_not_said_to_listen(said, why):
 def test_times_and_lengths_are_said_in_words():
     now = at(UTC, 2026, 5, 5, 12)
     hour = 3600 * NANOSECONDS
-    assert [when(now - hours * hour, now, UTC) for hours in (1, 13, 60)] == [
+    assert [ENGLISH.when(now - hours * hour, now, UTC) for hours in (1, 13, 60)] == [
         "11:00",
         "yesterday 23:00",
         "3 May 00:00",
     ]
-    said = [length(seconds) for seconds in (0.4, 1, 89, 91, 5400, 7260)]
+    said = [ENGLISH.length(seconds) for seconds in (0.4, 1, 89, 91, 5400, 7260)]
     expected = "less than a second,1 second,89 seconds,2 minutes,1 hour 30 minutes,2 hours 1 minute"
     assert said == expected.split(",")
 
@@ -645,11 +642,11 @@ def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):
     (log,) = find_logs(tmp_path)
     event = SoundEvent("mic", "music", start, start + 4 * NANOSECONDS, 1.0, 4.0)
     write_marks(log, [Mark("mic", start, event.end, "phone_ring", "Ann")])
-    said = EventCorrections(tmp_path, "home")
-    said.read_back()
-    assert said.of(event) == "Marked: Telephone ringing"
+    corrections = EventCorrections(tmp_path, "home")
+    corrections.read_back()
+    assert corrections.of(event) == ("phone_ring", False)
     later = event._replace(start=event.end, end=event.end + NANOSECONDS)
-    assert said.of(later) == ""
+    assert corrections.of(later) is None
 
 
 # In a browser

@@ -30,11 +30,11 @@ from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.mqtt.home_assistant import discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.home_page import scenario_lines
+from hearthlog.analyzer.bridge.page.status import scenario_lines
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
-from hearthlog.analyzer.bridge.wording import times
+from hearthlog.analyzer.bridge.wording import ENGLISH
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.local_time import today
@@ -588,7 +588,7 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
     (line,) = scenario_lines(news)
     assert line["what"] == "Water"
     assert line["about"].startswith("Now not listening. Today ")
-    assert f"toilet flush {times(len(flushes))} (" in line["about"]
+    assert f"toilet flush {ENGLISH.times(len(flushes))} (" in line["about"]
     state.scenarios["mic-water"].seen = math.inf
     assert scenario_lines(news)[0]["about"].startswith("Now ")
     assert "not listening" not in scenario_lines(news)[0]["about"]

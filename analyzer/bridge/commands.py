@@ -3,7 +3,7 @@
 import errno
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import timedelta
 from itertools import pairwise
@@ -15,9 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import class_words
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
-from hearthlog.models.classes import CLASS_NAME, CLASSES, SILENCE, class_name
+from hearthlog.models.classes import CLASS_NAME, CLASSES, class_name
 from hearthlog.recorder import pause_schedule
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -99,10 +98,24 @@ _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 _BY_WORDS = {spelt(row.words): row.name for row in CLASSES}
 
 
+class Correction(NamedTuple):
+    """What a person called an event; `is_own` on the page."""
+
+    label: str
+    is_own: bool
+
+
 class EventCorrections:
-    """Corrections of a recorder's events by people."""
+    """Corrections of a recorder's events by people.
+
+    Attributes
+    ----------
+    number : int
+        Grows with each change.
+    """
 
     def __init__(self, folder: Path, node: str) -> None:
+        self.number = 0
         self._folder = folder
         self._node = node
         self._marks: list[Mark] = []
@@ -118,35 +131,38 @@ class EventCorrections:
         logs = [log for log, name in names if name.node == self._node and not name.layer]
         marked = [log for log in logs[-_MOST_LOGS:] if review_path(log).exists()]
         self._marks = [mark for log in marked for mark in read_marks(log)]
+        self.number += 1
 
-    def of(self, event: SoundEvent) -> str:
-        """Return the correction of an event in a few words; empty if there is none."""
+    def of(self, event: SoundEvent, marks: Sequence[Mark] | None = None) -> Correction | None:
+        """Return the correction of an event; None if there is none.
+
+        Parameters
+        ----------
+        marks : sequence of Mark, optional
+            Marks of the day of the event; by default those of the newest logs.
+        """
         label = self._own.get(event.id)
         if label is not None:
-            return f"You said: {_in_words(label)}"
-        own = [mark for mark in self._marks if mark.microphone == event.microphone]
+            return Correction(label, True)
+        known = self._marks if marks is None else marks
+        own = [mark for mark in known if mark.microphone == event.microphone]
         common = [min(mark.end, event.end) - max(mark.start, event.start) for mark in own]
         if max(common, default=0) <= 0:
-            return ""
+            return None
         mark = own[common.index(max(common))]
-        who = "You said" if mark.reviewer == REVIEWER else "Marked"
-        return f"{who}: {_in_words(mark.label)}"
+        return Correction(mark.label, mark.reviewer == REVIEWER)
 
-    def add(self, event: SoundEvent, text: str) -> str:
-        """Correct the class of an event; return the correction in words.
-
-        Raise `BridgeError` if the text is no valid class name, or the event cannot be marked.
-        """
-        label = class_of(text)
+    def add(self, event: SoundEvent, label: str) -> None:
+        """Correct the class of an event; raise `BridgeError` if it cannot be marked."""
         with self._lock:
             try:
                 correct_event(self._folder, self._node, event, label, REVIEWER)
             except BridgeError as error:
                 raise explained(error) from error
             self._own[event.id] = label
+            self.number += 1
             while len(self._own) > 1000:
                 del self._own[next(iter(self._own))]
-        return self.of(event)
 
 
 def class_of(text: str) -> str:
@@ -162,10 +178,6 @@ def class_of(text: str) -> str:
             "beginning with a letter."
         )
     return label
-
-
-def _in_words(label: str) -> str:
-    return "nothing" if label == SILENCE else class_words(label)
 
 
 def explained(error: Exception) -> HearthlogError:

@@ -251,6 +251,15 @@ class PageSettings(_Table):
         default=[],
         description='Origins that may embed the page, such as ["http://homeassistant.local:8123"].',
     )
+    sound: bool = Field(
+        default=False, description="Play kept sound of events to those who may open the page."
+    )
+    language: str = Field(
+        default="",
+        pattern=r"^([a-z]{2,3})?$",
+        examples=["de"],
+        description="Language of the page; empty: that of the browser, English or German.",
+    )
 
 
 class PingSettings(_Table):

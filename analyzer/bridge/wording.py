@@ -1,74 +1,170 @@
-"""Addresses, labelling sources, days and texts for the home that a bridge follows."""
+"""Words of the page of the home, in each language that has a file of texts."""
 
-from datetime import timedelta, tzinfo
+import json
+import re
+from collections.abc import Mapping, Sequence
+from datetime import date, timedelta, tzinfo
+from functools import cache
+from importlib.resources import files
 
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.models.classes import in_words
-from hearthlog.schemas.errors import printable, shortened
+from hearthlog.models.classes import class_name, in_words
+from hearthlog.schemas.errors import listed, printable, shortened
 
 _LONGEST = 200  # characters of a text from a log
 _LONGEST_NAME = 60
 _SURE, _FAIRLY_SURE = 0.9, 0.7
 _HEARD = {"listening", "reading"}  # diagnostic texts of a working microphone
+_FILES = "hearthlog.analyzer.bridge.page"
+_LANGUAGE = re.compile(r"([a-z]{2,3})\.json")
+_DEFAULT = "en"
+_LONGEST_HEADER = 500  # characters of an `Accept-Language`
+_CLASS = "class."
+
+
+class Words:
+    """The texts of a language.
+
+    Attributes
+    ----------
+    language : str
+        `en`, `de` …
+    texts : mapping of str to str
+        By key, with placeholders in braces.
+    """
+
+    def __init__(self, language: str, texts: Mapping[str, str]) -> None:
+        self.language = language
+        self.texts = texts
+        self._months, self._weekdays = texts["months"].split(), texts["weekdays"].split()
+
+    def text(self, key: str, **values: object) -> str:
+        """Return the text of a key, with values in place of its placeholders."""
+        return self.texts[key].format(**values)
+
+    def count(self, key: str, number: int) -> str:
+        """Format a number of things: `12 seconds`."""
+        return self.text(f"{key}.{'one' if number == 1 else 'other'}", count=self.number(number))
+
+    def number(self, number: int) -> str:
+        """Format a whole number: `1,204`."""
+        return f"{number:,}".replace(",", self.texts["thousands"])
+
+    def listed(self, texts: Sequence[str], last: str = "and") -> str:
+        """Return texts as a list: `a, b and c`."""
+        return listed(texts, self.texts[last])
+
+    def translated(self, english: str) -> str:
+        """Return the text in place of an English one of the same key; itself if there is none."""
+        key = _keys_of_english().get(english)
+        return english if key is None else self.texts[key]
+
+    def when(self, time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
+        """Format a time relative to now: `14:05`, `yesterday 23:10`, `3 May 14:05`.
+
+        Parameters
+        ----------
+        seconds : bool
+            Whether to include seconds.
+        """
+        moment, today = local_time(time, zone), local_time(now, zone).date()
+        shown = f"{moment:%H:%M:%S}" if seconds else f"{moment:%H:%M}"
+        if moment.date() == today:
+            return shown
+        if moment.date() == today - timedelta(days=1):
+            return self.text("yesterday", time=shown)
+        short = self.text("date", day=moment.day, month=self._months[moment.month - 1])
+        return self.text("date and time", date=short, time=shown)
+
+    def long_date(self, day: date) -> str:
+        """Format a date: `Tuesday, 3 May`."""
+        names = {"weekday": self._weekdays[day.weekday()], "month": self._months[day.month - 1]}
+        return self.text("long date", day=day.day, **names)
+
+    def short_date(self, day: date) -> str:
+        """Format a date: `Tue, 3 May`."""
+        weekday = self._weekdays[day.weekday()][: int(self.texts["letters of a short weekday"])]
+        month = self._months[day.month - 1]
+        return self.text("long date", weekday=weekday, day=day.day, month=month)
+
+    def length(self, seconds: float) -> str:
+        """Format a length of time: `12 seconds`, `3 minutes`, `2 hours 10 minutes`."""
+        if seconds < 1:
+            return self.text("below a second")
+        if seconds < 90:
+            return self.count("second", round(seconds))
+        minutes = round(seconds / 60)
+        if minutes < 90:
+            return self.count("minute", minutes)
+        hours, rest = divmod(minutes, 60)
+        return self.count("hour", hours) + (f" {self.count('minute', rest)}" if rest else "")
+
+    def sureness(self, confidence: float) -> str:
+        """Format the confidence of a model: `sure (95 %)`."""
+        key = "not sure"
+        if confidence >= _FAIRLY_SURE:
+            key = "sure" if confidence >= _SURE else "fairly sure"
+        return self.text(key, share=f"{100 * confidence:.0f}")
+
+    def times(self, count: int) -> str:
+        """Format a count: `never`, `once`, `4 times`."""
+        key = {0: "never", 1: "once", 2: "twice"}.get(count, "times")
+        return self.text(key, count=self.number(count))
+
+    def class_words(self, label: str) -> str:
+        """Return the display name of a class, on one line of limited length."""
+        words = self.texts.get(f"{_CLASS}{class_name(label)}") or in_words(label)
+        return shortened(words, _LONGEST_NAME)
+
+    def inside(self, words: str) -> str:
+        """Return the display name of a class as it is written inside of a sentence."""
+        return words.lower() if self.texts["noun in a sentence"] == "lower case" else words
+
+    def inside_first(self, sentence: str) -> str:
+        """Return a sentence that begins with a name as the later part of another one."""
+        return self.inside(sentence[:1]) + sentence[1:]
+
+
+@cache
+def languages() -> frozenset[str]:
+    """Return the languages with a file of texts."""
+    names = (_LANGUAGE.fullmatch(each.name) for each in files(_FILES).iterdir())
+    return frozenset(match[1] for match in names if match)
+
+
+@cache
+def words_of(language: str) -> Words:
+    """Return the words of a language; those of English if it has no file."""
+    own = language if language in languages() else _DEFAULT
+    return Words(own, json.loads(files(_FILES).joinpath(f"{own}.json").read_text("utf-8")))
+
+
+@cache
+def _keys_of_english() -> dict[str, str]:
+    return {text: key for key, text in words_of(_DEFAULT).texts.items()}
+
+
+def preferred_language(header: str) -> str:
+    """Return the first language of an `Accept-Language` that has a file of texts, else English."""
+    wanted: list[tuple[float, str]] = []
+    for part in header[:_LONGEST_HEADER].lower().split(","):
+        tag, _, weight = part.strip().partition(";q=")
+        try:
+            share = float(weight or 1)
+        except ValueError:
+            continue
+        if 0 < share <= 1:
+            wanted.append((-share, tag.partition("-")[0]))
+    known = [tag for _, tag in sorted(wanted, key=lambda each: each[0]) if tag in languages()]
+    return known[0] if known else _DEFAULT
+
+
+ENGLISH = words_of(_DEFAULT)
 
 
 def clock(time: int, zone: tzinfo) -> str:
     """Format the local time of day: `14:05`."""
     return f"{local_time(time, zone):%H:%M}"
-
-
-def when(time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
-    """Format a time relative to now: `14:05`, `yesterday 23:10`, `3 May 14:05`.
-
-    Parameters
-    ----------
-    seconds : bool
-        Whether to include seconds.
-    """
-    moment, today = local_time(time, zone), local_time(now, zone).date()
-    shown = f"{moment:%H:%M:%S}" if seconds else f"{moment:%H:%M}"
-    if moment.date() == today:
-        return shown
-    if moment.date() == today - timedelta(days=1):
-        return f"yesterday {shown}"
-    return f"{moment.day} {moment:%B} {shown}"
-
-
-def long_date(time: int, zone: tzinfo) -> str:
-    """Format a date: `Tuesday, 3 May`."""
-    moment = local_time(time, zone)
-    return f"{moment:%A}, {moment.day} {moment:%B}"
-
-
-def length(seconds: float) -> str:
-    """Format a length of time: `12 seconds`, `3 minutes`, `2 hours 10 minutes`."""
-    if seconds < 1:
-        return "less than a second"
-    if seconds < 90:
-        return _counted(round(seconds), "second")
-    minutes = round(seconds / 60)
-    if minutes < 90:
-        return _counted(minutes, "minute")
-    hours, rest = divmod(minutes, 60)
-    return _counted(hours, "hour") + (f" {_counted(rest, 'minute')}" if rest else "")
-
-
-def sureness(confidence: float) -> str:
-    """Format the confidence of a model: `sure (95 %)`."""
-    words = "not sure"
-    if confidence >= _FAIRLY_SURE:
-        words = "sure" if confidence >= _SURE else "fairly sure"
-    return f"{words} ({100 * confidence:.0f} %)"
-
-
-def times(count: int) -> str:
-    """Format a count: `never`, `once`, `4 times`."""
-    return {0: "never", 1: "once", 2: "twice"}.get(count, f"{count} times")
-
-
-def class_words(label: str) -> str:
-    """Return the human-readable name of a class, on one line of limited length."""
-    return shortened(in_words(label), _LONGEST_NAME)
 
 
 def room(microphone: str) -> str:
@@ -90,7 +186,3 @@ def reason(text: str) -> str:
         Last diagnostics of the microphone: `listening` if the recorder ended or was killed.
     """
     return "" if text in _HEARD else text
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"

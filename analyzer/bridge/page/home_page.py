@@ -1,396 +1,69 @@
-"""Page of the home: parts as JSON, updated once a second."""
+"""Page of the home: parts as JSON, updated once a second, and what a browser asks for."""
 
 import json
-import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from datetime import tzinfo
+from collections.abc import Callable, Sequence
+from datetime import date
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from hearthlog.analyzer.activity.events import ANY_SOUND, HOLD_SECONDS, SoundEvent
-from hearthlog.analyzer.activity.sources import source_microphone, source_parts
+from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.commands import EventCorrections, class_of, explained
-from hearthlog.analyzer.bridge.home_state import HomeState, ListeningThreshold, LiveMicrophone
+from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, ListenedTime, day_picture, picture_of
+from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
+from hearthlog.analyzer.bridge.page.sounds import (
+    Bout,
+    KeptSounds,
+    ShownBouts,
+    bouts,
+    events_between,
+)
+from hearthlog.analyzer.bridge.page.status import CurrentSounds, health_list, scenario_lines
 from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, page_token
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import (
-    class_words,
-    clock,
-    length,
-    long_date,
-    reason,
-    room,
-    sureness,
-    times,
-    told,
-    when,
-)
-from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.analyzer.logs.local_time import (
-    EVENING,
-    MORNING,
-    Today,
-    at_hour,
-    day_span,
-    local_time,
-)
+from hearthlog.analyzer.bridge.wording import Words, clock, preferred_language, room, words_of
+from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.never_tell import read_list, write_list
-from hearthlog.analyzer.logs.spans import joined
-from hearthlog.models.classes import SILENCE, in_words, ordered
+from hearthlog.analyzer.marks.marks import Mark
+from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.recorder.host import writes_to_journal
-from hearthlog.schemas.errors import HearthlogError, listed
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
 
-_QUIETEST = -80.0  # dBFS at the left end of the bar
-_GOES_ON = (HOLD_SECONDS + 5) * NANOSECONDS  # after the end of a segment
-_NOT_LISTENING = "Not listening"
-
-
-class _Heard(NamedTuple):
-    words: str
-    since: int  # in nanoseconds of UTC; 0: unknown
-
-
-class CurrentSounds:
-    """Current sounds of each microphone, with their start times."""
-
-    def __init__(self) -> None:
-        self._last: dict[str, _Heard] = {}
-
-    def describe(self, news: News) -> Any:
-        """Return the current sounds for JSON."""
-        microphones = news.state.present()
-        return {
-            "is_recording": news.state.is_recording(),
-            "rooms": [
-                self._room(each, news, is_alone=len(microphones) == 1) for each in microphones
-            ],
-        }
-
-    def _room(self, microphone: LiveMicrophone, news: News, *, is_alone: bool) -> Any:
-        words = _sentence(microphone)
-        last = self._last.get(microphone.name)
-        if last is None or last.words != words:
-            since = _active_since(microphone) or (news.today.now if last is not None else 0)
-            last = self._last[microphone.name] = _Heard(words, since)
-        shown = f"since {when(last.since, news.today.now, news.zone)}" if last.since else ""
-        health = news.state.health.get(microphone.name)
-        is_listening = microphone.is_listening()
-        return {
-            "room": "" if is_alone else room(microphone.name),
-            "words": words,
-            "since": shown,
-            "why": reason(told(health.text)) if health is not None and not is_listening else "",
-            "level": _level(microphone) if is_listening else None,
-        }
-
-
-def _sentence(microphone: LiveMicrophone) -> str:
-    if not microphone.is_listening():
-        return _NOT_LISTENING
-    names = [class_words(label) for label in active_classes(microphone)]
-    if names:
-        return listed([names[0], *map(str.lower, names[1:])], "and")
-    return "A sound" if microphone.heard.is_heard(ANY_SOUND) else in_words(SILENCE)
-
-
-def active_classes(microphone: LiveMicrophone) -> list[str]:
-    """Return the active classes except silence, the most important first."""
-    return [
-        label
-        for label in ordered(microphone.classes)
-        if is_sound(label) and microphone.heard.is_heard(label)
-    ]
-
-
-def _active_since(microphone: LiveMicrophone) -> int:
-    """Return the start of the microphone's current state, from the log; 0 if unknown."""
-    if not microphone.is_listening():
-        return microphone.heard.time
-    heard = active_classes(microphone)
-    if heard:
-        last = [microphone.last_event(label) for label in heard]
-        end = microphone.heard.time - _GOES_ON
-        going = [event.start for event in last if event is not None and event.end >= end]
-        return max(going) if len(going) == len(heard) else 0
-    last = [microphone.last_event(label) for label in microphone.labels()]
-    return max((event.end for event in last if event is not None), default=0)
-
-
-def _level(microphone: LiveMicrophone) -> Any:
-    """Return the level as a share of the bar and as text; None if unknown."""
-    level = microphone.level_dbfs
-    if not math.isfinite(level):
-        return None
-    return min(max(round(1 - level / _QUIETEST, 2), 0.0), 1.0), f"{level:.0f} dB".replace(
-        "-", "\N{MINUS SIGN}"
-    )
-
-
-_SHOWN = 20
+_EVERY_SECONDS = 1.0
+_SHOW = {"yes": True, "no": False}
+_MOST_LOOKED_AT, _MOST_OTHERS = 8, 20  # bouts of the current day
+_MOST_OF_DAY = 200  # bouts of a past day
+_MOST_ASKED = 50  # events in a request
 _DAY = 24 * 3600 * NANOSECONDS
 
 
-def last_events(
-    news: News, said_of: Callable[[SoundEvent], str]
-) -> tuple[dict[str, SoundEvent], Any]:
-    """Return the last events by id, and their description for JSON.
+class PageView:
+    """The parts of the page in one language."""
 
-    Parameters
-    ----------
-    said_of : callable
-        Returns the correction of an event in words; empty if there is none.
-    """
-    microphones = news.state.microphones.values()
-    found: list[SoundEvent] = []
-    for microphone in microphones:
-        for label in microphone.labels():
-            found += microphone.events(label, news.today.midnight - _DAY)[-_SHOWN:]
-    found = sorted(found, key=lambda event: (event.start, event.id), reverse=True)[:_SHOWN]
-    names = ordered(label for each in microphones for label in [*each.classes, *each.labels()])
-    shown = {
-        "events": [
-            _described(event, news, said_of(event), is_alone=len(microphones) == 1)
-            for event in found
-        ],
-        "classes": [(label, class_words(label)) for label in names if is_sound(label)],
-        "hidden": [(label, class_words(label)) for label in ordered(news.state.never_tell)],
-    }
-    return {event.id: event for event in found}, shown
+    def __init__(self, words: Words) -> None:
+        self.words = words
+        self.board = Board()
+        self.now = CurrentSounds(words)
+        self.keys: dict[str, Any] = {}  # of the parts that change seldom
 
+    def put(self, name: str, content: Any) -> None:
+        """Replace a part."""
+        self.board.put(name, json.dumps(content, allow_nan=False).encode())
 
-def _described(event: SoundEvent, news: News, said: str, *, is_alone: bool) -> Any:
-    return {
-        "id": event.id,
-        "label": event.label,
-        "words": class_words(event.label),
-        "colour": colour_on_paper(event.label),
-        "time": when(event.start, news.today.now, news.zone, seconds=True),
-        "length": length(event.seconds),
-        "sure": sureness(event.confidence),
-        "room": "" if is_alone else room(event.microphone),
-        "said": said,
-    }
-
-
-_WELL, _WARNING, _WRONG = 0, 1, 2  # as in diagnostics
-_THINGS = {"disk": "Disk", "machine": "Clock and computer"}
-
-
-def _line(what: str, level: int, text: str) -> dict[str, Any]:
-    return {"what": what, "level": level, "text": text}
-
-
-def health_list(news: News, node: str, started: int, recurring: str = "") -> list[Any]:
-    """Return the health of all subjects for JSON.
-
-    Parameters
-    ----------
-    started : int
-        Start of the bridge, in nanoseconds of UTC.
-    recurring : str, optional
-        Problem with the recurring sounds; empty for none.
-    """
-    lines = [*_lines(news, node, started)]
-    if recurring:
-        lines.append(_line("Sounds that recur", _WARNING, recurring))
-    return lines
-
-
-def _lines(news: News, node: str, started: int) -> Iterator[Any]:
-    state = news.state
-    for microphone in state.present():
-        yield _of_microphone(microphone, state)
-    is_recording = state.is_recording()
-    yield _line(
-        "Recorder",
-        _WELL if is_recording else _WRONG,
-        "recording" if is_recording else "nothing has been written for more than 15 seconds",
-    )
-    for subject, health in sorted(state.health.items()):
-        if subject not in state.microphones:
-            yield _line(_thing(subject, node), min(health.level, _WRONG), told(health.text))
-    yield _line(
-        "Bridge", _WELL, f"follows the recorder since {when(started, news.today.now, news.zone)}"
-    )
-
-
-def _of_microphone(microphone: LiveMicrophone, state: HomeState) -> Any:
-    health = state.health.get(microphone.name)
-    text, level = ("", _WELL) if health is None else (told(health.text), health.level)
-    is_alone = len(state.present()) == 1
-    what = "Microphone" if is_alone else f"Microphone, {room(microphone.name)}"
-    if not microphone.is_listening():
-        why = reason(text)
-        return _line(what, _WRONG, f"not listening: {why}" if why else "not listening")
-    return _line(what, min(level, _WRONG), f"listening: {text}" if level else "listening")
-
-
-def _thing(subject: str, node: str) -> str:
-    whose, _, part = subject.partition(" ")
-    if whose == node and part in _THINGS:
-        return _THINGS[part]
-    return told(subject.replace("_", " ")).capitalize()
-
-
-def scenario_lines(news: News) -> list[Any]:
-    """Return a line for each scenario of each microphone, for JSON."""
-    state, midnight = news.state, news.today.midnight
-    lines = []
-    for name in sorted(state.scenarios):
-        own = state.scenarios[name]
-        today = _today(own, midnight)
-        if own.is_listening() or today:
-            where = [room(source_microphone(name))] if len(state.microphones) > 1 else []
-            what = " · ".join([room(source_parts(name)[1]), *where])
-            lines.append({"what": what, "about": f"Now {_now(own)}. Today {today or 'nothing'}."})
-    return lines
-
-
-def _now(own: LiveMicrophone) -> str:
-    if not own.is_listening():
-        return "not listening"
-    return listed([class_words(label).lower() for label in active_classes(own)], "and") or "nothing"
-
-
-def _today(own: LiveMicrophone, midnight: int) -> str:
-    """Format count and total length of each class since midnight, longest first."""
-    events = {label: own.events(label, midnight) for label in own.labels()}
-    seconds = {label: sum(each.seconds for each in same) for label, same in events.items() if same}
-    return ", ".join(
-        f"{class_words(label).lower()} {times(len(events[label]))} ({length(seconds[label])})"
-        for label in sorted(seconds, key=lambda label: -seconds[label])
-    )
-
-
-BIN = 120 * NANOSECONDS  # as in the picture of the report
-_HOUR = 3600 * NANOSECONDS
-_LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
-_MOST_TIMES = 40  # of a count
-_SILENT = 60 * NANOSECONDS  # shortest gap that is drawn
-_DIGITS = 4  # decimals of a position in the day, 0 to 1
-
-
-class DaySpan(NamedTuple):
-    """A local day from midnight to midnight, in nanoseconds of UTC."""
-
-    start: int
-    end: int
-    zone: tzinfo
-
-    def place(self, time: int) -> float:
-        """Return the position of a time in the day, 0 to 1."""
-        inside = min(max(time, self.start), self.end)
-        return round((inside - self.start) / (self.end - self.start), _DIGITS)
-
-
-def day_picture(microphones: Iterable[LiveMicrophone], today: Today, zone: tzinfo) -> Any:
-    """Return the picture of a day for JSON."""
-    date = local_time(today.midnight, zone).date()
-    day = DaySpan(*day_span(date, zone), zone)
-    hours = range(day.start, day.end, _HOUR)
-    nights = [
-        (day.start, at_hour(date, MORNING, zone)),
-        (at_hour(date, EVENING, zone), day.end),
-    ]
-    return {
-        "title": long_date(today.now, zone),
-        "now": day.place(today.now - today.now % BIN),
-        "hours": [(day.place(hour), local_time(hour, zone).hour) for hour in hours],
-        "nights": [(day.place(start), day.place(end)) for start, end in nights],
-        "rooms": [_room(microphone, day, today) for microphone in microphones],
-    }
-
-
-def _room(microphone: LiveMicrophone, day: DaySpan, today: Today) -> Any:
-    known = microphone.known_of(today)
-    return {
-        "room": room(microphone.name),
-        "gaps": [(day.place(a), day.place(b)) for a, b in _unheard(microphone, day, today)],
-        "lanes": [
-            _lane(microphone, label, day, today, known)
-            for label in ordered([*microphone.classes, *microphone.labels()])
-            if label != SILENCE
-        ],
-    }
-
-
-def _lane(
-    microphone: LiveMicrophone, label: str, day: DaySpan, today: Today, known: ListeningThreshold
-) -> Any:
-    count, night = microphone.counts(label, today, known)
-    last = microphone.last_event(label)
-    last_heard = "" if last is None else when(last.end, today.now, day.zone)
-    words = class_words(label)
-    how_often = "not known" if count is None else times(count)
-    summary = f"{words}: {how_often} today" + (f", last at {last_heard}" if count else "")
-    events = microphone.events(label, day.start - 24 * _HOUR)
-    of_night = [e for e in events if today.night <= e.start < today.morning]
-    of_day = [e for e in events if e.start >= today.midnight]
-    return {
-        "label": label,
-        "words": words,
-        "colour": colour_on_paper(label),
-        "bars": bars((event for event in events if event.end > day.start), day),
-        "told": summary,
-        "today": count,
-        "night": night,
-        "last": last_heard,
-        "times": [_times(of_day, day.zone), _times(of_night, day.zone)],
-    }
-
-
-def _times(events: Sequence[SoundEvent], zone: tzinfo) -> str:
-    """Return when events began, newest first; the oldest of many are counted."""
-    shown = [clock(event.start, zone) for event in reversed(events[-_MOST_TIMES:])]
-    left = len(events) - len(shown)
-    return ", ".join(shown) + (f" and {left} before" if left else "")
-
-
-def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
-    """Return how much of each two minutes of a day events fill: one digit per bin, 9 for full.
-
-    Returns
-    -------
-    str
-        Empty without events.
-    """
-    filled = [0] * -(-(day.end - day.start) // BIN)
-    for event in events:
-        start, end = max(event.start, day.start), min(max(event.end, event.start + 1), day.end)
-        for place in range((start - day.start) // BIN, -(-(end - day.start) // BIN)):
-            first = day.start + place * BIN
-            filled[place] += min(end, first + BIN) - max(start, first)
-    if not any(filled):
-        return ""
-    return "".join(
-        str(max(min(-(-9 * part // BIN), 9), _LEAST)) if part else "0" for part in filled
-    )
-
-
-def _unheard(microphone: LiveMicrophone, day: DaySpan, today: Today) -> list[tuple[int, int]]:
-    """Return the gaps of a microphone in a day, up to now, without short ones."""
-    spans = [(day.start, microphone.since or today.now), *microphone.gaps]
-    if not microphone.is_listening():
-        spans.append((max(microphone.heard.time, day.start), today.now))
-    inside = [(max(a, day.start), min(b, today.now)) for a, b in spans]
-    long = np.array([(a, b) for a, b in inside if b - a >= _SILENT], np.int64).reshape(-1, 2)
-    gaps = joined(long[:, 0], long[:, 1], BIN - 1)  # with two minutes and more between them
-    return [*zip(gaps.starts.tolist(), gaps.ends.tolist(), strict=True)]
-
-
-_EVERY_SECONDS = 1.0
-_SHOW = {"yes": True, "no": False}
+    def put_changed(self, name: str, key: Any, describe: Callable[[], Any]) -> None:
+        """Replace a part if its key has changed."""
+        if self.keys.get(name) != key:
+            self.keys[name] = key
+            self.put(name, describe())
 
 
 class HomePage:
@@ -403,22 +76,26 @@ class HomePage:
         self, settings: PageSettings, home: RecorderAddress, state: Path, say: Callable[[str], None]
     ) -> None:
         bind = ip_address(settings.bind)
-        self._node, self._say = home.node, say
+        self._settings, self._home, self._say = settings, home, say
         self._started = time.time_ns()
         self._made = -_EVERY_SECONDS
-        self._day_key: Any = None
-        self._events: dict[str, SoundEvent] = {}
-        self._now = CurrentSounds()
+        self._state = HomeState()  # the latest
+        self._events: dict[str, SoundEvent] = {}  # of today and the last night, by id
+        self._bouts: dict[str, Bout] = {}  # by id
+        self._events_key: Any = None
+        self._listened = ListenedTime()
         self._corrections = EventCorrections(home.folder, home.node)
         self._recurring = RecurringSounds(home.folder)
+        self._past = PastDays(home)
+        self._sounds = KeptSounds(home.folder, home.node)
         self._is_read_back = False
+        self._views: dict[str, PageView] = {}
+        self._lock = threading.Lock()
+        self.view(self.words("").language)
         token = page_token(settings.token_file, state)
         names = frozenset(settings.names)
         admission = PageAdmission(settings.bind, settings.port, token, cookie_key(state), names)
-        self._board = Board()
-        self._home = home
-        actions = {"/mark": self._mark, "/group": self._recurring.name, "/show": self._show}
-        self._server = PageServer(admission, self._board, actions, settings.frames)
+        self._server = PageServer(admission, self, settings.frames)
         host = f"[{settings.bind}]" if bind.version == 6 else settings.bind
         address = f"http://{host}:{settings.port}/"
         whole = f"{address}?token={token}"
@@ -437,42 +114,200 @@ class HomePage:
                 "others on the network can read it and its token"
             )
 
+    def words(self, accepted: str) -> Words:
+        """Return the words of the configured language, else of one that a browser accepts."""
+        return words_of(self._settings.language or preferred_language(accepted))
+
+    def view(self, language: str) -> PageView:
+        """Return the parts of the page in a language."""
+        with self._lock:
+            if language not in self._views:
+                self._views[language] = PageView(words_of(language))
+            return self._views[language]
+
+    def board(self, words: Words) -> Board:
+        """Return the parts of the page in a language, for its stream."""
+        return self.view(words.language).board
+
+    def home_name(self) -> str:
+        """Return the name of the home."""
+        return room(self._home.node)
+
     def update(self, news: News) -> None:
         """Update the page, at most once a second."""
-        self._board.keep_fresh()
+        self._listened.add(news.columns)
+        with self._lock:
+            views = [*self._views.values()]
+        for view in views:
+            view.board.keep_fresh()
         if time.monotonic() - self._made < _EVERY_SECONDS:
             return
         self._made = time.monotonic()
+        self._state = news.state
         if not self._is_read_back:
             self._is_read_back = True
             threading.Thread(target=self._read_back, daemon=True).start()
-        self._events, last = last_events(news, self._corrections.of)
-        self._put("now", self._now.describe(news))
-        self._put("scenarios", scenario_lines(news))
-        self._put("home", {"home": room(self._node), "clock": clock(news.today.now, news.zone)})
-        self._put("events", last)
-        self._put("recurring", self._recurring.describe(Moment(news.today.now, news.zone)))
-        self._put("health", health_list(news, self._node, self._started, self._recurring.problem))
-        key = _day_key(news)
-        if key != self._day_key:
-            self._day_key = key
-            self._put("day", day_picture(news.state.microphones.values(), news.today, news.zone))
+        first = min(news.today.midnight, news.today.night)
+        self._listened.forget(first - _DAY)
+        key = _events_key(news)
+        if key != self._events_key:
+            self._events_key = key
+            every = events_between(news.state.microphones.values(), first, news.today.now + _DAY)
+            self._events = {event.id: event for event in every}
+            self._bouts = {bout.first.id: bout for bout in bouts(every)}
+        for view in views:
+            self._update_view(view, news)
+
+    def _update_view(self, view: PageView, news: News) -> None:
+        moment, words, started = Moment(news.today.now, news.zone), view.words, self._started
+        view.put("now", view.now.describe(news))
+        view.put("scenarios", scenario_lines(news, words))
+        about = {
+            "home": self.home_name(),
+            "clock": clock(moment.now, news.zone),
+            "sound": self._settings.sound,
+        }
+        view.put("home", about)
+        view.put("recurring", self._recurring.describe(moment, words))
+        problem = self._recurring.problem
+        view.put("health", health_list(news, self._home.node, started, problem, words))
+        day = local_time(moment.now, news.zone).date()
+        key = self._events_key, self._corrections.number, day, _classes_key(news)
+        view.put_changed("events", key, lambda: self._last_bouts(news, words))
+        every = [*news.state.microphones.values()]
+        view.put_changed(
+            "day",
+            _day_key(news),
+            lambda: day_picture(every, news.today, news.zone, self._listened, words),
+        )
 
     def close(self) -> None:
         """Stop the server and its streams."""
         self._server.end()
         self._recurring.close()
 
-    def _put(self, name: str, content: Any) -> None:
-        self._board.put(name, json.dumps(content, allow_nan=False).encode())
+    def boards(self) -> list[Board]:
+        """Return the parts of the page in all languages."""
+        with self._lock:
+            return [view.board for view in self._views.values()]
 
-    def _mark(self, event: str, label: str) -> str:
-        found = self._events.get(event)
-        if found is None:
+    def _last_bouts(self, news: News, words: Words) -> Any:
+        microphones = news.state.microphones.values()
+        names = ordered(label for each in microphones for label in [*each.classes, *each.labels()])
+        shown = self._shown(words, news.today.now, is_alone=len(microphones) == 1)
+        every = [shown.describe(bout) for bout in self._latest()]
+        hidden = ordered(news.state.never_tell)
+        return {
+            "events": every,
+            "classes": [(label, words.class_words(label)) for label in names if is_sound(label)],
+            "hidden": [
+                (n, words.class_words(n), words.inside(words.class_words(n))) for n in hidden
+            ],
+        }
+
+    def _latest(self) -> list[Bout]:
+        """Return the newest bouts that need a look, and the newest others."""
+        left = {True: _MOST_LOOKED_AT, False: _MOST_OTHERS}
+        found = []
+        for bout in self._bouts.values():
+            if left[bout.is_important]:
+                left[bout.is_important] -= 1
+                found.append(bout)
+        return found
+
+    def _shown(
+        self, words: Words, now: int, *, is_alone: bool, marks: Sequence[Mark] | None = None
+    ) -> ShownBouts:
+        def correction(event: SoundEvent) -> str:
+            found = self._corrections.of(event, marks)
+            if found is None:
+                return ""
+            is_nothing = found.label == SILENCE
+            name = words.text("mark.nothing") if is_nothing else words.class_words(found.label)
+            return words.text("mark.own" if found.is_own else "mark.other", **{"class": name})
+
+        return ShownBouts(now, self._home.zone, words, correction, is_alone)
+
+    def act(self, path: str, subject: str, label: str, words: Words) -> str:
+        """Carry out what a person asked for; return what was done, in words."""
+        if path == "/mark":
+            return self._mark(subject, label, words)
+        if path == "/group":
+            return self._recurring.name(subject, label, words)
+        return self._show(subject, label, words)
+
+    def answer(self, path: str, text: str, words: Words) -> Any:
+        """Return what a browser asks for, for JSON: days, a day, or events with kept sound."""
+        if path == "/days":
+            days = self._past.dates()
+            return [(day.isoformat(), words.short_date(day), day.year) for day in days]
+        if path == "/day":
+            return self._day(text, words)
+        asked = text.split("&")[:_MOST_ASKED] if self._settings.sound else []
+        found = ((each, self._find(each)) for each in asked)
+        return [each for each, event in found if event is not None and self._sounds.has(event)]
+
+    def sound(self, identifier: str) -> bytes:
+        """Return the kept sound of an event as a WAV file, without that of hidden classes.
+
+        Raise `BridgeError` if there is none.
+        """
+        event = self._find(identifier) if self._settings.sound else None
+        if event is None:
+            raise BridgeError("No sound was kept of this.")
+        past = self._past.find_event(identifier)
+        states = [self._state] if past is None else [self._state, past[0].state]
+        hidden = [
+            other
+            for state in states
+            for each in state.every()
+            for label in each.all_labels()
+            if label in self._state.never_tell
+            for other in each.events(label, event.start - _DAY)
+        ]
+        return self._sounds.wav(event, hidden)
+
+    def _find(self, identifier: str) -> SoundEvent | None:
+        """Return the event with an id that may be shown, of today or of a day that was read."""
+        event = self._events.get(identifier)
+        if event is None:
+            past = self._past.find_event(identifier)
+            event = None if past is None else past[1]
+        return None if event is None or event.label in self._state.never_tell else event
+
+    def _day(self, text: str, words: Words) -> Any:
+        try:
+            asked = date.fromisoformat(text)
+        except ValueError as error:
+            raise BridgeError("There are no logs of this day.") from error
+        day = self._past.read(asked, self._state.never_tell)
+        moment, zone = day.moment, self._home.zone
+        microphones = [*day.state.microphones.values()]
+        home = HomeDay(microphones, moment, zone, day.listened, words, is_past=True)
+        every = bouts(events_between(microphones, moment.midnight, moment.now + 1))
+        shown = self._shown(words, moment.now, is_alone=len(microphones) == 1, marks=day.marks)
+        return picture_of(home) | {"events": [shown.describe(b) for b in every[:_MOST_OF_DAY]]}
+
+    def _mark(self, identifier: str, text: str, words: Words) -> str:
+        bout = self._bouts.get(identifier)
+        events: Sequence[SoundEvent] = [] if bout is None else bout.events
+        past = None if events else self._past.find_event(identifier)
+        if past is not None:
+            day, event = past
+            same = events_between(day.state.microphones.values(), 0, day.moment.now + 1)
+            own = [each for each in bouts(same) if event in each.events]
+            events = own[0].events if own else [event]
+        elif not events and identifier in self._events:
+            events = [self._events[identifier]]
+        if not events:
             raise BridgeError("This event is too long ago for the page: `hearthlog review` has it.")
-        return self._corrections.add(found, label)
+        label = class_of(text)
+        for event in events:
+            self._corrections.add(event, label)
+        name = words.text("mark.nothing") if label == SILENCE else words.class_words(label)
+        return words.text("mark.own", **{"class": name})
 
-    def _show(self, choice: str, label: str) -> str:
+    def _show(self, choice: str, label: str, words: Words) -> str:
         """Hide a class from all outputs and reports, or show it again."""
         name = class_of(label)
         if name == SILENCE or choice not in _SHOW:
@@ -485,8 +320,8 @@ class HomePage:
             write_list(folder, names - {name} if _SHOW[choice] else names | {name})
         except (HearthlogError, OSError) as error:
             raise explained(error) from error
-        self._day_key = None
-        return f"{class_words(name)} is {'shown again' if _SHOW[choice] else 'shown nowhere now'}."
+        key = "shown again" if _SHOW[choice] else "shown nowhere"
+        return words.text(key, **{"class": words.class_words(name)})
 
     def _read_back(self) -> None:
         try:
@@ -495,17 +330,29 @@ class HomePage:
             self._say(f"page: earlier marks are not shown: {error}")
 
 
+def _classes_key(news: News) -> Any:
+    """Return a key that changes whenever the shown classes change."""
+    microphones = news.state.microphones.values()
+    return news.state.never_tell, [(each.name, each.classes) for each in microphones]
+
+
+def _events_key(news: News) -> Any:
+    """Return a key that changes whenever an event begins, grows or is hidden."""
+    return (
+        news.today.midnight,
+        news.today.night,
+        news.state.never_tell,
+        [
+            (each.name, [(n, each.last_event(n), len(each.events(n, 0))) for n in each.labels()])
+            for each in news.state.microphones.values()
+        ],
+    )
+
+
 def _day_key(news: News) -> Any:
     """Return a key that changes whenever the picture of the day changes."""
-    microphones = news.state.microphones.values()
-    return news.today.now // BIN, [
-        (
-            each.name,
-            each.is_listening(),
-            each.since,
-            len(each.gaps),
-            [(label, each.last_event(label)) for label in each.labels()],
-            list(each.classes),
-        )
-        for each in microphones
+    listening = [
+        (each.name, each.is_listening(), each.since, len(each.gaps))
+        for each in news.state.microphones.values()
     ]
+    return news.today.now // BIN, listening, _classes_key(news), _events_key(news)

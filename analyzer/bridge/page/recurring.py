@@ -11,7 +11,7 @@ from typing import IO, Any, NamedTuple, cast
 
 from hearthlog.analyzer.bridge.commands import READ_ONLY, REVIEWER, class_of
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import class_words, length, room, times, told, when
+from hearthlog.analyzer.bridge.wording import ENGLISH, Words, room, told
 from hearthlog.analyzer.discover.summary import (
     SUMMARY,
     GroupsSummary,
@@ -22,7 +22,7 @@ from hearthlog.analyzer.discover.summary import (
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import SILENCE
 from hearthlog.recorder.host import module_command
-from hearthlog.schemas.errors import HearthlogError, listed
+from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import read_time
 
 _MOST_UNNAMED, _MOST_NAMED = 10, 50
@@ -45,7 +45,11 @@ def shown_groups(summary: GroupsSummary) -> dict[str, GroupSummary]:
 
 
 def recurring_list(
-    summary: GroupsSummary, looked: int, said: Mapping[str, str], moment: Moment
+    summary: GroupsSummary,
+    looked: int,
+    said: Mapping[str, str],
+    moment: Moment,
+    words: Words = ENGLISH,
 ) -> Any:
     """Return the recurring sounds for JSON.
 
@@ -60,49 +64,58 @@ def recurring_list(
     left = sum(not each.name for each in summary.groups) - _MOST_UNNAMED
     is_alone = len({name for each in summary.groups for name in each.microphones}) <= 1
     return {
-        "looked": when(min(max(looked, 0), moment.now), *moment),
-        "more": f"{left} more without a name come later." if left > 0 else "",
+        "looked": words.when(min(max(looked, 0), moment.now), *moment),
+        "more": words.text("recurring.more", count=words.number(left)) if left > 0 else "",
         "groups": [
-            _described(key, group, said.get(key, ""), moment, is_alone=is_alone)
+            _described(key, group, said.get(key, ""), (moment, words), is_alone=is_alone)
             for key, group in shown.items()
         ],
     }
 
 
-def _described(key: str, group: GroupSummary, said: str, moment: Moment, *, is_alone: bool) -> Any:
+def _described(
+    key: str, group: GroupSummary, said: str, shown: tuple[Moment, Words], *, is_alone: bool
+) -> Any:
+    moment, words = shown
+    number = words.text("recurring.sound", number=group.number)
+    examples = _examples(group, moment, words, is_alone=is_alone)
     return {
         "id": key,
-        "words": class_words(group.name) if group.name else f"Sound {group.number}",
+        "words": words.class_words(group.name) if group.name else number,
         "is_named": bool(group.name),
-        "about": _how_often(group),
-        "heard": _named_as(group),
-        "listen": f"For instance {_examples(group, moment, is_alone=is_alone)}",
+        "about": _how_often(group, words),
+        "heard": _named_as(group, words),
+        "listen": words.text("recurring.examples", times=examples),
         "said": said,
     }
 
 
-def _how_often(group: GroupSummary) -> str:
-    days = "one day" if group.days == 1 else f"{group.days} days"
-    hours = busiest_hours(group.hours).replace(" to ", " and ")
-    usual = f", mostly between {hours} o'clock" if hours else ""
-    often = times(group.times)
-    return f"{often[0].upper()}{often[1:]} on {days}{usual}, {length(group.seconds)} each"
+def _how_often(group: GroupSummary, words: Words) -> str:
+    hours = busiest_hours(group.hours)
+    first, _, last = hours.partition(" to ")
+    often = words.times(group.times)
+    return words.text(
+        "recurring.often at" if hours else "recurring.often",
+        times=f"{often[0].upper()}{often[1:]}",
+        days=words.count("day", group.days),
+        hours=words.text("recurring.hours", first=first, last=last) if last else hours,
+        length=words.length(group.seconds),
+    )
 
 
-def _named_as(group: GroupSummary) -> str:
+def _named_as(group: GroupSummary, words: Words) -> str:
     labels = [*group.labels.items()][:_LABELS]
-    shares = [f"{class_words(label)} ({100 * share:.0f}{_SPACE}%)" for label, share in labels]
-    return f"Heard as {listed(shares)}" if shares else ""
+    shares = [f"{words.class_words(label)} ({100 * share:.0f}{_SPACE}%)" for label, share in labels]
+    return words.text("recurring.labels", classes=words.listed(shares, "or")) if shares else ""
 
 
-def _examples(group: GroupSummary, moment: Moment, *, is_alone: bool) -> str:
-    return listed(
+def _examples(group: GroupSummary, moment: Moment, words: Words, *, is_alone: bool) -> str:
+    return words.listed(
         [
-            when(read_time(each.start), *moment, seconds=True)
+            words.when(read_time(each.start), *moment, seconds=True)
             + ("" if is_alone else f" ({room(each.microphone)})")
             for each in sorted(group.examples, key=lambda each: read_time(each.start))
-        ],
-        "and",
+        ]
     )
 
 
@@ -126,7 +139,7 @@ class GroupNaming:
         self._thread: Thread | None = None
         self._lock = Lock()
 
-    def start(self, key: str, number: int, label: str) -> str:
+    def start(self, key: str, number: int, label: str, words: Words = ENGLISH) -> str:
         """Start marking the sounds of a group; return a status text.
 
         Parameters
@@ -140,13 +153,10 @@ class GroupNaming:
             If another group is being named, or the folder is not writable.
         """
         options = ["--undo", str(number)]
-        text = "The name is being taken back …"
+        text = words.text("recurring.undoing")
         if label:
             options = ["--name", f"{number}={label}", "--reviewer", REVIEWER]
-            text = (
-                f"Being marked: {class_words(label)}. The box reads all its logs for that, which "
-                "can take many minutes."
-            )
+            text = words.text("recurring.marking", **{"class": words.class_words(label)})
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
                 raise BridgeError("The box still marks another sound: try again when it is done.")
@@ -154,7 +164,9 @@ class GroupNaming:
                 raise BridgeError(READ_ONLY)
             process = self._process = _started([*options, "--json", "--", str(self._folder)])
             self.said[key] = text
-            self._thread = Thread(target=self._follow, args=(process, key, number), daemon=True)
+            self._thread = Thread(
+                target=self._follow, args=(process, key, number, words), daemon=True
+            )
             self._thread.start()
         return text
 
@@ -164,14 +176,14 @@ class GroupNaming:
             if self._process is not None:
                 self._process.terminate()
 
-    def _follow(self, process: subprocess.Popen[str], key: str, number: int) -> None:
+    def _follow(self, process: subprocess.Popen[str], key: str, number: int, words: Words) -> None:
         """Wait for the process to end, and store its result."""
         timer = Timer(_LONGEST_SECONDS, process.kill)
         timer.daemon = True
         timer.start()
         with process:
             result, last = _read(cast(IO[str], process.stderr), f"{_PREFIX}group {number}:")
-            self.said[key] = _outcome(process.wait(), result, last)
+            self.said[key] = _outcome(process.wait(), result, last, words)
         timer.cancel()
 
 
@@ -203,12 +215,13 @@ def _read(stream: IO[str], wanted: str) -> tuple[str, str]:
     return told(result), told(last)
 
 
-def _outcome(status: int, result: str, last: str) -> str:
+def _outcome(status: int, result: str, last: str, words: Words) -> str:
     if status < 0:
-        return f"It was not done: the process was ended by signal {-status}."
+        return words.text("recurring.signal", number=-status)
     if not result or status not in {0, _DONE_WITH_LOSSES}:
-        return f"It was not done: {last or f'exit status {status}'}"
-    return result if status == 0 else f"{result}; not all could be read: {last}"
+        problem = last or words.text("recurring.status", number=status)
+        return words.text("recurring.not done", text=problem)
+    return result if status == 0 else words.text("recurring.partly", text=result, rest=last)
 
 
 _NOTHING: dict[str, Any] = {"looked": "", "more": "", "groups": []}
@@ -230,22 +243,22 @@ class RecurringSounds:
         self._looked = 0
         self._summary: GroupsSummary | None = None
         self._naming = GroupNaming(folder)
-        self._state: Any = None
-        self._described: Any = _NOTHING
+        self._described: dict[str, tuple[Any, Any]] = {}  # state and content, by language
 
-    def describe(self, moment: Moment) -> Any:
+    def describe(self, moment: Moment, words: Words = ENGLISH) -> Any:
         """Return the groups for JSON; empty without a readable summary."""
         self._look()
         if self._summary is None:
             return _NOTHING
         said = dict(self._naming.said)
         state = self._seen, said, local_time(*moment).date()
-        if state != self._state:
-            self._state = state
-            self._described = recurring_list(self._summary, self._looked, said, moment)
-        return self._described
+        described = self._described.get(words.language)
+        if described is None or described[0] != state:
+            shown = recurring_list(self._summary, self._looked, said, moment, words)
+            described = self._described[words.language] = state, shown
+        return described[1]
 
-    def name(self, key: str, text: str) -> str:
+    def name(self, key: str, text: str, words: Words = ENGLISH) -> str:
         """Start naming a group; return a status text.
 
         Parameters
@@ -265,7 +278,7 @@ class RecurringSounds:
         label = class_of(text) if text else ""
         if label == SILENCE:
             raise BridgeError("Write what it was: a sound that recurs cannot be named silence.")
-        return self._naming.start(key, group.number, label)
+        return self._naming.start(key, group.number, label, words)
 
     def close(self) -> None:
         """Stop naming."""

@@ -1,22 +1,25 @@
 """Web server of the page: admission of requests, and streams of the page's parts."""
 
 import hmac
+import html
 import json
 import re
 import select
 import socket
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib.resources import files
 from secrets import compare_digest
 from threading import Condition
 from time import monotonic
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, Protocol, cast
+from urllib.parse import unquote
 
 from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.wording import Words
 from hearthlog.analyzer.http import (
     SECONDS,
     HttpHandler,
@@ -211,19 +214,29 @@ class Board:
 
 
 _MOST_STREAMS = 16
-_MARK_SECONDS = 120.0  # to read the logs of the event from a slow disk
+_READ_SECONDS = 120.0  # to read the logs from a slow disk
 _BEAT_SECONDS, _LOOK_SECONDS = 5.0, 1.0
 _FILES = {
     "/": ("page.html", "text/html; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "/picture.js": ("picture.js", "text/javascript; charset=utf-8"),
+    "/sounds.js": ("sounds.js", "text/javascript; charset=utf-8"),
+    "/elements.js": ("elements.js", "text/javascript; charset=utf-8"),
+    "/icon.svg": ("icon.svg", "image/svg+xml"),
+    "/icon-180.png": ("icon-180.png", "image/png"),
+    "/icon-512.png": ("icon-512.png", "image/png"),
 }
+_ASKED = {"/days", "/day", "/kept"}  # answered as JSON
+_TEXT = re.compile(r"\{\{(page\.[a-z ]+)\}\}")  # in page.html
+_GROUND = "#f4f6f8"  # as in page.css
 # JSON field beside the label: a subject, or whether the class is shown.
 _SUBJECTS = {"/mark": "event", "/group": "group", "/show": "show"}
 _JSON = "application/json"
 _POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
-    "base-uri 'none'; form-action 'none'; require-trusted-types-for 'script'; trusted-types 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
+    "manifest-src 'self'; base-uri 'none'; form-action 'none'; "
+    "require-trusted-types-for 'script'; trusted-types 'none'"
 )
 _FIELDS = {
     **HttpHandler.fields,
@@ -239,13 +252,36 @@ _ENTRANCE = (
 )
 
 
+class PageContent(Protocol):
+    """What the page shows, and does; called from many threads."""
+
+    def words(self, accepted: str) -> Words:
+        """Return the words for an `Accept-Language`."""
+
+    def board(self, words: Words) -> Board:
+        """Return the parts of the page in a language."""
+
+    def boards(self) -> Sequence[Board]:
+        """Return the parts of the page in all languages."""
+
+    def home_name(self) -> str:
+        """Return the name of the home."""
+
+    def act(self, path: str, subject: str, label: str, words: Words) -> str:
+        """Carry out a POST request; return what was done, or raise `HearthlogError`."""
+
+    def answer(self, path: str, text: str, words: Words) -> Any:
+        """Return the answer to a GET request for JSON, or raise `HearthlogError`."""
+
+    def sound(self, identifier: str) -> bytes:
+        """Return the sound of an event as a WAV file, or raise `HearthlogError`."""
+
+
 class PageServer(HttpServer):
     """Serves the page from a separate thread.
 
     Parameters
     ----------
-    actions : mapping of str to callable
-        By path of a POST request: takes the id of an event or group and a label, returns a text.
     frames : sequence of str, optional
         Origins of pages that may show this page in a frame.
 
@@ -258,8 +294,7 @@ class PageServer(HttpServer):
     def __init__(
         self,
         admission: PageAdmission,
-        board: Board,
-        actions: Mapping[str, Callable[[str, str], str]],
+        content: PageContent,
         frames: Sequence[str] = (),
     ) -> None:
         bind, port = admission.bind, admission.port
@@ -270,7 +305,8 @@ class PageServer(HttpServer):
                 f"the page cannot listen on {bind}, port {port} ({error.strerror or error}); "
                 "choose another `bind` or `port` in [bridge.page]"
             ) from error
-        self.admission, self.board, self.actions = admission, board, actions
+        self.admission, self.content = admission, content
+        self.is_ended = False
         self.has_frames = bool(frames)
         ancestors = " ".join(frames) or "'none'"
         policy = f"{_POLICY}; frame-ancestors {ancestors}"
@@ -282,7 +318,9 @@ class PageServer(HttpServer):
 
     def end(self) -> None:
         """Stop all streams and the server."""
-        self.board.close()
+        self.is_ended = True
+        for board in self.content.boards():
+            board.close()
         super().end()
 
 
@@ -300,20 +338,78 @@ class _Handler(HttpHandler):
         self.fields = self._server.fields
         super().setup()
 
+    @property
+    def _words(self) -> Words:
+        """The words for this browser."""
+        return self._server.content.words(self.headers.get("Accept-Language", ""))
+
     def do_GET(self) -> None:
-        """Send the page, one of its files, or the stream of changes."""
+        """Send the page, one of its files, the stream of changes, or what the page asks for."""
         if not self._is_admitted(changes=False):
             return
+        path, _, query = self._path.partition("?")
         if has_token(self.path, self._server.admission.token):
             self._send_entrance()
         elif self._path == "/events":
             self._stream()
+        elif path in _ASKED or path == "/sound":
+            self._send_asked(path, unquote(query, errors="replace"))
+        elif self._path in {"/words.js", "/page.webmanifest"}:
+            self._send_generated()
         elif self._path in _FILES:
             name, kind = _FILES[self._path]
             content = files("hearthlog.analyzer.bridge.page").joinpath(name).read_bytes()
-            self.send(HTTPStatus.OK, content, kind)
+            self.send(HTTPStatus.OK, content if self._path != "/" else self._page(content), kind)
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
+
+    def _page(self, content: bytes) -> bytes:
+        """Return the page with its texts in the language of the browser."""
+        words = self._words
+
+        def text(found: re.Match[str]) -> str:
+            return html.escape(words.texts[found[1]])
+
+        page = content.decode().replace('lang="en"', f'lang="{words.language}"')
+        return _TEXT.sub(text, page).encode()
+
+    def _send_generated(self) -> None:
+        words = self._words
+        if self._path == "/words.js":
+            texts = {key: text for key, text in words.texts.items() if key.startswith("page.")}
+            script = f"export default {json.dumps(texts)};\n"
+            self.send(HTTPStatus.OK, script.encode(), _FILES["/page.js"][1])
+            return
+        name = self._server.content.home_name()
+        icon = {"src": "icon-512.png", "sizes": "512x512", "type": "image/png"}
+        manifest = {
+            "name": name,
+            "short_name": name,
+            "lang": words.language,
+            "start_url": "./",
+            "scope": "./",
+            "display": "standalone",
+            "background_color": _GROUND,
+            "theme_color": _GROUND,
+            "icons": [icon, {"src": "icon.svg", "sizes": "any", "type": "image/svg+xml"}],
+        }
+        self.send(HTTPStatus.OK, json.dumps(manifest).encode(), "application/manifest+json")
+
+    def _send_asked(self, path: str, text: str) -> None:
+        """Send JSON, or the sound of an event, that is read from the logs."""
+        words, content = self._words, self._server.content
+        self._server.give_time(self.connection, _READ_SECONDS)
+        kind, code = _JSON, HTTPStatus.OK
+        try:
+            if path == "/sound":
+                body, kind = content.sound(text), "audio/wav"
+            else:
+                body = json.dumps(content.answer(path, text, words), allow_nan=False).encode()
+        except HearthlogError as error:
+            body = json.dumps({"error": words.translated(str(error))}).encode()
+            kind, code = _JSON, HTTPStatus.UNPROCESSABLE_ENTITY
+        self._server.give_time(self.connection, _READ_SECONDS)
+        self.send(code, body, kind)
 
     def do_POST(self) -> None:
         """Accept a label for an event or the sounds of a group, or whether a class is shown."""
@@ -326,11 +422,14 @@ class _Handler(HttpHandler):
         if isinstance(mark, HTTPStatus):
             self.send_error(mark)
             return
-        self._server.give_time(self.connection, _MARK_SECONDS)
+        self._server.give_time(self.connection, _READ_SECONDS)
+        words = self._words
         try:
-            answer, code = {"said": self._server.actions[self._path](*mark)}, HTTPStatus.OK
+            answer = {"said": self._server.content.act(self._path, *mark, words)}
+            code = HTTPStatus.OK
         except HearthlogError as error:
-            answer, code = {"error": str(error)}, HTTPStatus.UNPROCESSABLE_ENTITY
+            answer = {"error": words.translated(str(error))}
+            code = HTTPStatus.UNPROCESSABLE_ENTITY
         self._server.give_time(self.connection, SECONDS)
         self.send(code, json.dumps(answer).encode(), _JSON)
 
@@ -389,8 +488,9 @@ class _Handler(HttpHandler):
             )
             known: dict[str, int] = {}
             sent = 0.0
-            while not server.board.is_closed:
-                parts = server.board.wait(known, _LOOK_SECONDS)
+            board = server.content.board(self._words)
+            while not (board.is_closed or server.is_ended):
+                parts = board.wait(known, _LOOK_SECONDS)
                 if not parts and monotonic() - sent < _BEAT_SECONDS:
                     if self._is_gone():
                         return
@@ -398,7 +498,7 @@ class _Handler(HttpHandler):
                 known |= {name: part.number for name, part in parts.items()}
                 sent = monotonic()
                 server.give_time(self.connection, SECONDS + _BEAT_SECONDS)
-                self.wfile.write(_as_events(parts, is_fresh=server.board.is_fresh()))
+                self.wfile.write(_as_events(parts, is_fresh=board.is_fresh()))
         finally:
             server.streams.release()
 

@@ -1,0 +1,323 @@
+"""A day on the page: its picture, counts, times, and one sentence about it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import tzinfo
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity.sources import is_of_scenario, labelling_source
+from hearthlog.analyzer.bridge.home_state import MOST, ListeningThreshold, LiveMicrophone
+from hearthlog.analyzer.bridge.wording import ENGLISH, Words, clock, room
+from hearthlog.analyzer.colours import colour_on_paper
+from hearthlog.analyzer.logs.local_time import (
+    EVENING,
+    MORNING,
+    Today,
+    at_hour,
+    day_span,
+    local_time,
+)
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, union
+from hearthlog.models.classes import COUGHING, CRYING, PHONE_RING, SILENCE, YELLING, ordered
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.topics import parse_topic
+
+BIN = 120 * NANOSECONDS  # as in the picture of the report
+IMPORTANT = frozenset({COUGHING, CRYING, YELLING, PHONE_RING})  # classes that need a look
+_HOUR = 3600 * NANOSECONDS
+_LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
+_MOST_TIMES = 40  # of a count
+_SILENT = 60 * NANOSECONDS  # shortest gap that is drawn
+_DIGITS = 4  # decimals of a position in the day, 0 to 1
+
+
+class ListenedTime:
+    """The time in which each microphone listened, by the segments of its log.
+
+    Segments tile the time that was listened to, so this holds also without messages of gaps.
+    """
+
+    def __init__(self) -> None:
+        self._spans: dict[str, Spans] = {}
+
+    def add(self, columns: Iterable[Columns]) -> None:
+        """Add the segments among the messages of a log."""
+        for part in columns:
+            name = parse_topic(part.topic) if part.type == message_types.SEGMENT else None
+            source = None if name is None else labelling_source(name)
+            if source is None or is_of_scenario(source):
+                continue
+            starts = np.asarray(part["header.stamp"], np.int64)
+            ends = starts + np.maximum(np.asarray(part["duration"], np.int64), 0)
+            new = joined(starts, ends, _SILENT)
+            self._spans[source] = union(self._spans.get(source, NONE), new, pause=_SILENT)
+
+    def forget(self, before: int) -> None:
+        """Drop the spans before a time."""
+        for name, spans in self._spans.items():
+            if len(spans.ends) and spans.ends[0] < before:
+                self._spans[name] = cut(spans, before, int(spans.ends[-1]))
+
+    def of(self, microphone: str) -> Spans:
+        """Return the spans of a microphone."""
+        return self._spans.get(microphone, NONE)
+
+
+class DaySpan(NamedTuple):
+    """A local day from midnight to midnight, in nanoseconds of UTC."""
+
+    start: int
+    end: int
+    zone: tzinfo
+
+    def place(self, time: int) -> float:
+        """Return the position of a time in the day, 0 to 1."""
+        inside = min(max(time, self.start), self.end)
+        return round((inside - self.start) / (self.end - self.start), _DIGITS)
+
+
+class HomeDay(NamedTuple):
+    """The microphones of a home on a day.
+
+    Attributes
+    ----------
+    moment : Today
+        The current day; for a past day, its last moment.
+    """
+
+    microphones: Sequence[LiveMicrophone]
+    moment: Today
+    zone: tzinfo
+    listened: ListenedTime
+    words: Words = ENGLISH
+    is_past: bool = False
+
+    def span(self) -> DaySpan:
+        """Return the day from midnight to midnight."""
+        date = local_time(self.moment.midnight, self.zone).date()
+        return DaySpan(*day_span(date, self.zone), self.zone)
+
+    def unheard(self, microphone: LiveMicrophone, start: int, end: int) -> Spans:
+        """Return the time up to now in which a microphone did not listen."""
+        own = self.listened.of(microphone.name)
+        now = min(end, self.moment.now)
+        spans = [(start, microphone.since or now), *microphone.gaps]
+        spans += zip(own.ends[:-1].tolist(), own.starts[1:].tolist(), strict=True)
+        if not microphone.is_listening() or self.is_past:
+            last = max(microphone.heard.time, int(own.ends[-1]) if len(own.ends) else 0)
+            spans.append((last, now))
+        inside = np.array([(max(a, start), min(b, now)) for a, b in spans], np.int64)
+        some = inside[inside[:, 0] < inside[:, 1]]
+        return joined(some[:, 0], some[:, 1])
+
+    def listened_share(self, microphone: LiveMicrophone, start: int, end: int) -> float:
+        """Return the share of a time span, up to now, in which a microphone listened."""
+        end = min(end, self.moment.now)
+        return 1 - self.unheard(microphone, start, end).length / max(end - start, 1)
+
+    def known_of(self, microphone: LiveMicrophone) -> ListeningThreshold:
+        """Return whether a microphone listened enough for a count of 0."""
+        moment = self.moment
+        night = self.listened_share(microphone, moment.night, moment.morning)
+        day = self.listened_share(microphone, moment.midnight, moment.now)
+        return ListeningThreshold(day > 0, night >= MOST)
+
+
+def day_picture(
+    microphones: Iterable[LiveMicrophone],
+    today: Today,
+    zone: tzinfo,
+    listened: ListenedTime | None = None,
+    words: Words = ENGLISH,
+) -> Any:
+    """Return the picture of the current day for JSON."""
+    known = ListenedTime() if listened is None else listened
+    return picture_of(HomeDay([*microphones], today, zone, known, words))
+
+
+def picture_of(home: HomeDay) -> Any:
+    """Return the picture of a day for JSON."""
+    day = home.span()
+    date = local_time(day.start, home.zone).date()
+    hours = range(day.start, day.end, _HOUR)
+    nights = [
+        (day.start, at_hour(date, MORNING, home.zone)),
+        (at_hour(date, EVENING, home.zone), day.end),
+    ]
+    now = home.moment.now
+    return {
+        "date": date.isoformat(),
+        "title": home.words.long_date(date),
+        "sentence": day_sentence(home),
+        "now": None if home.is_past else day.place(now - now % BIN),
+        "hours": [(day.place(hour), local_time(hour, home.zone).hour) for hour in hours],
+        "nights": [(day.place(start), day.place(end)) for start, end in nights],
+        "rooms": [_room(microphone, day, home) for microphone in home.microphones],
+    }
+
+
+def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
+    known = home.known_of(microphone)
+    return {
+        "room": room(microphone.name),
+        "gaps": [(day.place(a), day.place(b)) for a, b in _gaps(microphone, day, home)],
+        "lanes": [
+            _lane(microphone, label, day, home, known)
+            for label in ordered([*microphone.classes, *microphone.labels()])
+            if label != SILENCE
+        ],
+    }
+
+
+def _gaps(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> list[tuple[int, int]]:
+    """Return the gaps of a microphone in a day, up to now, without short ones."""
+    gaps = home.unheard(microphone, day.start, day.end)
+    long = gaps.ends - gaps.starts >= _SILENT
+    shown = joined(gaps.starts[long], gaps.ends[long], BIN - 1)  # two minutes and more apart
+    return [*zip(shown.starts.tolist(), shown.ends.tolist(), strict=True)]
+
+
+def _lane(
+    microphone: LiveMicrophone, label: str, day: DaySpan, home: HomeDay, known: ListeningThreshold
+) -> Any:
+    today, words = home.moment, home.words
+    events = [e for e in microphone.events(label, day.start - 24 * _HOUR) if e.start < day.end]
+    of_night = [e for e in events if today.night <= e.start < today.morning]
+    of_day = [e for e in events if e.start >= today.midnight]
+    count: int | None = len(of_day) if of_day or known.day else None
+    night: int | None = len(of_night) if of_night or known.night else None
+    last = events[-1] if home.is_past and events else microphone.last_event(label)
+    at = "" if last is None else words.when(last.end, today.now, day.zone)
+    name = words.class_words(label)
+    often = words.text("count.not known") if count is None else words.times(count)
+    key = "lane of a day" if home.is_past else "lane and last" if count else "lane"
+    return {
+        "label": label,
+        "words": name,
+        "inside": words.inside(name),
+        "colour": colour_on_paper(label),
+        "bars": bars((event for event in events if event.end > day.start), day),
+        "told": words.text(key, **{"class": name, "times": often, "last": at}),
+        "today": count,
+        "night": night,
+        "last": at,
+        "times": [_times(of_day, day.zone), _times(of_night, day.zone)],
+    }
+
+
+def _times(events: Sequence[SoundEvent], zone: tzinfo) -> Any:
+    """Return when events began, newest first, with their ids, and how many older are left out."""
+    shown = events[-_MOST_TIMES:]
+    times = [(clock(event.start, zone), event.id) for event in reversed(shown)]
+    return {"times": times, "before": len(events) - len(shown)}
+
+
+def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
+    """Return how much of each two minutes of a day events fill: one digit per bin, 9 for full.
+
+    Returns
+    -------
+    str
+        Empty without events.
+    """
+    filled = [0] * -(-(day.end - day.start) // BIN)
+    for event in events:
+        start, end = max(event.start, day.start), min(max(event.end, event.start + 1), day.end)
+        for place in range((start - day.start) // BIN, -(-(end - day.start) // BIN)):
+            first = day.start + place * BIN
+            filled[place] += min(end, first + BIN) - max(start, first)
+    if not any(filled):
+        return ""
+    return "".join(
+        str(max(min(-(-9 * part // BIN), 9), _LEAST)) if part else "0" for part in filled
+    )
+
+
+_QUIET_SHARE = 0.01  # most of a quiet night with any sound
+_QUIET_EVENTS = 5  # most events of important classes in a quiet night
+_NOON = 12
+_MOST_CLASSES = 3  # in the sentence
+_MOST_CLOCKS = 3  # of a class
+
+
+def day_sentence(home: HomeDay) -> str:
+    """Return a sentence about the night, after noon about the day; its counts are those below it.
+
+    A night or a day that was not listened to is never called quiet.
+    """
+    moment = home.moment
+    hour = local_time(moment.now, home.zone).hour
+    if home.is_past or hour >= _NOON:
+        return _sentence_of_day(home)
+    end = min(moment.morning, moment.now)
+    words, found = home.words, _events_of(home, moment.night, moment.morning)
+    is_over = moment.now >= moment.morning
+    if not all(home.known_of(each).night for each in home.microphones) or not home.microphones:
+        when = words.text("night.partly")
+    elif _is_quiet(found, end - moment.night):
+        when = words.text("night.quiet" if is_over else "night.quiet so far")
+        found = {name: events for name, events in found.items() if name in IMPORTANT}
+    else:
+        when = words.text("night.last" if is_over else "night.this")
+    return _sentence(when, found, home)
+
+
+def _sentence_of_day(home: HomeDay) -> str:
+    moment, words = home.moment, home.words
+    found = _events_of(home, moment.midnight, home.span().end)
+    shares = [home.listened_share(m, moment.midnight, moment.now) for m in home.microphones]
+    if min(shares, default=0) < MOST:
+        when = words.text("day.past partly" if home.is_past else "day.partly")
+        return _sentence(when, found, home)
+    when = "" if home.is_past else words.text("day.today")
+    if any(name in IMPORTANT for name in found):
+        return _sentence(when, found, home)
+    known = {name for each in home.microphones for name in each.classes} & IMPORTANT
+    names = [words.inside(words.class_words(name)) for name in ordered(known)]
+    if not names:
+        return _sentence(when, found, home) if found else ""
+    key = "day.past none" if home.is_past else "day.none"
+    return words.text(key, when=when, classes=words.listed(names, "or")) + "."
+
+
+def _events_of(home: HomeDay, start: int, end: int) -> dict[str, list[SoundEvent]]:
+    """Return the events of each class that begin in a time span, the most important class first."""
+    found: dict[str, list[SoundEvent]] = {}
+    for microphone in home.microphones:
+        for label in microphone.labels():
+            own = [event for event in microphone.events(label, start) if event.start < end]
+            if own and label != SILENCE:
+                found.setdefault(label, []).extend(own)
+    return {name: sorted(found[name], key=lambda event: event.start) for name in ordered(found)}
+
+
+def _is_quiet(found: Mapping[str, Sequence[SoundEvent]], length: int) -> bool:
+    seconds = sum(event.seconds for events in found.values() for event in events)
+    important = sum(len(events) for name, events in found.items() if name in IMPORTANT)
+    return important <= _QUIET_EVENTS and seconds * NANOSECONDS <= _QUIET_SHARE * length
+
+
+def _sentence(when: str, found: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:
+    words = home.words
+    parts = [_class_and_times(name, found[name], home) for name in [*found][:_MOST_CLASSES]]
+    what = words.listed(parts)
+    if not parts or not when:
+        return f"{when or what[:1].upper() + what[1:]}."
+    return words.text("sentence", when=when, what=what) + "."
+
+
+def _class_and_times(name: str, events: Sequence[SoundEvent], home: HomeDay) -> str:
+    words = home.words
+    shown = words.inside(words.class_words(name))
+    values = {"class": shown, "times": words.times(len(events))}
+    if name not in IMPORTANT:
+        return words.text("class and count", **values)
+    clocks = [*dict.fromkeys(clock(event.start, home.zone) for event in events)]
+    when = words.listed(clocks)
+    if len(clocks) > _MOST_CLOCKS:
+        when = words.text("range", first=clocks[0], last=clocks[-1])
+    return words.text("class and times", **values, clocks=when)

@@ -1,0 +1,75 @@
+// Elements and texts. Texts come from logs: they are only ever put into the page as text.
+import texts from "./words.js";
+
+const SVG = "http://www.w3.org/2000/svg";
+export const language = document.documentElement.lang;
+export const place = (id) => document.getElementById(id);
+
+export function say(key, values = {}) {
+  return texts[`page.${key}`].replace(/\{(\w+)\}/g, (_, name) => values[name]);
+}
+
+export function count(key, number) {
+  return say(`${key}.${number === 1 ? "one" : "other"}`, { count: number.toLocaleString(language) });
+}
+
+export function make(name, attributes = {}, ...children) {
+  return fill(document.createElement(name), attributes, children);
+}
+
+export function draw(name, attributes = {}, ...children) {
+  return fill(document.createElementNS(SVG, name), attributes, children);
+}
+
+function fill(element, attributes, children) {
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  element.append(...children);
+  return element;
+}
+
+export function write(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function set(element, name, value) {
+  if (element.getAttribute(name) !== String(value)) element.setAttribute(name, value);
+}
+
+export function swatch(colour) {
+  const element = make("span", { class: "swatch", "aria-hidden": "true" });
+  element.style.backgroundColor = `rgb(${colour.join(" ")})`;
+  return element;
+}
+
+// As many children as there are items, each changed only where it has to be: what somebody reads,
+// or has the focus in, stays.
+export function keep(parent, items, begin, show) {
+  while (parent.children.length > items.length) parent.lastElementChild.remove();
+  items.forEach((item, index) => {
+    const child = parent.children[index] ?? parent.appendChild(begin());
+    show(child, item);
+  });
+}
+
+export async function send(path, content) {
+  try {
+    const answer = await fetch(path, {
+      method: "POST",
+      headers: { "Content-Type": "application/json" },
+      body: JSON.stringify(content),
+    });
+    if (answer.status === 200 || answer.status === 422) return await answer.json();
+    return { error: say("not saved") };
+  } catch {
+    return { error: say("not connected") };
+  }
+}
+
+// The answer to a question to the box, or an object with an error.
+export async function ask(path) {
+  try {
+    const answer = await fetch(path);
+    if (answer.status === 200 || answer.status === 422) return await answer.json();
+  } catch { /* no connection */ }
+  return { error: say("not read") };
+}

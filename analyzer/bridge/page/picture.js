@@ -1,0 +1,225 @@
+// A day as one picture, its counts, and the times behind a lane or a count.
+import { draw, keep, make, place, say, send, set, swatch, write } from "./elements.js";
+import { playButton, showPlayable } from "./sounds.js";
+
+const LANE = 36, NAME = 15, GAP = 3, HOURS = 20; // pixels
+const BINS_AN_HOUR = 30;
+let open = null; // the lane or count whose times are shown
+
+// Bins of one height in a row are one mark, and the narrowest is seen.
+export function marks(bars, width, hours, top, height) {
+  const step = width / (hours * BINS_AN_HOUR), foot = top + height;
+  let path = "";
+  for (let i = 0; i < bars.length;) {
+    let end = i + 1;
+    while (end < bars.length && bars[end] === bars[i]) end += 1;
+    if (bars[i] !== "0") {
+      const head = foot - height * (0.2 + 0.8 * bars[i] / 9);
+      path += `M${(i * step).toFixed(1)} ${foot}V${head.toFixed(1)}h${
+        Math.max((end - i) * step, 2).toFixed(1)}V${foot}Z`;
+    }
+    i = end;
+  }
+  return path;
+}
+
+export function spans(list, width, height) {
+  return list.map(([a, b]) => `M${a * width} 0H${b * width}V${height}H${a * width}Z`).join("");
+}
+
+function timesOf(it, index) {
+  const { times, before } = it.times[index];
+  return { it, times, before, value: index ? it.night : it.today, night: index === 1 };
+}
+
+// Shows when a sound was heard, below the picture or the count that was chosen; a second tap closes.
+function choose(chosen) {
+  const same = open?.button === chosen.button;
+  close();
+  if (same) return;
+  const close_ = make("button", { type: "button", class: "quiet back" });
+  open = { ...chosen, heading: make("p", { class: "what" }), list: make("ol", { class: "times" }),
+    note: make("p", { class: "about" }), hide: close_ };
+  close_.addEventListener("click", () => hideClass(open.data().it.label));
+  open.panel = make("div", { class: "panel" }, open.heading, open.list, open.note, close_);
+  open.where(open.panel);
+  set(chosen.button, "aria-expanded", "true");
+  showTimes();
+}
+
+function close() {
+  if (!open) return;
+  set(open.button, "aria-expanded", "false");
+  (open.panel.closest("tr.times") ?? open.panel).remove();
+  open = null;
+}
+
+function showTimes() {
+  const data = open.data();
+  if (!data) { close(); return; }
+  const { it, times, before, value, night } = data;
+  write(open.heading, say("times of", { what: it.words, when: night ? nightName() : dayName() }));
+  keep(open.list, times, () => make("li", {}, make("span")), (child, [time, id]) => {
+    write(child.firstElementChild, time);
+    if (child.dataset.id === id) return;
+    child.dataset.id = id;
+    child.querySelector("button")?.remove();
+    child.append(playButton(() => [id], () => `${it.words}, ${time}`));
+  });
+  showPlayable(times.map(([, id]) => id));
+  let text = before ? say("before", { count: before }) : "";
+  if (!times.length) text = value === null ? `${capital(say("not known"))}.` : say("not once");
+  write(open.note, text);
+  write(open.hide, say("hide", { class: it.inside }));
+}
+
+const capital = (text) => text[0].toUpperCase() + text.slice(1);
+const dayName = () => place("date").textContent;
+const nightName = () => say(shown?.now === null ? "night before" : "last night");
+
+async function hideClass(label) {
+  const answer = await send("show", { show: "no", label });
+  write(place("hidden-said"), answer.error ?? answer.said);
+}
+
+function beginLane(room, number) {
+  const name = draw("text", { class: "name" }), figure = draw("text", { class: "count" });
+  const lane = { name, figure, marks: draw("path", { class: "marks" }), line: draw("path", { class: "line" }),
+    hit: draw("rect", { class: "hit" }) };
+  lane.element = draw("g", { class: "lane", role: "button", tabindex: 0, "aria-expanded": "false" },
+    lane.hit, lane.line, lane.marks, name, figure);
+  const chosen = { button: lane.element, where: (panel) => room.svg.after(panel),
+    data: () => { const it = room.sounded[number]; return it && timesOf(it, 0); } };
+  lane.element.addEventListener("click", () => choose(chosen));
+  lane.element.addEventListener("keydown", (pressed) => {
+    if (pressed.key === "Enter" || pressed.key === " ") { pressed.preventDefault(); choose(chosen); }
+  });
+  return lane;
+}
+
+function beginRow(room, label) {
+  const find = () => room.lanes.find((each) => each.label === label);
+  const counts = [0, 1].map((index) => {
+    const button = make("button", { type: "button", class: "count", "aria-expanded": "false" });
+    button.addEventListener("click", () => choose({ button,
+      where: (panel) => row.element.after(make("tr", { class: "times" }, make("td", { colspan: 4 }, panel))),
+      data: () => { const it = find(); return it && timesOf(it, index); } }));
+    return button;
+  });
+  const name = make("th", { scope: "row" });
+  const cells = [make("td", {}, counts[0]), make("td", {}, counts[1]), make("td")];
+  const row = { label, name, counts, cells, element: make("tr", {}, name, ...cells) };
+  return row;
+}
+
+function showRow(row, it, where) {
+  if (!row.name.firstChild) row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour), make("span", {}, it.words)));
+  [it.today, it.night].forEach((value, index) => {
+    row.cells[index].className = value ? "" : "none";
+    write(row.counts[index], value === null ? say("not known") : String(value));
+    const when = index ? nightName() : dayName();
+    const name = [it.words, where, when].filter(Boolean).join(", ");
+    set(row.counts[index], "aria-label", `${name}: ${row.counts[index].textContent}`);
+  });
+  row.cells[2].className = it.last ? "" : "none";
+  write(row.cells[2], it.last || say("not lately"));
+}
+
+function beginRoom(name, isAlone) {
+  const room = { name, lanes: [], sounded: [], drawn: [], rows: [], where: isAlone ? "" : name };
+  room.nights = draw("path", { class: "shade" });
+  room.unheard = draw("path", { fill: "url(#unheard)" });
+  room.future = draw("rect", { class: "future" });
+  room.moment = draw("path", { class: "moment" });
+  room.hours = draw("g", { class: "hours", "aria-hidden": "true" });
+  room.group = draw("g");
+  room.ground = draw("rect", { class: "ground", rx: 6 });
+  room.svg = draw("svg", { class: "picture", role: "group" }, room.ground, room.nights, room.unheard,
+    room.future, room.group, room.moment, room.hours);
+  room.heads = ["sound", "today", "last night", "last"].map(() => make("th", { scope: "col" }));
+  room.body = make("tbody");
+  room.caption = make("caption", { class: "hidden" });
+  room.table = make("table", {}, room.caption, make("thead", {}, make("tr", {}, ...room.heads)), room.body);
+  room.note = make("p", { class: "note" });
+  room.elements = [...(isAlone ? [] : [make("h3", {}, name)]), room.svg, room.note, room.table];
+  return room;
+}
+
+function showRoom(room, { gaps, lanes }, day) {
+  room.lanes = lanes;
+  room.sounded = lanes.filter(({ bars }) => bars);
+  const width = Math.max(Math.floor(room.svg.getBoundingClientRect().width), 100);
+  const height = Math.max(room.sounded.length, 1) * LANE, whole = height + HOURS;
+  set(room.svg, "viewBox", `0 0 ${width} ${whole}`);
+  set(room.svg, "height", whole);
+  set(room.svg, "aria-label", [room.where, day.title].filter(Boolean).join(", "));
+  for (const [name, value] of [["width", width], ["height", height]]) set(room.ground, name, value);
+  set(room.nights, "d", spans(day.nights, width, height));
+  set(room.unheard, "d", spans(gaps, width, height));
+  const now = day.now === null ? 1 : day.now;
+  for (const [name, value] of [["x", now * width], ["width", (1 - now) * width], ["height", height]]) {
+    set(room.future, name, value);
+  }
+  set(room.moment, "d", day.now === null ? "" : `M${now * width} 0V${height}`);
+  while (room.drawn.length < room.sounded.length) {
+    const lane = beginLane(room, room.drawn.length);
+    room.drawn.push(lane);
+    room.group.append(lane.element);
+  }
+  while (room.drawn.length > room.sounded.length) room.drawn.pop().element.remove();
+  room.sounded.forEach((it, number) => {
+    const lane = room.drawn[number], top = number * LANE;
+    set(lane.element, "aria-label", it.told);
+    for (const [name, value] of [["x", 0], ["y", top], ["width", width], ["height", LANE]]) set(lane.hit, name, value);
+    set(lane.line, "d", number ? `M0 ${top}H${width}` : "");
+    set(lane.marks, "d", marks(it.bars, width, day.hours.length, top + NAME, LANE - NAME - GAP));
+    set(lane.marks, "fill", `rgb(${it.colour.join(" ")})`);
+    write(lane.name, it.words);
+    write(lane.figure, it.today ? `${it.today}×` : "");
+    for (const [text, x] of [[lane.name, 6], [lane.figure, width - 6]]) { set(text, "x", x); set(text, "y", top + 12.5); }
+  });
+  const every = width < 520 ? 4 : 2;
+  room.hours.replaceChildren(...day.hours.filter(([, hour]) => hour % every === 0).map(([where, hour]) =>
+    draw("text", { x: Math.min(Math.max(where * width, 8), width - 8), y: height + 14 }, String(hour).padStart(2, "0"))));
+  write(room.note, room.sounded.length ? "" : say("nothing"));
+  room.note.hidden = room.sounded.length > 0;
+  showTable(room, day);
+  if (open && !open.button.isConnected) close();
+}
+
+function showTable(room, day) {
+  const heads = [say("sound"), say("today"), say("last night"), say("last")];
+  if (day.now === null) [heads[1], heads[2]] = [say("day"), say("night before")];
+  room.heads.forEach((head, index) => write(head, heads[index]));
+  write(room.caption, room.where ? say("often in", { room: room.where }) : say("often"));
+  room.table.hidden = !room.lanes.length;
+  const key = JSON.stringify(room.lanes.map(({ label, words }) => [label, words]));
+  if (room.key !== key) { // else what somebody reads there stays
+    room.key = key;
+    room.rows = room.lanes.map(({ label }) => beginRow(room, label));
+    room.body.replaceChildren(...room.rows.map(({ element }) => element));
+  }
+  room.rows.forEach((row, index) => showRow(row, room.lanes[index], room.where));
+}
+
+let rooms = [], roomsOf = "", shown = null;
+
+export function showDay(day) {
+  const isNew = shown?.date !== day.date;
+  shown = day;
+  if (isNew) close();
+  place("legend").hidden = !day.rooms.length;
+  const key = JSON.stringify(day.rooms.map(({ room }) => room));
+  if (key !== roomsOf) {
+    close();
+    roomsOf = key;
+    rooms = day.rooms.map(({ room }) => beginRoom(room, day.rooms.length === 1));
+    place("rooms").replaceChildren(...rooms.flatMap(({ elements }) => elements));
+  }
+  day.rooms.forEach((room, index) => showRoom(rooms[index], room, day));
+  if (open) showTimes();
+}
+
+export function drawAgain() {
+  if (shown) showDay(shown);
+}

@@ -1,0 +1,311 @@
+// Lists of sounds: what they were, what they really were, and their kept sound.
+import { ask, count, keep, make, place, say, send, swatch, write } from "./elements.js";
+
+const REST = 8000; // milliseconds without a touch, after which a list may change
+const AGAIN = 60000; // after which it is asked again whether sound was kept
+let classes = [], isSoundAllowed = false;
+const lists = { look: new Map(), events: new Map(), recurring: new Map() }; // items by ids
+
+// Kept sound
+
+const playable = new Set(), asked = new Map(); // ids; when each was asked for
+const buttons = new Set();
+let playing = null, audio = null;
+
+export function allowSound(isAllowed) { isSoundAllowed = isAllowed; }
+
+// A button that plays the sound of the first of some events that has any.
+export function playButton(ids, name) {
+  const button = make("button", { type: "button", class: "play", hidden: "" }, "▶");
+  const show = () => {
+    if (!button.isConnected && button.wasShown) { buttons.delete(show); return; }
+    button.wasShown = button.isConnected;
+    const isOn = playing?.button === button;
+    write(button, isOn ? "■" : "▶");
+    button.setAttribute("aria-label", isOn ? say("stop") : say("play", { what: name() }));
+    button.hidden = !ids().some((id) => playable.has(id));
+  };
+  button.addEventListener("click", () => play(button, ids().find((id) => playable.has(id))));
+  buttons.add(show);
+  return button;
+}
+
+function showButtons() { for (const show of [...buttons]) show(); }
+
+// Asks the box once which of some events have sound.
+export async function showPlayable(ids) {
+  const now = Date.now();
+  const wanted = isSoundAllowed
+    ? ids.filter((id) => !playable.has(id) && now - (asked.get(id) ?? 0) > AGAIN).slice(0, 50) : [];
+  wanted.forEach((id) => asked.set(id, now));
+  if (wanted.length) {
+    const found = await ask(`kept?${wanted.map(encodeURIComponent).join("&")}`);
+    if (Array.isArray(found)) found.forEach((id) => playable.add(id));
+  }
+  showButtons();
+}
+
+function stop() {
+  const last = playing;
+  playing = null;
+  last?.source?.stop();
+  showButtons();
+}
+
+async function play(button, id) {
+  const isSame = playing?.button === button;
+  stop();
+  if (isSame) return;
+  write(place("play-problem"), "");
+  audio ??= new AudioContext();
+  const own = playing = { button };
+  showButtons();
+  try {
+    await audio.resume();
+    const answer = await fetch(`sound?${encodeURIComponent(id)}`);
+    if (answer.status !== 200) throw new Error((await answer.json()).error);
+    const sound = await audio.decodeAudioData(await answer.arrayBuffer());
+    if (playing !== own) return;
+    own.source = new AudioBufferSourceNode(audio, { buffer: sound });
+    own.source.connect(audio.destination);
+    own.source.addEventListener("ended", () => { if (playing === own) stop(); });
+    own.source.start();
+  } catch (error) {
+    if (playing === own) stop();
+    write(place("play-problem"), error.name === "Error" && error.message ? error.message : say("no sound"));
+  }
+}
+
+// What a sound really was
+
+function choice(name, value, ...words) {
+  return make("label", {}, make("input", { type: "radio", name, value, required: "" }), ...words);
+}
+
+// A form in which one says what a sound was; `save` is told it, and answers what came of it.
+function form(item, { legend, choices, save }) {
+  const own = make("input", { type: "text", maxlength: 64, autocomplete: "off", "aria-label": say("what") });
+  const something = choice("label", "", say("own"));
+  something.classList.add("own");
+  something.append(own);
+  own.addEventListener("input", () => { something.firstElementChild.checked = true; });
+  const problem = make("p", { class: "problem", role: "alert" });
+  const button = make("button", {}, say("save"));
+  const question = make("form", {}, make("fieldset", {}, make("legend", {}, legend),
+    ...choices.map(([label, words]) => choice("label", label, words)), something), problem, button);
+  question.addEventListener("submit", async (submitted) => {
+    submitted.preventDefault();
+    const label = new FormData(question).get("label") || own.value.trim();
+    if (!label) { write(problem, say("write")); own.focus(); return; }
+    button.disabled = true;
+    write(problem, "");
+    const answer = await save(label);
+    button.disabled = false;
+    if (answer.error) { write(problem, answer.error); return; }
+    showAnswer(item, answer.said);
+    item.details.open = false;
+    item.summary.focus();
+  });
+  return question;
+}
+
+function showAnswer(item, said) {
+  write(item.said, said);
+  item.element.classList.toggle("reviewed", Boolean(said) && item.isReviewable);
+}
+
+// An item of a list of sounds, with a form that `question` describes when it is opened.
+function begin(question) {
+  const item = {
+    what: make("p", { class: "what" }),
+    about: make("p", { class: "about" }),
+    said: make("p", { class: "said", role: "status" }),
+    summary: make("summary", {}, say("that was")),
+    isReviewable: false,
+  };
+  item.details = make("details", {}, item.summary);
+  item.element = make("li", {}, make("div", {}, item.what, item.about, item.said), item.details);
+  item.summary.append(item.hint = make("span", { class: "hidden" }));
+  item.details.addEventListener("toggle", () => {
+    if (item.details.open && item.details.children.length === 1) item.details.append(form(item, question(item)));
+    if (!item.details.open) item.details.querySelector("form")?.remove();
+  });
+  return item;
+}
+
+// The items of a list in its order, by the ids of what they show; one in which somebody is just
+// saying what it was stays.
+function arrange(list, items, entries, begun, show) {
+  const ids = new Set(entries.map(({ id }) => id));
+  for (const [id, item] of items) {
+    if (ids.has(id) || (item.details.open && item.element.isConnected)) continue;
+    item.element.remove();
+    items.delete(id);
+  }
+  let before = null;
+  for (const entry of entries) {
+    let item = items.get(entry.id);
+    if (!item) items.set(entry.id, item = begun(entry));
+    show(item, entry);
+    const next = before ? before.nextSibling : list.firstChild;
+    if (item.element !== next) list.insertBefore(item.element, next);
+    before = item.element;
+  }
+}
+
+function beginBout(entry) {
+  const item = begin(() => {
+    const { id, label, words, time } = item.entry;
+    const others = classes.filter(([name]) => name !== label);
+    return {
+      legend: say("question", { class: words, time }),
+      choices: [[label, say("right", { class: words })], ...others, ["television", say("television")], ["silence", say("silence")]],
+      save: (chosen) => send("mark", { event: id, label: chosen }),
+    };
+  });
+  item.entry = entry;
+  item.isReviewable = true;
+  item.what.append(swatch(entry.colour), entry.words, item.often = make("span", { class: "often" }));
+  item.play = playButton(() => item.entry.ids, () => `${item.entry.words}, ${item.entry.time}`);
+  item.details.before(item.play);
+  return item;
+}
+
+function showBout(item, entry) {
+  item.entry = entry;
+  write(item.often, entry.times ? ` · ${entry.times}` : "");
+  write(item.about, [entry.time, entry.length, entry.sure, entry.room].filter(Boolean).join(" · "));
+  showAnswer(item, entry.said);
+  write(item.hint, ` (${entry.words}, ${entry.time})`);
+}
+
+let latest = null, shownIds = null, isPast = false;
+let touched = -Infinity;
+
+function showList(events) {
+  const look = events.filter((each) => each.look), others = events.filter((each) => !each.look);
+  arrange(place("look"), lists.look, look, beginBout, showBout);
+  arrange(place("events"), lists.events, others, beginBout, showBout);
+  place("looked-at").hidden = !look.length;
+  place("no-events").hidden = events.length > 0;
+  showPlayable(events.flatMap(({ ids }) => ids));
+}
+
+// Whether nobody reads, points at or answers in the lists just now.
+function isAtRest() {
+  const section = place("sounds");
+  if (section.contains(document.activeElement) || section.querySelector("details[open]")) return false;
+  if (matchMedia("(hover: hover)").matches && section.matches(":hover")) return false;
+  const { top, bottom } = section.getBoundingClientRect();
+  return (top > innerHeight || bottom < 0 || top >= 0) && Date.now() - touched > REST;
+}
+
+function showLatest(isWanted) {
+  if (!latest || isPast) return;
+  const fresh = shownIds ? latest.filter(({ id }) => !shownIds.has(id)).length : 0;
+  const button = place("new-sounds");
+  if (!fresh || isWanted || isAtRest()) {
+    shownIds = new Set(latest.map(({ id }) => id));
+    button.hidden = true;
+    showList(latest);
+    return;
+  }
+  for (const entry of latest) { // those that are shown may go on
+    const item = lists.look.get(entry.id) ?? lists.events.get(entry.id);
+    if (item) showBout(item, entry);
+  }
+  write(button, count("new", fresh));
+  button.hidden = false;
+}
+
+export function showEvents({ events, classes: known, hidden }) {
+  classes = known;
+  showHidden(hidden);
+  latest = events;
+  const labels = new Set([...known.map(([label]) => label), ...events.map(({ label }) => label)]);
+  for (const id of [...(shownIds ?? [])]) { // a class that was hidden goes at once
+    const item = lists.look.get(id) ?? lists.events.get(id);
+    if (item && !labels.has(item.entry.label)) shownIds = null;
+  }
+  showLatest(false);
+}
+
+// The sounds of a past day; without any argument those of today again.
+export function showSoundsOf(events) {
+  isPast = events !== undefined;
+  write(place("events-heading"), say(isPast ? "sounds of" : "sounds"));
+  write(place("no-events"), say(isPast ? "none of day" : "none"));
+  place("new-sounds").hidden = true;
+  if (isPast) showList(events);
+  else showLatest(true);
+}
+
+for (const kind of ["touchstart", "wheel", "keydown"]) {
+  addEventListener(kind, () => { touched = Date.now(); }, { passive: true });
+}
+setInterval(() => { if (!place("new-sounds").hidden) showLatest(false); }, 2000);
+place("new-sounds").addEventListener("click", () => {
+  showLatest(true);
+  const section = place("sounds");
+  if (section.getBoundingClientRect().top < 0) section.scrollIntoView();
+});
+
+// Classes that are hidden
+
+async function showClass(label) {
+  const answer = await send("show", { show: "yes", label });
+  write(place("hidden-said"), answer.error ?? answer.said);
+}
+
+function showHidden(hidden) {
+  keep(place("hidden-classes"), hidden, () => {
+    const button = make("button", { type: "button", class: "back" });
+    const child = make("li", {}, make("span"), " ", button);
+    button.addEventListener("click", () => showClass(child.dataset.label));
+    return child;
+  }, (child, [label, words, inside]) => {
+    child.dataset.label = label;
+    write(child.firstElementChild, words);
+    write(child.lastElementChild, say("show", { class: inside }));
+  });
+  place("hidden-sounds").hidden = !hidden.length;
+}
+
+// Sounds that recur
+
+function beginGroup({ id }) {
+  const item = begin(({ words }) => ({
+    legend: say("question of group", { class: words }),
+    choices: classes,
+    save: (label) => send("group", { group: id, label }),
+  }));
+  [item.heard, item.listen] = [make("p", { class: "about" }), make("p", { class: "about" })];
+  item.about.after(item.heard, item.listen);
+  item.back = make("button", { type: "button", class: "back" }, say("take back"));
+  item.back.append(item.backHint = make("span", { class: "hidden" }));
+  item.details.after(item.back);
+  item.back.addEventListener("click", async () => {
+    item.back.disabled = true;
+    const answer = await send("group", { group: id, label: "" });
+    item.back.disabled = false;
+    write(item.said, answer.error ?? answer.said);
+  });
+  return item;
+}
+
+export function showRecurring({ looked, more, groups }) {
+  place("recurs").hidden = !groups.length;
+  write(place("recurring-hint"), say("recurring hint", { found: looked ? say("found", { time: looked }) : "" }));
+  write(place("more"), more);
+  arrange(place("recurring"), lists.recurring, groups, beginGroup, (item, group) => {
+    item.words = group.words;
+    write(item.what, group.words);
+    write(item.about, group.about);
+    write(item.heard, group.heard);
+    write(item.listen, group.listen);
+    write(item.said, group.said);
+    write(item.hint, ` (${group.words})`);
+    write(item.backHint, ` ${say("take back name", { class: group.words })}`);
+    item.back.hidden = !group.is_named;
+  });
+}

@@ -1,0 +1,225 @@
+"""List of sounds on the page: events of one class folded, what needs a look, and their sound."""
+
+import io
+import wave
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime, tzinfo
+from pathlib import Path
+from threading import Lock
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity.sources import source_microphone
+from hearthlog.analyzer.bridge.home_state import LiveMicrophone
+from hearthlog.analyzer.bridge.page.day import IMPORTANT
+from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.wording import Words, clock, room
+from hearthlog.analyzer.colours import colour_on_paper
+from hearthlog.analyzer.logs.clips import kept_sound, kept_time
+from hearthlog.models.classes import SILENCE
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.files import AUDIO_LAYER, find_logs, log_name
+from hearthlog.schemas.messages.topics import LIVE, labelling_topic
+
+_PAUSE = 300 * NANOSECONDS  # longest between two events of a bout
+_MOST_OF_BOUT = 50  # events
+
+
+class Bout(NamedTuple):
+    """Events of one class at one microphone, with pauses of five minutes at most.
+
+    Attributes
+    ----------
+    events : sequence of SoundEvent
+        The oldest first; its id is that of the bout.
+    """
+
+    events: Sequence[SoundEvent]
+
+    @property
+    def first(self) -> SoundEvent:
+        """The oldest event."""
+        return self.events[0]
+
+    @property
+    def last(self) -> SoundEvent:
+        """The newest event."""
+        return self.events[-1]
+
+    @property
+    def is_important(self) -> bool:
+        """Whether the bout needs a look."""
+        return self.first.label in IMPORTANT
+
+
+def bouts(events: Iterable[SoundEvent]) -> list[Bout]:
+    """Fold events to bouts, the newest first."""
+    found: list[list[SoundEvent]] = []
+    going: dict[tuple[str, str], list[SoundEvent]] = {}
+    for event in sorted(events, key=lambda event: event.start):
+        key = event.microphone, event.label
+        own = going.get(key)
+        if own and event.start - own[-1].end <= _PAUSE and len(own) < _MOST_OF_BOUT:
+            own.append(event)
+        else:
+            going[key] = [event]
+            found.append(going[key])
+    folded = [Bout(each) for each in found]
+    return sorted(folded, key=lambda bout: (bout.last.start, bout.last.id), reverse=True)
+
+
+def events_between(microphones: Iterable[LiveMicrophone], start: int, end: int) -> list[SoundEvent]:
+    """Return the events of microphones that begin in a time span and may be shown."""
+    return [
+        event
+        for microphone in microphones
+        for label in microphone.labels()
+        if label != SILENCE
+        for event in microphone.events(label, start)
+        if event.start < end
+    ]
+
+
+class ShownBouts(NamedTuple):
+    """How bouts are shown.
+
+    Attributes
+    ----------
+    correction : callable
+        Returns the correction of an event in words; empty if there is none.
+    """
+
+    now: int
+    zone: tzinfo
+    words: Words
+    correction: Callable[[SoundEvent], str]
+    is_alone: bool
+
+    def describe(self, bout: Bout) -> Any:
+        """Return a bout for JSON."""
+        words, first, last = self.words, bout.first, bout.last
+        count = len(bout.events)
+        time = words.when(first.start, self.now, self.zone)
+        end = clock(last.end, self.zone)
+        if count > 1 and end != clock(first.start, self.zone):
+            time = words.text("range", first=time, last=end)
+        said = [text for text in map(self.correction, bout.events) if text]
+        length = words.length(sum(event.seconds for event in bout.events))
+        return {
+            "id": first.id,
+            "label": first.label,
+            "words": words.class_words(first.label),
+            "colour": colour_on_paper(first.label),
+            "times": words.times(count) if count > 1 else "",
+            "time": time,
+            "length": length,
+            "sure": words.sureness(max(event.confidence for event in bout.events)),
+            "room": "" if self.is_alone else room(first.microphone),
+            "said": said[-1] if said else "",
+            "look": bout.is_important,
+            "ids": [event.id for event in reversed(bout.events)],
+        }
+
+
+_LONGEST_SOUND = 60 * NANOSECONDS
+_NEAR = 10 * NANOSECONDS  # a clip may lie so far from its log time
+_MOST_KEPT = 2000  # remembered events with kept sound
+_FULL_SCALE = 32767
+
+
+class KeptSounds:
+    """Kept sound of the events of a home."""
+
+    def __init__(self, folder: Path, node: str) -> None:
+        self._folder = folder
+        self._node = node
+        self._found: OrderedDict[str, None] = OrderedDict()  # ids of events with kept sound
+        self._lock = Lock()  # one reader at a time
+
+    def has(self, event: SoundEvent) -> bool:
+        """Whether any sound of an event was kept; `False` if its layers cannot be read."""
+        if event.id in self._found:
+            return True
+        start, end = _limits(event)
+        with self._lock:
+            try:
+                layers = self._layers(start, end)
+                kept = bool(layers) and bool(kept_time(layers, _topic(event), start, end).length)
+            except (HearthlogError, OSError):
+                return False
+            if kept:
+                self._found[event.id] = None
+                if len(self._found) > _MOST_KEPT:
+                    self._found.popitem(last=False)
+        return kept
+
+    def wav(self, event: SoundEvent, hidden: Iterable[SoundEvent]) -> bytes:
+        """Return the sound of an event, up to its first minute, as a WAV file.
+
+        Parameters
+        ----------
+        hidden : iterable of SoundEvent
+            Events that nobody may hear: silence takes their place.
+
+        Raises
+        ------
+        BridgeError
+            If no sound was kept, or it cannot be read.
+        """
+        start, end = _limits(event)
+        try:
+            with self._lock:
+                rate, samples = kept_sound(self._layers(start, end), _topic(event), start, end)
+        except (HearthlogError, OSError) as error:
+            raise BridgeError(f"{event.id}: the sound cannot be read ({error})") from error
+        if not rate:
+            raise BridgeError("No sound was kept of this.")
+        for other in hidden:
+            if source_microphone(other.microphone) == event.microphone:
+                first, last = (
+                    min(max((edge - start) * rate // NANOSECONDS, 0), len(samples))
+                    for edge in (other.start, other.end)
+                )
+                samples[first : last + 1] = 0
+        content = io.BytesIO()
+        with wave.open(content, "wb") as sound:
+            sound.setnchannels(1)
+            sound.setsampwidth(2)
+            sound.setframerate(rate)
+            whole = np.clip(samples * _FULL_SCALE, -_FULL_SCALE, _FULL_SCALE).astype("<i2")
+            sound.writeframes(whole.tobytes())
+        return content.getvalue()
+
+    def _layers(self, start: int, end: int) -> list[Path]:
+        """Return the layers that may have sound of a time span."""
+        named = ((log, log_name(log)) for log in find_logs(self._folder))
+        layers = [
+            (begin, log)
+            for log, name in named
+            if (name.layer, name.node) == (AUDIO_LAYER, self._node)
+            and (begin := _begin(name.time)) is not None
+            and begin <= end + _NEAR
+        ]
+        last = max((begin for begin, _ in layers if begin <= start - _NEAR), default=0)
+        return [log for begin, log in layers if begin >= last]
+
+
+def _limits(event: SoundEvent) -> tuple[int, int]:
+    return event.start, min(event.end, event.start + _LONGEST_SOUND)
+
+
+def _topic(event: SoundEvent) -> str:
+    return labelling_topic(event.microphone, LIVE, "audio")
+
+
+def _begin(name: str) -> int | None:
+    """Return the start of a log by its name, in nanoseconds of UTC; None if it has none."""
+    try:
+        begin = datetime.strptime(name[:16], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return int(begin.timestamp()) * NANOSECONDS

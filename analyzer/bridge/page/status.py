@@ -1,0 +1,214 @@
+"""Current state on the page: what sounds now, scenarios, and what works."""
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from hearthlog.analyzer.activity.events import ANY_SOUND, HOLD_SECONDS
+from hearthlog.analyzer.activity.sources import source_microphone, source_parts
+from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
+from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.wording import ENGLISH, Words, reason, room, told
+from hearthlog.models.classes import SILENCE, ordered
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.topics import is_sound
+
+_QUIETEST = -80.0  # dBFS at the left end of the bar
+_GOES_ON = (HOLD_SECONDS + 5) * NANOSECONDS  # after the end of a segment
+
+
+class _Current(NamedTuple):
+    words: str
+    since: int  # in nanoseconds of UTC; 0: unknown
+
+
+class CurrentSounds:
+    """Current sounds of each microphone, with their start times."""
+
+    def __init__(self, words: Words = ENGLISH) -> None:
+        self._words = words
+        self._last: dict[str, _Current] = {}
+
+    def describe(self, news: News) -> Any:
+        """Return the current sounds for JSON."""
+        words, microphones = self._words, news.state.present()
+        nothing = "now.nothing" if news.state.is_recording() else "now.not recording"
+        return {
+            "nothing": "" if microphones else words.text(nothing) + ".",
+            "rooms": [
+                self._room(each, news, is_alone=len(microphones) == 1) for each in microphones
+            ],
+        }
+
+    def _room(self, microphone: LiveMicrophone, news: News, *, is_alone: bool) -> Any:
+        words, sound = self._words, _sounds_in_words(microphone, self._words)
+        last = self._last.get(microphone.name)
+        if last is None or last.words != sound:
+            since = _active_since(microphone) or (news.today.now if last is not None else 0)
+            last = self._last[microphone.name] = _Current(sound, since)
+        since_words = words.when(last.since, news.today.now, news.zone) if last.since else ""
+        health = news.state.health.get(microphone.name)
+        is_listening = microphone.is_listening()
+        why = reason(told(health.text)) if health is not None and not is_listening else ""
+        sentence = sound
+        if since_words:
+            sentence = words.text("now.since", words=sentence, time=since_words)
+        if why:
+            sentence = words.text("now.why", words=sentence, why=why)
+        where = "" if is_alone else room(microphone.name)
+        if where:
+            sentence = words.text("now.room", room=where, words=words.inside_first(sentence))
+        return {
+            "room": where,
+            "words": sound,
+            "sentence": f"{sentence}.",
+            "since": since_words,
+            "why": why,
+            "level": _level(microphone) if is_listening else None,
+        }
+
+
+def _sounds_in_words(microphone: LiveMicrophone, words: Words) -> str:
+    if not microphone.is_listening():
+        return words.text("now.not listening")
+    names = [words.class_words(label) for label in active_classes(microphone)]
+    if names:
+        return words.listed([names[0], *map(words.inside, names[1:])])
+    is_sound_now = microphone.heard.is_heard(ANY_SOUND)
+    return words.text("now.sound") if is_sound_now else words.class_words(SILENCE)
+
+
+def active_classes(microphone: LiveMicrophone) -> list[str]:
+    """Return the active classes except silence, the most important first."""
+    return [
+        label
+        for label in ordered(microphone.classes)
+        if is_sound(label) and microphone.heard.is_heard(label)
+    ]
+
+
+def _active_since(microphone: LiveMicrophone) -> int:
+    """Return the start of the microphone's current state, from the log; 0 if unknown."""
+    if not microphone.is_listening():
+        return microphone.heard.time
+    heard = active_classes(microphone)
+    if heard:
+        last = [microphone.last_event(label) for label in heard]
+        end = microphone.heard.time - _GOES_ON
+        going = [event.start for event in last if event is not None and event.end >= end]
+        return max(going) if len(going) == len(heard) else 0
+    last = [microphone.last_event(label) for label in microphone.labels()]
+    return max((event.end for event in last if event is not None), default=0)
+
+
+def _level(microphone: LiveMicrophone) -> Any:
+    """Return the level as a share of the bar and as text; None if unknown."""
+    level = microphone.level_dbfs
+    if not math.isfinite(level):
+        return None
+    return min(max(round(1 - level / _QUIETEST, 2), 0.0), 1.0), f"{level:.0f} dB".replace(
+        "-", "\N{MINUS SIGN}"
+    )
+
+
+_WELL, _WARNING, _WRONG = 0, 1, 2  # as in diagnostics
+_THINGS = {"disk": "health.disk", "machine": "health.machine"}  # keys of words
+
+
+def _line(what: str, level: int, text: str) -> dict[str, Any]:
+    return {"what": what, "level": level, "text": text}
+
+
+def health_list(
+    news: News, node: str, started: int, recurring: str = "", words: Words = ENGLISH
+) -> list[Any]:
+    """Return the health of all subjects for JSON.
+
+    Parameters
+    ----------
+    started : int
+        Start of the bridge, in nanoseconds of UTC.
+    recurring : str, optional
+        Problem with the recurring sounds; empty for none.
+    """
+    lines = [*_lines(news, node, started, words)]
+    if recurring:
+        lines.append(_line(words.text("health.recurring"), _WARNING, recurring))
+    return lines
+
+
+def _lines(news: News, node: str, started: int, words: Words) -> Iterator[Any]:
+    state = news.state
+    for microphone in state.present():
+        yield _of_microphone(microphone, state, words)
+    is_recording = state.is_recording()
+    yield _line(
+        words.text("health.recorder"),
+        _WELL if is_recording else _WRONG,
+        words.text("health.recording" if is_recording else "health.not recording"),
+    )
+    for subject, health in sorted(state.health.items()):
+        if subject not in state.microphones:
+            level, text = min(health.level, _WRONG), words.translated(told(health.text))
+            yield _line(_thing(subject, node, words), level, text)
+    since = words.when(started, news.today.now, news.zone)
+    yield _line(words.text("health.bridge"), _WELL, words.text("health.follows", time=since))
+
+
+def _of_microphone(microphone: LiveMicrophone, state: HomeState, words: Words) -> Any:
+    health = state.health.get(microphone.name)
+    text, level = ("", _WELL) if health is None else (told(health.text), health.level)
+    is_alone = len(state.present()) == 1
+    key = "health.microphone" if is_alone else "health.microphone of"
+    what = words.text(key, room=room(microphone.name))
+    if not microphone.is_listening():
+        why = reason(text)
+        key = "health.not listening because" if why else "health.not listening"
+        return _line(what, _WRONG, words.text(key, text=why))
+    key = "health.listening but" if level else "health.listening"
+    return _line(what, min(level, _WRONG), words.text(key, text=text))
+
+
+def _thing(subject: str, node: str, words: Words) -> str:
+    whose, _, part = subject.partition(" ")
+    if whose == node and part in _THINGS:
+        return words.text(_THINGS[part])
+    return told(subject.replace("_", " ")).capitalize()
+
+
+def scenario_lines(news: News, words: Words = ENGLISH) -> list[Any]:
+    """Return a line for each scenario of each microphone, for JSON."""
+    state, midnight = news.state, news.today.midnight
+    lines = []
+    for name in sorted(state.scenarios):
+        own = state.scenarios[name]
+        today = _today(own, midnight, words)
+        if own.is_listening() or today:
+            where = [room(source_microphone(name))] if len(state.microphones) > 1 else []
+            what = " · ".join([room(source_parts(name)[1]), *where])
+            nothing = words.text("now.none")
+            about = words.text("now.scenario", now=_now(own, words), today=today or nothing)
+            lines.append({"what": what, "about": about})
+    return lines
+
+
+def _now(own: LiveMicrophone, words: Words) -> str:
+    if not own.is_listening():
+        return words.inside_first(words.text("now.not listening"))
+    names = [words.inside(words.class_words(label)) for label in active_classes(own)]
+    return words.listed(names) or words.text("now.none")
+
+
+def _today(own: LiveMicrophone, midnight: int, words: Words) -> str:
+    """Format count and total length of each class since midnight, longest first."""
+    events = {label: own.events(label, midnight) for label in own.labels()}
+    seconds = {label: sum(each.seconds for each in same) for label, same in events.items() if same}
+    return ", ".join(
+        words.text(
+            "class, times and length",
+            **{"class": words.inside(words.class_words(label))},
+            times=words.times(len(events[label])),
+            length=words.length(seconds[label]),
+        )
+        for label in sorted(seconds, key=lambda label: -seconds[label])
+    )
