@@ -255,7 +255,7 @@ class Phone:
 
     def _is_there(self):
         with suppress(AssertionError):  # it is still going on from the entrance
-            return self.of('document.querySelectorAll("#events li, .lanes svg").length > 1')
+            return self.of('document.querySelectorAll("#events li, #look li, .lane").length > 1')
 
     def of(self, expression):
         return self._browser.evaluate(expression)

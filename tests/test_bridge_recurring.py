@@ -381,6 +381,7 @@ def test_the_list_is_not_there_before_sounds_were_grouped_and_a_damaged_one_is_a
     with serving(tmp_path) as home:
         heard_once(home)
         phone.open(home)
+        phone.of('document.querySelector("#working").open = true')
         phone.shows("#health", "Bridge: Good")
         assert phone.of('document.getElementById("recurs").hidden')
         (tmp_path / "logs" / SUMMARY).write_text("{")

@@ -118,7 +118,7 @@ class Words:
 
     def inside(self, words: str) -> str:
         """Return the display name of a class as it is written inside of a sentence."""
-        return words.lower() if self.texts["noun in a sentence"] == "lower case" else words
+        return words.lower() if self.texts["page.nouns"] == "lower case" else words
 
     def inside_first(self, sentence: str) -> str:
         """Return a sentence that begins with a name as the later part of another one."""

@@ -108,8 +108,10 @@ class HomeDay(NamedTuple):
         spans = [(start, microphone.since or now), *microphone.gaps]
         spans += zip(own.ends[:-1].tolist(), own.starts[1:].tolist(), strict=True)
         if not microphone.is_listening() or self.is_past:
-            last = max(microphone.heard.time, int(own.ends[-1]) if len(own.ends) else 0)
-            spans.append((last, now))
+            ends = [int(own.ends[-1])] if len(own.ends) else []
+            events = (microphone.last_event(label) for label in microphone.labels())
+            ends += [event.end for event in events if event is not None]
+            spans.append((max([microphone.heard.time, *ends]), now))
         inside = np.array([(max(a, start), min(b, now)) for a, b in spans], np.int64)
         some = inside[inside[:, 0] < inside[:, 1]]
         return joined(some[:, 0], some[:, 1])
@@ -198,7 +200,6 @@ def _lane(
     return {
         "label": label,
         "words": name,
-        "inside": words.inside(name),
         "colour": colour_on_paper(label),
         "bars": bars((event for event in events if event.end > day.start), day),
         "told": words.text(key, **{"class": name, "times": often, "last": at}),

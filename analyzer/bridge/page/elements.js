@@ -13,6 +13,11 @@ export function count(key, number) {
   return say(`${key}.${number === 1 ? "one" : "other"}`, { count: number.toLocaleString(language) });
 }
 
+// The name of a class as it is written inside of a sentence.
+export function inside(words) {
+  return texts["page.nouns"] === "lower case" ? words.toLowerCase() : words;
+}
+
 export function make(name, attributes = {}, ...children) {
   return fill(document.createElement(name), attributes, children);
 }

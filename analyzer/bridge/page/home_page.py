@@ -200,9 +200,7 @@ class HomePage:
         return {
             "events": every,
             "classes": [(label, words.class_words(label)) for label in names if is_sound(label)],
-            "hidden": [
-                (n, words.class_words(n), words.inside(words.class_words(n))) for n in hidden
-            ],
+            "hidden": [(label, words.class_words(label)) for label in hidden],
         }
 
     def _latest(self) -> list[Bout]:

@@ -65,7 +65,7 @@ let today = null, chosen = "", dates = []; // chosen: the date of a past day; em
 const fetched = new Map(); // past days by date, for a while
 
 function showToday(day) {
-  const isNext = today && today.date !== day.date;
+  const isNext = today?.date !== day.date;
   today = day;
   write(place("day-sentence"), day.sentence);
   if (isNext) readDates();
@@ -87,6 +87,7 @@ async function readDates() {
   place("dates").replaceChildren(...dates.map(([date, words, year]) =>
     make("option", { value: date }, nameOfDay(date, words, year === thisYear ? 0 : year))));
   showPlaceOfDay();
+  showWeek();
 }
 
 function nameOfDay(date, words, year) {
@@ -136,10 +137,15 @@ function step(by) {
   if (dates[at]) chooseDay(dates[at][0]);
 }
 
-async function showWeek() {
-  const week = place("week"), button = place("show-week");
+function openWeek() {
+  const week = place("week");
   week.hidden = !week.hidden;
-  set(button, "aria-expanded", String(!week.hidden));
+  set(place("show-week"), "aria-expanded", String(!week.hidden));
+  showWeek();
+}
+
+async function showWeek() {
+  const week = place("week");
   if (week.hidden) return;
   const rows = dates.slice(0, 7).map(([date, words]) => {
     const row = { date, svg: draw("svg", { "aria-hidden": "true", preserveAspectRatio: "none" }),
@@ -152,7 +158,7 @@ async function showWeek() {
   week.replaceChildren(...rows.map((row) => make("li", {}, row.button)));
   for (const row of rows) {
     const day = row.date === today?.date ? today : await readDay(row.date);
-    if (week.hidden) return;
+    if (week.hidden || !row.button.isConnected) return;
     if (day.error) write(row.about, day.error);
     else showDayOfWeek(row, day);
   }
@@ -174,7 +180,7 @@ function showDayOfWeek(row, day) {
 place("dates").addEventListener("change", () => chooseDay(place("dates").value));
 place("day-before").addEventListener("click", () => step(1));
 place("day-after").addEventListener("click", () => step(-1));
-place("show-week").addEventListener("click", showWeek);
+place("show-week").addEventListener("click", openWeek);
 setInterval(readDates, DAYS);
 
 // The connection to the box
@@ -218,4 +224,3 @@ addEventListener("resize", () => {
   width = innerWidth;
 });
 connect();
-readDates();

@@ -1,5 +1,5 @@
 // A day as one picture, its counts, and the times behind a lane or a count.
-import { draw, keep, make, place, say, send, set, swatch, write } from "./elements.js";
+import { draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
 import { playButton, showPlayable } from "./sounds.js";
 
 const LANE = 36, NAME = 15, GAP = 3, HOURS = 20; // pixels
@@ -70,7 +70,7 @@ function showTimes() {
   let text = before ? say("before", { count: before }) : "";
   if (!times.length) text = value === null ? `${capital(say("not known"))}.` : say("not once");
   write(open.note, text);
-  write(open.hide, say("hide", { class: it.inside }));
+  write(open.hide, say("hide", { class: inside(it.words) }));
 }
 
 const capital = (text) => text[0].toUpperCase() + text.slice(1);

@@ -1,5 +1,5 @@
 // Lists of sounds: what they were, what they really were, and their kept sound.
-import { ask, count, keep, make, place, say, send, swatch, write } from "./elements.js";
+import { ask, count, inside, keep, make, place, say, send, swatch, write } from "./elements.js";
 
 const REST = 8000; // milliseconds without a touch, after which a list may change
 const AGAIN = 60000; // after which it is asked again whether sound was kept
@@ -263,10 +263,10 @@ function showHidden(hidden) {
     const child = make("li", {}, make("span"), " ", button);
     button.addEventListener("click", () => showClass(child.dataset.label));
     return child;
-  }, (child, [label, words, inside]) => {
+  }, (child, [label, words]) => {
     child.dataset.label = label;
     write(child.firstElementChild, words);
-    write(child.lastElementChild, say("show", { class: inside }));
+    write(child.lastElementChild, say("show", { class: inside(words) }));
   });
   place("hidden-sounds").hidden = !hidden.length;
 }
