@@ -171,8 +171,11 @@ def serving(folder, settings=None, **options):
 
 
 @contextmanager
-def proxying(port, path):
-    """A proxy of its own port that has the page below a path; yields the address."""
+def proxying(port, path, fields=()):
+    """A proxy of its own port that has the page below a path; yields the address.
+
+    It adds fields to each request, as the ingress of Home Assistant does.
+    """
 
     class Proxy(BaseHTTPRequestHandler):
         def do_GET(self):
@@ -182,7 +185,7 @@ def proxying(port, path):
                 return
             body = self.rfile.read(int(self.headers.get("Content-Length", "0")))
             behind = HTTPConnection("127.0.0.1", port, timeout=30)
-            behind.request(self.command, inside, body, dict(self.headers))
+            behind.request(self.command, inside, body, {**self.headers, **dict(fields)})
             answer = behind.getresponse()
             self.send_response_only(answer.status)
             for name, value in answer.getheaders():

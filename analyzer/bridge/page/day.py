@@ -261,7 +261,7 @@ def day_sentence(home: HomeDay) -> str:
         when = words.text("night.partly")
     elif _is_quiet(found, end - moment.night):
         when = words.text("night.quiet" if is_over else "night.quiet so far")
-        found = {name: events for name, events in found.items() if name in IMPORTANT}
+        found = {name: own for name, own in found.items() if name in IMPORTANT}
     else:
         when = words.text("night.last" if is_over else "night.this")
     return _sentence(when, found, home)
@@ -304,7 +304,8 @@ def _is_quiet(found: Mapping[str, Sequence[SoundEvent]], length: int) -> bool:
 
 def _sentence(when: str, found: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:
     words = home.words
-    parts = [_class_and_times(name, found[name], home) for name in [*found][:_MOST_CLASSES]]
+    names = [name for name in found if name in IMPORTANT] or [*found]
+    parts = [_class_and_times(name, found[name], home) for name in names[:_MOST_CLASSES]]
     what = words.listed(parts)
     if not parts or not when:
         return f"{when or what[:1].upper() + what[1:]}."

@@ -26,6 +26,7 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import parse_topic
 
 _MOST_DAYS = 10  # in memory
+_NO_LOGS = "There are no logs of this day."
 _FRESH_SECONDS = 300.0  # after which a day is read again: a late segment may belong to it
 
 
@@ -65,7 +66,10 @@ class PastDays:
         with self._lock:
             made, found = self._days.get(day, (0.0, None))
             if found is None or time.monotonic() - made > _FRESH_SECONDS:
-                found = _read(self._logs(), self._node, day, self._zone)
+                logs = self._logs()
+                if day not in logs.days(self._zone):
+                    raise BridgeError(_NO_LOGS)
+                found = _read(logs, self._node, day, self._zone)
                 self._days[day] = time.monotonic(), found
             self._days.move_to_end(day)
             while len(self._days) > _MOST_DAYS:
@@ -85,7 +89,7 @@ class PastDays:
         try:
             return find_home_logs([self._folder])
         except HearthlogError as error:
-            raise BridgeError("There are no logs of this day.") from error
+            raise BridgeError(_NO_LOGS) from error
 
 
 def _read(logs: HomeLogs, node: str, day: date, zone: tzinfo) -> PastDay:
@@ -94,8 +98,6 @@ def _read(logs: HomeLogs, node: str, day: date, zone: tzinfo) -> PastDay:
     night = at_hour(before, EVENING, zone), at_hour(day, MORNING, zone)
     late = end + SEGMENT_DELAY  # a segment is written at its end
     entries = [each for each in logs.between(night[0], late) if each.node == node]
-    if not any(each.start < end for each in entries):
-        raise BridgeError("There are no logs of this day.")
     state, listened, marks = HomeState(), ListenedTime(), list[Mark]()
     for entry in entries:
         marks += _read_log(entry, (night[0], late), end, state, listened)

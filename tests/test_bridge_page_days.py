@@ -1,0 +1,523 @@
+"""The page of the home: its sentence, past days, folded sounds, kept sound, and languages."""
+
+import io
+import json
+import re
+import time
+import wave
+from datetime import UTC, datetime, timedelta
+from http.client import HTTPConnection
+from types import SimpleNamespace
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+from homelife import GENERAL, at, write_day
+from pydantic import ValidationError
+from servedhome import PALE_TEXTS, Phone, proxying, serving
+from viewers import browsing, patiently
+
+from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.bridge.home_state import HomeState
+from hearthlog.analyzer.bridge.page import past_days
+from hearthlog.analyzer.bridge.page.day import HomeDay, ListenedTime, picture_of
+from hearthlog.analyzer.bridge.page.past_days import PastDays
+from hearthlog.analyzer.bridge.page.sounds import bouts
+from hearthlog.analyzer.bridge.settings import PageSettings
+from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.wording import languages, preferred_language, words_of
+from hearthlog.analyzer.logs.local_time import local_time, today
+from hearthlog.models.classes import CLASSES
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns
+from hearthlog.schemas.logs.files import audio_path, find_logs
+from hearthlog.schemas.logs.writer import LogWriter
+from hearthlog.schemas.messages import message_types
+from hearthlog.schemas.messages.message_types import encode, message, time_message
+from hearthlog.schemas.messages.topics import audio_topic
+
+MIDNIGHT = int(datetime(2026, 5, 5, tzinfo=UTC).timestamp()) * NANOSECONDS
+HOUR, MINUTE = 3600 * NANOSECONDS, 60 * NANOSECONDS
+GERMAN = {"Accept-Language": "de-AT,de;q=0.9,en;q=0.5"}
+
+
+# The sentence
+
+
+def tiled(hours, *sounds):
+    """Segments of some hours of the day, silence between sounds of (hour, seconds, label)."""
+    rows, now = [], int(hours[0] * HOUR)
+    for hour, seconds, label in sorted(sounds):
+        begin, end = int(hour * HOUR), int(hour * HOUR) + seconds * NANOSECONDS
+        rows += [(now, begin, "silence"), (begin, end, label)]
+        now = end
+    return [*rows, (now, int(hours[1] * HOUR), "silence")]
+
+
+def home_at(hour, *parts, language="en"):
+    """A home at an hour of the day, by the segments of its log."""
+    rows = [row for part in parts for row in part]
+    starts, ends = (MIDNIGHT + np.array([row[i] for row in rows]) for i in (0, 1))
+    fields = {
+        "header.stamp": starts,
+        "duration": ends - starts,
+        "label": np.array([row[2] for row in rows], object),
+        "confidence": np.ones(len(rows), np.float32),
+    }
+    columns = Columns("/mic/segment", message_types.SEGMENT, {}, ends, ends, ends, fields)
+    state, listened = HomeState(), ListenedTime()
+    state.push([columns])
+    listened.add([columns])
+    (own,) = state.microphones.values()
+    own.names, own.seen = ["silence", "coughing", "crying", "speech"], time.monotonic()
+    moment = today(MIDNIGHT + int(hour * HOUR), UTC)
+    return HomeDay([own], moment, UTC, listened, words_of(language))
+
+
+NIGHT = [(2.17, 3, "coughing"), (6.22, 3, "coughing")]
+
+
+@pytest.mark.parametrize(
+    ("hour", "hours", "sounds", "sentence"),
+    [
+        (9, (-3, 9), NIGHT, "A quiet night: coughing twice (02:10 and 06:13)."),
+        (9, (-3, 9), [], "A quiet night."),
+        (3, (-3, 3), NIGHT[:1], "A quiet night so far: coughing once (02:10)."),
+        (9, (5, 9), NIGHT[1:], "Last night was not listened to throughout: coughing once (06:13)."),
+        (9, (5, 9), [], "Last night was not listened to throughout."),
+        (
+            9,
+            (-3, 9),
+            [(1 + number / 10, 3, "coughing") for number in range(9)],
+            "Last night: coughing 9 times (01:00 to 01:48).",
+        ),
+        (9, (-3, 9), [(1, 1800, "speech")], "Last night: talking once."),
+        (14, (-3, 14), [(10, 3, "coughing")], "Today: coughing once (10:00)."),
+        (14, (-3, 14), [], "Today: no coughing or crying."),
+        (14, (9, 14), [], "Today was not listened to throughout."),
+    ],
+)
+def test_the_sentence_is_true_and_calls_nothing_quiet_that_was_not_listened_to(
+    hour, hours, sounds, sentence
+):
+    assert picture_of(home_at(hour, tiled(hours, *sounds)))["sentence"] == sentence
+
+
+def test_the_counts_of_the_sentence_are_those_below_it():
+    picture = picture_of(home_at(9, tiled((-3, 9), *NIGHT)))
+    (lane,) = (each for each in picture["rooms"][0]["lanes"] if each["label"] == "coughing")
+    assert (lane["today"], lane["night"]) == (2, 2)
+    assert [time for time, _ in lane["times"][0]["times"]] == ["06:13", "02:10"]
+    assert lane["times"][0]["times"][0][1].startswith("mic-coughing-")
+
+
+def test_hours_that_no_log_has_are_hatched_and_no_0_is_said_of_them():
+    home = home_at(9, tiled((-3, -2)), tiled((7, 9)))
+    (room,) = picture_of(home)["rooms"]
+    assert room["gaps"] == [(0, round(7 / 24, 4))]
+    assert {lane["night"] for lane in room["lanes"]} == {None}
+    assert {lane["today"] for lane in room["lanes"]} == {0}
+
+
+# Sounds that are folded
+
+
+def event(minute, label="speech", microphone="mic"):
+    start = MIDNIGHT + round(minute * MINUTE)
+    return SoundEvent(microphone, label, start, start + 5 * NANOSECONDS, 0.9, 5.0)
+
+
+def test_sounds_of_one_class_within_five_minutes_are_one_entry():
+    folded = bouts([event(0), event(4), event(4.5, "coughing"), event(9), event(15)])
+    assert [(each.first.label, len(each.events)) for each in folded] == [
+        ("speech", 1),
+        ("speech", 3),
+        ("coughing", 1),
+    ]
+    assert len(bouts([event(0), event(1, microphone="bath")])) == 2
+    assert max(len(each.events) for each in bouts(event(minute) for minute in range(900))) == 50
+
+
+def test_an_answer_to_folded_sounds_marks_each_of_them(tmp_path):
+    with serving(tmp_path) as home:
+        starts = [home.log.heard("speech", minutes) for minutes in (20, 18, 16)]
+        home.log.hears("silence")
+        with home.stream() as part:
+            shown = part("events", lambda it: len(it["events"][0]["ids"]) == 3)["events"]
+            (entry,) = shown
+            assert entry["times"] == "3 times"
+            assert home.mark(entry["id"], "music")[0] == 200
+            part("events", lambda it: it["events"][0]["said"] == "You said: Music")
+        assert sorted(mark.start for mark in home.marks()) == starts
+
+
+# Past days, with the sound of one
+
+
+def keep_sound(folder, microphone, start, seconds):
+    """Write a tone into the audio layer of the log that has a time."""
+    hour = f"{datetime.fromtimestamp(start // NANOSECONDS, UTC):%Y%m%dT%H%M%S}"
+    log = max(each for each in find_logs(folder) if each.name[5:20] <= hour)
+    writer = LogWriter(audio_path(log), [audio_topic(microphone)], {"version": "0", "node": "home"})
+    tone = 8000 * np.sin(np.arange(16_000 * seconds))
+    sound = message(
+        message_types.RAW_AUDIO,
+        timestamp=time_message(start),
+        data=tone.astype("<i2").view("u1"),
+        format="pcm-s16",
+        sample_rate=16_000,
+        number_of_channels=1,
+    )
+    writer.write(f"/{microphone}/audio", start, encode(sound))
+    writer.finish()
+
+
+@pytest.fixture(scope="module")
+def lived(tmp_path_factory):
+    """A home with two past days, of which the later one has kept sound, and a present."""
+    folder = tmp_path_factory.mktemp("lived")
+    now = datetime.now(UTC)
+    days = [(now - timedelta(days=back)).date() for back in (4, 3)]
+    sounds = [(at("13:10"), 5.0, "coughing", 0.9), (at("13:40"), 90.0, "speech", 0.8)]
+    for day in days:
+        write_day(folder / "logs", day, sounds)
+    begin = int(datetime(days[1].year, days[1].month, days[1].day, tzinfo=UTC).timestamp())
+    start = round(begin + at("13:10")) * NANOSECONDS
+    keep_sound(folder / "logs", "mic", start, 5)
+    with serving(folder, {"sound": True}) as home:
+        home.coughed = start
+        home.log.heard("silence", 350, 60)
+        home.log.heard("coughing", 40, 3)
+        home.log.heard("music", 30, 3)
+        home.log.hears("silence")
+        with home.stream() as part:
+            part("events", lambda events: len(events["events"]) == 2)
+        home.date = local_time(start, home.home.zone).date().isoformat()
+        yield home
+
+
+def got(home, path, **fields):
+    status, _, text = home.ask("GET", path, **fields)
+    return status, json.loads(text)
+
+
+def test_a_past_day_has_the_picture_the_counts_and_the_sounds_of_its_logs(lived):
+    _, days = got(lived, "/days")
+    dates = [date for date, _, _ in days]
+    assert dates == sorted(dates, reverse=True)
+    assert lived.date in dates
+    status, day = got(lived, f"/day?{lived.date}")
+    assert (status, day["now"]) == (200, None)
+    lanes = {lane["label"]: lane for lane in day["rooms"][0]["lanes"]}
+    assert {*lanes} == {*GENERAL} - {"silence"}
+    assert (lanes["coughing"]["today"], lanes["crying"]["today"]) == (1, 0)
+    assert [each["label"] for each in day["events"]] == ["speech", "coughing"]
+    assert f"mic-coughing-{lived.coughed}" in day["events"][1]["ids"]
+    assert day["events"][1]["look"]
+
+
+@pytest.mark.parametrize("text", ["2001-01-01", "", "../../etc/passwd", "9999-12-31", "%00", "x"])
+def test_a_day_without_logs_is_one_line(lived, text):
+    status, answer = got(lived, f"/day?{text}")
+    assert (status, answer) == (422, {"error": "There are no logs of this day."})
+    assert lived.ask("GET", f"/day?{lived.date}", cookie=None)[0] == 403
+
+
+def test_a_day_is_read_once_and_only_some_are_kept(lived, monkeypatch):
+    monkeypatch.setattr(past_days, "_MOST_DAYS", 1)
+    days = PastDays(lived.home)
+    dates = [day for day in days.dates() if day.isoformat() <= lived.date]
+    first = days.read(dates[0], frozenset())
+    assert days.read(dates[0], frozenset()) is first
+    days.read(dates[1], frozenset())
+    assert days.read(dates[0], frozenset()) is not first
+    with pytest.raises(BridgeError, match="no logs"):
+        days.read(datetime(2001, 1, 1, tzinfo=UTC).date(), frozenset())
+
+
+def test_a_day_that_takes_long_to_read_holds_nobody_up(lived):
+    with lived._page._past._lock, lived.connect() as asked:
+        head = f"GET /day?{lived.date} HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {lived.cookie()}"
+        asked.sendall(f"{head}\r\n\r\n".encode())
+        with lived.stream() as part:
+            start = lived.log.heard("laughing", 5)
+            part("events", lambda it: str(start) in json.dumps(it))
+
+
+def test_a_past_sound_can_be_called_by_its_name(lived):
+    got(lived, f"/day?{lived.date}")
+    identifier = f"mic-speech-{lived.coughed + 30 * MINUTE}"
+    status, answer = lived.mark(identifier, "television")
+    assert (status, json.loads(answer)) == (200, {"said": "You said: Television"})
+    _, day = got(lived, f"/day?{lived.date}")
+    assert day["events"][0]["said"] == "You said: Television"
+    lived.restart()
+    _, day = got(lived, f"/day?{lived.date}")
+    assert day["events"][0]["said"] == "You said: Television"
+
+
+def sound_of(home, identifier):
+    connection = HTTPConnection("127.0.0.1", home.port, timeout=30)
+    connection.request("GET", f"/sound?{quote(identifier)}", headers={"Cookie": home.cookie()})
+    answer = connection.getresponse()
+    content = answer.read()
+    connection.close()
+    return answer.status, content
+
+
+def test_kept_sound_is_played_only_of_an_event_that_has_it(lived):
+    got(lived, f"/day?{lived.date}")
+    coughed = f"mic-coughing-{lived.coughed}"
+    spoken = f"mic-speech-{lived.coughed + 30 * MINUTE}"
+    assert got(lived, f"/kept?{coughed}&{spoken}&none") == (200, [coughed])
+    status, content = sound_of(lived, coughed)
+    assert status == 200
+    with wave.open(io.BytesIO(content)) as sound:
+        assert (sound.getframerate(), sound.getnframes()) == (16_000, 80_000)
+        assert np.frombuffer(sound.readframes(80_000), "<i2").any()
+    for other in (spoken, "none", f"mic-coughing-{lived.coughed + 1}", "../x"):
+        assert sound_of(lived, other)[0] == 422
+    assert lived.ask("GET", f"/sound?{coughed}", cookie=None)[0] == 403
+
+
+def test_the_sound_of_a_hidden_class_is_never_played(lived):
+    got(lived, f"/day?{lived.date}")
+    coughed = f"mic-coughing-{lived.coughed}"
+    lived.post("/show", {"show": "no", "label": "coughing"})
+    patiently(lambda: sound_of(lived, coughed)[0], lambda status: status == 422)
+    assert got(lived, f"/kept?{coughed}") == (200, [])
+    assert "oughing" not in json.dumps(got(lived, f"/day?{lived.date}")[1])
+    lived.post("/show", {"show": "yes", "label": "coughing"})
+    patiently(lambda: sound_of(lived, coughed)[0], lambda status: status == 200)
+
+
+def test_a_hidden_sound_within_a_sound_is_silence(lived):
+    event = SoundEvent("mic", "coughing", lived.coughed, lived.coughed + 5 * NANOSECONDS, 1, 5)
+    second = event.start + NANOSECONDS
+    inside = SoundEvent("mic-water", "shower", second, second + NANOSECONDS, 1, 1)
+    content = lived._page._sounds.wav(event, [inside])
+    with wave.open(io.BytesIO(content)) as sound:
+        samples = np.frombuffer(sound.readframes(80_000), "<i2").reshape(5, -1)
+    assert [bool(each[1:].any()) for each in samples] == [True, False, True, True, True]
+
+
+def test_no_sound_leaves_a_home_whose_owner_did_not_allow_it(tmp_path):
+    with serving(tmp_path) as home:
+        start = home.log.heard("coughing", 10, 3)
+        home.log.hears("silence")
+        with home.stream() as part:
+            part("events", lambda events: events["events"])
+        keep_sound(home.log.folder, "mic", start, 3)
+        assert got(home, f"/kept?mic-coughing-{start}") == (200, [])
+        assert sound_of(home, f"mic-coughing-{start}")[0] == 422
+
+
+# Languages
+
+
+def placeholders(text):
+    return {*re.findall(r"\{(\w+)\}", text)}
+
+
+@pytest.mark.parametrize("language", sorted(languages() - {"en"}))
+def test_each_language_has_the_texts_of_english_with_their_placeholders(language):
+    english, other = words_of("en").texts, words_of(language).texts
+    own = {key for key in other if not key.startswith("class.")}
+    assert own == english.keys()
+    assert {key: placeholders(other[key]) for key in own} == {
+        key: placeholders(text) for key, text in english.items()
+    }
+    assert {key for key in other if key.startswith("class.")} == {
+        f"class.{c.name}" for c in CLASSES
+    }
+    assert len(other["months"].split()) == 12
+    assert len(other["weekdays"].split()) == 7
+
+
+@pytest.mark.parametrize(
+    ("header", "language"),
+    [
+        ("de-AT,de;q=0.9,en;q=0.5", "de"),
+        ("fr,en;q=0.5,de;q=0.8", "de"),
+        ("fr", "en"),
+        ("", "en"),
+        ("de;q=0", "en"),
+        ("de;q=x, en", "en"),
+        ("../../secret", "en"),
+        ("d" * 9999, "en"),
+    ],
+)
+def test_the_language_is_the_first_that_the_browser_wants_and_the_page_has(header, language):
+    assert preferred_language(header) == language
+
+
+def test_a_german_browser_gets_german_words_dates_and_errors(lived):
+    _, _, page = lived.ask("GET", "/", **GERMAN)
+    assert '<html lang="de">' in page
+    assert "Letzte Geräusche" in page
+    assert "{{" not in page
+    _, day = got(lived, f"/day?{lived.date}", **GERMAN)
+    assert {"Husten", "Weinen", "Telefon"} <= {n["words"] for n in day["rooms"][0]["lanes"]}
+    assert day["title"].split(",")[0] in words_of("de").texts["weekdays"].split()
+    assert got(lived, "/day?x", **GERMAN)[1]["error"].startswith("Von diesem Tag")
+    picture = picture_of(home_at(9, tiled((-3, 9), *NIGHT), language="de"))
+    assert picture["sentence"] == "Eine ruhige Nacht: zweimal Husten (02:10 und 06:13)."
+
+
+def test_the_configured_language_holds_for_every_browser_and_a_missing_one_is_english(tmp_path):
+    for language, title in (("de", "Zuhause"), ("fr", "The home")):
+        with serving(tmp_path / language, {"language": language}) as home:
+            assert f"<title>{title}</title>" in home.ask("GET", "/", **GERMAN)[2]
+    with pytest.raises(ValidationError):
+        PageSettings(language="../../etc")
+
+
+# On a phone's home screen, and behind a proxy
+
+
+def test_the_page_can_be_installed_and_is_small(lived):
+    page = lived.ask("GET", "/")[2]
+    own = re.findall(r'(?:href|src)="([^"]+)"', page)
+    assert not any(each.startswith(("/", "http")) for each in own)
+    manifest = json.loads(lived.ask("GET", "/page.webmanifest")[2])
+    assert (manifest["display"], manifest["start_url"]) == ("standalone", "./")
+    assert {icon["src"] for icon in manifest["icons"]} == {"icon-512.png", "icon.svg"}
+    scripts = ["picture.js", "sounds.js", "elements.js"]
+    size = 0
+    for name in {"", *own, *scripts, *(icon["src"] for icon in manifest["icons"])}:
+        connection = HTTPConnection("127.0.0.1", lived.port, timeout=30)
+        connection.request("GET", f"/{name}", headers={"Cookie": lived.cookie()})
+        answer = connection.getresponse()
+        assert answer.status == 200, name
+        assert answer.headers["Cache-Control"] == "no-store"
+        size += len(answer.read())
+        connection.close()
+    assert size < 200_000
+
+
+@pytest.fixture(scope="module")
+def phone(tmp_path_factory):
+    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
+        yield Phone(browser)
+
+
+def test_the_page_works_behind_the_ingress_of_home_assistant(phone, lived):
+    path = "/api/hassio_ingress/abc123"
+    with proxying(lived.port, path, {"X-Ingress-Path": path}) as address:
+        phone.open(SimpleNamespace(url=f"{address}?token={lived.token}"))
+        assert phone.of("location.href") == address
+        phone.until("!document.getElementById('day-before').disabled")
+        phone.of("document.getElementById('day-before').click()")
+        phone.until("document.getElementById('past-sentence').innerText")
+        assert phone.of("seen") == []
+        assert phone.of("document.querySelector('[rel=manifest]').href.startsWith(location.href)")
+    hostile = {"X-Ingress-Path": '"><script>alert(1)</script>'}
+    assert "alert(1)" not in str(lived.ask("GET", "/", **hostile))
+    assert lived.ask("GET", "/", cookie=None, **{"X-Ingress-Path": path})[0] == 403
+    assert lived.ask("GET", "/", Host="evil.example", **{"X-Ingress-Path": path})[0] == 403
+
+
+# In a browser
+
+
+def lane(words):
+    return (
+        "[...document.querySelectorAll('.lane')]"
+        f".find((e) => e.querySelector('.name').textContent === {words!r})"
+    )
+
+
+def test_the_first_screen_of_a_phone_has_the_sentence_and_the_whole_picture(phone, lived):
+    lived.log.hears("silence")
+    phone.open(lived)
+    phone.until(lane("Coughing"))
+    size = float(phone.of("getComputedStyle(document.querySelector('.sentence')).fontSize")[:-2])
+    assert size >= 25
+    assert phone.of("document.querySelector('.picture').getBoundingClientRect().bottom") < 844
+    sounded = phone.of("[...document.querySelectorAll('.lane .name')].map((e) => e.textContent)")
+    assert sounded[0] == "Coughing"
+    assert "Crying" not in sounded
+
+
+def test_a_lane_is_opened_by_keyboard_and_shows_its_times(phone, lived):
+    phone.open(lived)
+    phone.until(lane("Coughing"))
+    phone.of(f"{lane('Coughing')}.focus()")
+    phone.press("Enter", "\r")
+    phone.shows(".panel", "Coughing · Today")
+    phone.shows(".panel", "Hide coughing everywhere")
+    assert len(phone.text(".panel ol.times").split()) == 1
+    assert phone.of(f"{lane('Coughing')}.getAttribute('aria-expanded')") == "true"
+    phone.press("Enter", "\r")
+    phone.until("!document.querySelector('.panel')")
+
+
+def test_a_past_day_and_the_week_are_one_tap_away_and_have_their_sound(phone, lived):
+    phone.open(lived)
+    phone.until("document.getElementById('dates').options.length > 2")
+    phone.of("document.getElementById('show-week').click()")
+    phone.until("document.querySelectorAll('#week .marks').length > 2")
+    phone.of(
+        "const dates = document.getElementById('dates');"
+        f"dates.value = '{lived.date}'; dates.dispatchEvent(new Event('change'));"
+    )
+    phone.shows("#past-sentence", "coughing once")
+    phone.shows("#events-heading", "Sounds of this day")
+    phone.until("document.querySelector('#look .play:not([hidden])')")
+    phone.of("document.querySelector('#look .play').click()")
+    phone.until("document.querySelector('#look .play').textContent === '■'")
+    assert phone.of(PALE_TEXTS) == []
+    assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+    phone.of("dates.value = dates.options[0].value; dates.dispatchEvent(new Event('change'));")
+    phone.shows("#events-heading", "Last sounds")
+    assert phone.of("document.getElementById('past-sentence').hidden")
+    assert phone.of("document.querySelector('#events .play:not([hidden])')") is None
+    assert phone.of("seen") == []
+
+
+def test_what_somebody_has_answered_is_grey(phone, lived):
+    phone.open(lived)
+    entry = next(each for each in lived.events() if each["label"] == "music")
+    phone.until("document.querySelector('#events li')")
+    assert phone.of("document.querySelectorAll('#events .reviewed').length") == 0
+    lived.mark(entry["id"], "music")
+    phone.shows("#events .reviewed", "You said: Music")
+    assert phone.of(PALE_TEXTS) == []
+
+
+def test_at_1366_the_sounds_stand_beside_the_picture(phone, lived):
+    phone.open(lived, 1366, 768)
+    phone.until(lane("Coughing"))
+    edges = "document.querySelector('{}').getBoundingClientRect().{}"
+    right = phone.of(edges.format(".picture", "right"))
+    assert right < phone.of(edges.format("#sounds", "left"))
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_german_phone_is_shown_a_page_that_fits(phone, lived, scheme):
+    agent = phone.of("navigator.userAgent")
+    call = phone._browser.call
+    call("Network.enable")
+    call("Network.setUserAgentOverride", userAgent=agent, acceptLanguage="de")
+    phone.open(lived, 390, 844, scheme)
+    phone.shows("#events-heading", "Letzte Geräusche")
+    phone.shows("#heard", "Ruhe")
+    phone.of(f"{lane('Husten')}.dispatchEvent(new MouseEvent('click'))")
+    phone.shows(".panel", "Husten überall ausblenden")
+    assert phone.of(PALE_TEXTS) == []
+    assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+    call("Network.setUserAgentOverride", userAgent=agent, acceptLanguage="en")
+
+
+def test_a_phone_that_is_offline_says_so_in_one_line_and_keeps_what_it_shows(phone, tmp_path):
+    with serving(tmp_path) as home:
+        home.log.heard("coughing", 40, 3)
+        home.log.hears("silence")
+        phone.open(home)
+        phone.until(lane("Coughing"))
+        phone.of("Object.defineProperty(navigator, 'onLine', { get: () => false })")
+        home.end()
+        phone.shows("#trouble", "This device is offline. What you see is of 12:")
+        assert phone.of(f"{lane('Coughing')} !== undefined")
+        home.restart()
+        phone.until("document.getElementById('trouble').hidden")
