@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from hearthlog.analyzer.colours import Colour, colour
+from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import play_sound
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
@@ -42,7 +42,7 @@ from hearthlog.analyzer.review.review_list import (
     random_minutes,
     read_list,
 )
-from hearthlog.analyzer.review.timeline import LabelledSpans, SoundClip
+from hearthlog.analyzer.review.timeline import Key, LabelledSpans, SoundClip
 from hearthlog.models.classes import TELEVISION, UNKNOWN, in_words
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
@@ -68,14 +68,6 @@ class ReviewItem(NamedTuple):
     label: str
     text: str
     chosen: str = QUEUE
-
-
-class Key(NamedTuple):
-    """A key, its action, and the colour of the class that it names: red, green and blue."""
-
-    key: str
-    text: str
-    colour: Colour | None = None
 
 
 class Screen(Protocol):

@@ -397,3 +397,11 @@ class Timeline:
         Raise `DataError` if the time zone is unknown.
         """
         return home_clock(home_zone(self.zone), self.grid.start, self.grid.end)
+
+
+class Key(NamedTuple):
+    """A key of a review, its action, and the colour of the class that it names."""
+
+    key: str
+    text: str
+    colour: Colour | None = None

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.logs.spans import Spans
     from hearthlog.analyzer.review.marking import Marking
     from hearthlog.analyzer.review.review_list import ReviewSpan, SoundFile
-    from hearthlog.analyzer.review.session import Key, ReviewItem
-    from hearthlog.analyzer.review.timeline import Timeline
+    from hearthlog.analyzer.review.session import ReviewItem
+    from hearthlog.analyzer.review.timeline import Key, Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _QUEUE = "--queue"

@@ -22,9 +22,9 @@ from hearthlog.analyzer.review.lanes import (
     reviewed_lane,
     selected_lane,
 )
-from hearthlog.analyzer.review.session import Key
 from hearthlog.analyzer.review.timeline import (
     HomeClock,
+    Key,
     LabelledSpans,
     Timeline,
     TimelineGrid,

@@ -13,7 +13,7 @@ from importlib.resources import files
 from typing import Any, cast
 
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, free_port
-from hearthlog.analyzer.review.session import Key
+from hearthlog.analyzer.review.timeline import Key
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.viewer import (
     TOP_BAR,
