@@ -40,6 +40,7 @@ from hearthlog.analyzer.review.lanes import (
 )
 from hearthlog.analyzer.review.live_timeline import LiveTimeline, last_time
 from hearthlog.analyzer.review.timeline import LogLines, Plot
+from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import LiveServer
 from hearthlog.models.classes import ordered
@@ -255,7 +256,7 @@ class Letters(list):
 
         def note(recording, entity, indexes, columns):
             columns = [*columns]
-            if entity == "current":
+            if entity.startswith("current/"):
                 texts = (each for each in columns if "text" in str(each.component_descriptor()))
                 self.append(next(texts).as_arrow_array().to_pylist()[0][0])
             return send(recording, entity, indexes, columns)
@@ -287,13 +288,30 @@ def test_large_letters_say_what_is_heard_now_how_sure_and_since_when(tmp_path, m
         sounds.hide()
         server.show_current(sounds, UTC)
     assert letters[0] == "# Coughing · 87 % · for 2 s"
-    assert letters[1].splitlines() == [
-        "# Living room (xy) · Nobody listens since 2026-03-01 07:00",
-        "",
-        "# Mic · Coughing · 87 % · for 2 s",
-    ]
-    assert letters[2].endswith("# Mic · A sound · 87 % · for 2 s")
+    assert letters[1] == "# Living room (xy) · Nobody listens since 2026-03-01 07:00"
+    assert letters[2] == "# Mic · A sound · 87 % · for 2 s"
     assert len(letters) == 3
+
+
+def test_where_nobody_listens_the_lane_ends_with_the_last_label(tmp_path, monkeypatch):
+    lanes, sounds = [], CurrentSounds(tmp_path, pytest.fail)
+    change = Canvas.change_states
+
+    def note(canvas, entity, times, states):
+        lanes.append((entity, *times.tolist(), *states))
+        change(canvas, entity, times, states)
+
+    monkeypatch.setattr(Canvas, "change_states", note)
+    begin = 1_772_348_400 * SECOND
+    with LiveServer(free_port(), "127.0.0.1", MINUTES) as server:
+        server.show([StateLane(RECORDER, "mic", np.array([begin]), ["coughing"])])
+        sound = heard_now(sounds, "coughing", begin, 40)
+        server.show_current(sounds, UTC)
+        assert len(lanes) == 1
+        sound.seen -= AWAY_SECONDS + 1
+        server.show_current(sounds, UTC)
+        server.show_current(sounds, UTC)
+    assert lanes[1:] == [("lanes/mic/Heard", begin + 2 * SECOND, None)]
 
 
 def test_large_letters_change_once_a_minute_while_the_sound_does_not(tmp_path, monkeypatch):

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, tzinfo
 from pathlib import Path
@@ -23,7 +23,15 @@ from hearthlog.analyzer.review.current_sounds import (
     microphone_words,
     silent_since,
 )
-from hearthlog.analyzer.review.lanes import DIRECTION, FEATURES, NOVELTY, PLOTS, Checked, StateLane
+from hearthlog.analyzer.review.lanes import (
+    DIRECTION,
+    FEATURES,
+    NOVELTY,
+    PLOTS,
+    RECORDER,
+    Checked,
+    StateLane,
+)
 from hearthlog.analyzer.review.live_timeline import Update
 from hearthlog.analyzer.review.timeline import LogLines, Plot, Timeline, home_clock
 from hearthlog.analyzer.review.timeline_reader import read_frames
@@ -131,8 +139,8 @@ _TOGETHER = 4 * NANOSECONDS  # minimum per plot message: each costs a viewer kil
 _MOST_STROKES = 1_200  # maximum of a band on the screen
 _STATES = "lanes"  # entity of all lanes
 _HEAD_HEIGHT, _LANE_HEIGHT = 90, 48
-_CURRENT = "current"  # entity of the text of the current sounds
-_TEXT_HEIGHT, _TEXT_LINE = 20, 44
+_CURRENT = "current"  # root of the texts of the current sounds
+_TEXT_HEIGHT, _COLUMNS = 64, 2  # of the texts of microphones
 _DETAILS, _DETAILS_HEIGHT = {DIRECTION, NOVELTY, FEATURES}, 160  # plots in tabs
 _STEP_SECONDS = 1, 10, 60  # between updates of a sound: in the first 10 s, the first minute, later
 _LEAST_CHANGE = 0.1  # of a confidence, for an update
@@ -200,16 +208,23 @@ class LiveServer:
         Each update costs a viewer some kilobytes that it never drops.
         """
         named = [one for _, one in sorted(sounds.microphones.items()) if one.time][:_MOST_NAMED]
-        current = {one.microphone: _step(one, sounds) for one in named}
-        if not named or not _differ(self._current, current):
-            return
-        self._current = current
-        time = max(one.time for one in named)
-        clock = self._canvas_at(time, zone).clock
-        lines = [_line(one, sounds, zone, several=len(named) > 1) for one in named]
-        column = rr.TimeColumn(clock.name, timestamp=[np.datetime64(clock.shown(time), "ns")])
-        text = rr.TextDocument.columns(text=["\n\n".join(lines)], media_type=["text/markdown"])
-        self._recording.send_columns(_CURRENT, [column], text)
+        for one in named:
+            step, last = _step(one, sounds), self._current.get(one.microphone)
+            if last is not None and step[:2] == last[:2] and abs(step[2] - last[2]) < _LEAST_CHANGE:
+                continue
+            self._current[one.microphone] = step
+            canvas = self._canvas_at(one.time, zone)
+            clock = canvas.clock
+            lane = f"{_STATES}/{one.microphone}/{RECORDER.name}"
+            if not one.is_listening() and lane in self._lanes:  # or its last sound would go on
+                canvas.change_states(lane, np.array([one.time]), [None])
+            time = np.datetime64(clock.shown(one.time), "ns")
+            heading = _heading(one, sounds, zone, several=len(named) > 1)
+            self._recording.send_columns(
+                f"{_CURRENT}/{one.microphone}",
+                [rr.TimeColumn(clock.name, timestamp=[time])],
+                rr.TextDocument.columns(text=[heading], media_type=["text/markdown"]),
+            )
 
     def _canvas_at(self, time: int, zone: tzinfo) -> Canvas:
         clock = home_clock(zone, time, time + 1)
@@ -265,16 +280,7 @@ def _step(sound: CurrentSound, sounds: CurrentSounds) -> tuple[str, int, float]:
     return sounds.words(sound), int(seconds // step) + sound.since, sound.confidence
 
 
-def _differ(
-    one: Mapping[str, tuple[str, int, float]], other: Mapping[str, tuple[str, int, float]]
-) -> bool:
-    if one.keys() != other.keys():
-        return True
-    pairs = [(one[name], other[name]) for name in one]
-    return any(a[:2] != b[:2] or abs(a[2] - b[2]) >= _LEAST_CHANGE for a, b in pairs)
-
-
-def _line(sound: CurrentSound, sounds: CurrentSounds, zone: tzinfo, *, several: bool) -> str:
+def _heading(sound: CurrentSound, sounds: CurrentSounds, zone: tzinfo, *, several: bool) -> str:
     """Return a heading of Markdown for a microphone."""
     if sound.is_listening():
         confidence = f"{100 * sound.confidence:.0f} %"
@@ -292,9 +298,12 @@ def _joined(parts: Sequence[Plot]) -> Plot:
 def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
     """Lay out the views, whose time axes end with the newest data."""
     microphones = sorted({same[0].microphone for same in plots.values()})
-    current = rrb.TextDocumentView(origin=_CURRENT, name="Now", titlebar=False)
+    named = microphones[:_MOST_NAMED]
+    views = (rrb.TextDocumentView(origin=f"{_CURRENT}/{name}", titlebar=False) for name in named)
+    lines = -(-len(named) // _COLUMNS)
+    current = rrb.Grid(*views, grid_columns=min(len(named), _COLUMNS))
     rows: list[Row] = [
-        (_TEXT_HEIGHT + _TEXT_LINE * min(len(microphones), _MOST_NAMED), current),
+        (_TEXT_HEIGHT * lines, current),
         (_HEAD_HEIGHT + _LANE_HEIGHT * len(microphones), states_view(_STATES, "What is heard")),
         (580, tabs(_stack_plots(name, plots) for name in microphones)),
         (140, lines_view()),
