@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from homelife import GENERAL, at, write_day
 from pydantic import ValidationError
-from servedhome import PALE_TEXTS, Phone, proxying, serving
+from servedhome import JSON, PALE_TEXTS, Phone, proxying, serving
 from viewers import browsing, patiently
 
 from hearthlog.analyzer.activity.events import SoundEvent
@@ -360,6 +360,14 @@ def test_a_german_browser_gets_german_words_dates_and_errors(lived):
     assert {"Husten", "Weinen", "Telefon"} <= {n["words"] for n in day["rooms"][0]["lanes"]}
     assert day["title"].split(",")[0] in words_of("de").texts["weekdays"].split()
     assert got(lived, "/day?x", **GERMAN)[1]["error"].startswith("Von diesem Tag")
+    origin = f"http://127.0.0.1:{lived.port}"
+    for event, label, text in (
+        (f"mic-coughing-{lived.coughed}", "Türglocke", "Dieser Name geht nicht"),
+        ("none", "music", "Dieses Geräusch liegt für diese Seite zu lange zurück"),
+    ):
+        body = json.dumps({"event": event, "label": label})
+        answer = lived.ask("POST", "/mark", body, Origin=origin, **JSON, **GERMAN)
+        assert (answer[0], json.loads(answer[2])["error"].startswith(text)) == (422, True)
     picture = picture_of(home_at(9, tiled((-3, 9), *NIGHT), language="de"))
     assert picture["sentence"] == "Eine ruhige Nacht: zweimal Husten (02:10 und 06:13)."
 

@@ -42,7 +42,7 @@ _EVERY_SECONDS = 1.0
 _SHOW = {"yes": True, "no": False}
 _MOST_LOOKED_AT, _MOST_OTHERS = 8, 20  # bouts of the current day
 _MOST_OF_DAY = 200  # bouts of a past day
-_MOST_ASKED = 50  # events in a request
+_MOST_IDS = 50  # events in a request
 _DAY = 24 * 3600 * NANOSECONDS
 
 
@@ -241,8 +241,8 @@ class HomePage:
             return [(day.isoformat(), words.short_date(day), day.year) for day in days]
         if path == "/day":
             return self._day(text, words)
-        asked = text.split("&")[:_MOST_ASKED] if self._settings.sound else []
-        found = ((each, self._find(each)) for each in asked)
+        identifiers = text.split("&")[:_MOST_IDS] if self._settings.sound else []
+        found = ((each, self._find(each)) for each in identifiers)
         return [each for each, event in found if event is not None and self._sounds.has(event)]
 
     def sound(self, identifier: str) -> bytes:
@@ -275,10 +275,10 @@ class HomePage:
 
     def _day(self, text: str, words: Words) -> Any:
         try:
-            asked = date.fromisoformat(text)
+            requested = date.fromisoformat(text)
         except ValueError as error:
             raise BridgeError("There are no logs of this day.") from error
-        day = self._past.read(asked, self._state.never_tell)
+        day = self._past.read(requested, self._state.never_tell)
         moment, zone = day.moment, self._home.zone
         microphones = [*day.state.microphones.values()]
         home = HomeDay(microphones, moment, zone, day.listened, words, is_past=True)

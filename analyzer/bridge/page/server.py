@@ -227,7 +227,7 @@ _FILES = {
     "/icon-180.png": ("icon-180.png", "image/png"),
     "/icon-512.png": ("icon-512.png", "image/png"),
 }
-_ASKED = {"/days", "/day", "/kept"}  # answered as JSON
+_QUERIES = {"/days", "/day", "/kept"}  # answered as JSON
 _TEXT = re.compile(r"\{\{(page\.[a-z ]+)\}\}")  # in page.html
 _GROUND = "#f4f6f8"  # as in page.css
 # JSON field beside the label: a subject, or whether the class is shown.
@@ -352,8 +352,8 @@ class _Handler(HttpHandler):
             self._send_entrance()
         elif self._path == "/events":
             self._stream()
-        elif path in _ASKED or path == "/sound":
-            self._send_asked(path, unquote(query, errors="replace"))
+        elif path in _QUERIES or path == "/sound":
+            self._send_result(path, unquote(query, errors="replace"))
         elif self._path in {"/words.js", "/page.webmanifest"}:
             self._send_generated()
         elif self._path in _FILES:
@@ -395,7 +395,7 @@ class _Handler(HttpHandler):
         }
         self.send(HTTPStatus.OK, json.dumps(manifest).encode(), "application/manifest+json")
 
-    def _send_asked(self, path: str, text: str) -> None:
+    def _send_result(self, path: str, text: str) -> None:
         """Send JSON, or the sound of an event, that is read from the logs."""
         words, content = self._words, self._server.content
         self._server.give_time(self.connection, _READ_SECONDS)

@@ -8,7 +8,7 @@ const lists = { look: new Map(), events: new Map(), recurring: new Map() }; // i
 
 // Kept sound
 
-const playable = new Set(), asked = new Map(); // ids; when each was asked for
+const playable = new Set(), requested = new Map(); // ids; when each was asked for
 const buttons = new Set();
 let playing = null, audio = null;
 
@@ -36,8 +36,8 @@ function showButtons() { for (const show of [...buttons]) show(); }
 export async function showPlayable(ids) {
   const now = Date.now();
   const wanted = isSoundAllowed
-    ? ids.filter((id) => !playable.has(id) && now - (asked.get(id) ?? 0) > AGAIN).slice(0, 50) : [];
-  wanted.forEach((id) => asked.set(id, now));
+    ? ids.filter((id) => !playable.has(id) && now - (requested.get(id) ?? 0) > AGAIN).slice(0, 50) : [];
+  wanted.forEach((id) => requested.set(id, now));
   if (wanted.length) {
     const found = await ask(`kept?${wanted.map(encodeURIComponent).join("&")}`);
     if (Array.isArray(found)) found.forEach((id) => playable.add(id));

@@ -107,7 +107,7 @@ class ShownBouts(NamedTuple):
         end = clock(last.end, self.zone)
         if count > 1 and end != clock(first.start, self.zone):
             time = words.text("range", first=time, last=end)
-        said = [text for text in map(self.correction, bout.events) if text]
+        corrections = [text for text in map(self.correction, bout.events) if text]
         length = words.length(sum(event.seconds for event in bout.events))
         return {
             "id": first.id,
@@ -119,7 +119,7 @@ class ShownBouts(NamedTuple):
             "length": length,
             "sure": words.sureness(max(event.confidence for event in bout.events)),
             "room": "" if self.is_alone else room(first.microphone),
-            "said": said[-1] if said else "",
+            "said": corrections[-1] if corrections else "",
             "look": bout.is_important,
             "ids": [event.id for event in reversed(bout.events)],
         }
@@ -190,8 +190,8 @@ class KeptSounds:
             sound.setnchannels(1)
             sound.setsampwidth(2)
             sound.setframerate(rate)
-            whole = np.clip(samples * _FULL_SCALE, -_FULL_SCALE, _FULL_SCALE).astype("<i2")
-            sound.writeframes(whole.tobytes())
+            pcm = np.clip(samples * _FULL_SCALE, -_FULL_SCALE, _FULL_SCALE).astype("<i2")
+            sound.writeframes(pcm.tobytes())
         return content.getvalue()
 
     def _layers(self, start: int, end: int) -> list[Path]:
