@@ -21,6 +21,7 @@ APART = {("tools", "lab"), ("tools", "ros")}  # measured, or built, by itself
 CLIPS = PurePosixPath("tools/home/clips")
 STARTERS = "models/starter"
 EMBEDDING = "models/embedding"
+PAGE = "analyzer/bridge/page"
 CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PROJECT = CONFIGURATION["project"]
 
@@ -33,7 +34,7 @@ def installed_as(path):
     if path.parts[:2] == ("tools", "package"):
         own = path.is_relative_to(PACKAGE)
         return f"hearthlog/{path.relative_to(PACKAGE)}" if own else None
-    kept = path.name in DATA or any(map(path.is_relative_to, (CLIPS, STARTERS, EMBEDDING)))
+    kept = path.name in DATA or any(map(path.is_relative_to, (CLIPS, STARTERS, EMBEDDING, PAGE)))
     if path.suffix not in {".py", ".msg", ".toml", ".service"} and not kept:
         return None
     return f"hearthlog/{path}"
