@@ -1,6 +1,5 @@
 """Marks that a reviewer makes at a viewer: in the layer at once, undone, never lost."""
 
-import contextlib
 import json
 import shutil
 import signal
@@ -21,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from lossy import LossySource
 from spliced import run
-from viewers import Window, browsing, display, free_port, patiently, reviewing, ruler
+from viewers import Window, browsing, display, find_ruler, free_port, patiently, reviewing
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
@@ -846,7 +845,7 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
         review.wait_for("drag a span")
         check_privacy(review)
         window = Window(display, port)
-        x, y = ruler(patiently(window.picture, shows_ruler))
+        x, y = find_ruler(window.picture)
         window.drag(y, x + 300, x + 500)
         selected = window.dragged()
         review.press("2")
@@ -862,12 +861,6 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
     assert review.lines[-1].endswith(f"hearthlog train --home {home}")
 
 
-def shows_ruler(picture, below=0):
-    with contextlib.suppress(AssertionError):
-        return ruler(picture, below)
-    return None
-
-
 def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp_path):
     options = ("--web", "--port", free_port(), "--reviewer", "Ann")
     with reviewing(home, *options, BROWSER="true") as review:
@@ -878,7 +871,7 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             check_privacy(review)
             patiently(page.text, lambda text: "drag a span" in text)
             below = page.evaluate("document.getElementById('keys').offsetHeight")
-            x, y = ruler(patiently(page.picture, lambda png: shows_ruler(png, below)), below)
+            x, y = find_ruler(page.picture, below)
             page.drag(y, x + 200, x + 350)  # a part of the second log
             buttons = "[...document.querySelectorAll('button')]"
             page.evaluate(f"{buttons}.find(each => each.textContent == 'talking2').click()")

@@ -419,3 +419,14 @@ def ruler(picture, below=0):
     x = int(np.argmax(lengths))
     assert lengths[x] > 40, "no time cursor in the picture"
     return x, len(left) - int(lengths[x]) + 8
+
+
+def find_ruler(take, below=0):
+    """Take pictures until one shows the time ruler; return its place, as `ruler` does."""
+
+    def found():
+        with suppress(AssertionError):
+            return ruler(take(), below)
+        return None
+
+    return patiently(found, bool)
