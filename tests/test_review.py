@@ -870,8 +870,7 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             review.wait_for("drag a span")
             check_privacy(review)
             patiently(page.text, lambda text: "drag a span" in text)
-            below = page.evaluate("document.getElementById('keys').offsetHeight")
-            x, y = find_ruler(page.picture, below)
+            x, y = find_ruler(page.picture, page.bar_height())
             page.drag(y, x + 200, x + 350)  # a part of the second log
             buttons = "[...document.querySelectorAll('button')]"
             page.evaluate(f"{buttons}.find(each => each.textContent == 'talking2').click()")

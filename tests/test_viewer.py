@@ -362,7 +362,7 @@ def test_the_wheel_moves_no_lane_away_from_its_name(day_page, tmp_path):
 
 def test_what_is_dragged_on_the_ruler_is_selected_in_the_lanes_above_it(day_page):
     timeline, viewer, page = day_page
-    x, y = find_ruler(page.picture)
+    x, y = find_ruler(page.picture, page.bar_height())
     page.drag(y, x + 200, x + 420)
     start, end = patiently(viewer.selection, bool)
     viewer.refresh()

@@ -352,6 +352,10 @@ class Page:
         found = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
         return found["result"].get("value")
 
+    def bar_height(self):
+        """The pixels of the bar of keys, below the viewer."""
+        return self.evaluate("document.getElementById('keys').offsetHeight")
+
     def text(self):
         """The line that the page shows."""
         return self.evaluate('document.getElementById("text").textContent') or ""
