@@ -34,6 +34,9 @@ from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
+# Its workers have 80 columns, whatever the terminal: tables there are as in a pipe elsewhere.
+os.environ.pop("COLUMNS", None)
+
 __all__ = [
     "FRESH_HEARTHLOG",
     "HEARTHLOG",

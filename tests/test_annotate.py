@@ -310,7 +310,7 @@ def test_a_layer_in_which_nothing_is_marked_is_a_layer(logs, log, zero, hearthlo
     layer = write_marks(log, [], reviewed=[looked_at(zero, 0, 60, chosen=RANDOM)])
     assert hearthlog("doctor", layer).returncode == 0
     assert "/mic/review/reviewed" in hearthlog("info", layer, "--json").stdout
-    assert f"layer: {layer}" in hearthlog("info", logs).stdout
+    assert f"layer: {layer}" in hearthlog("info", logs, "--verbose").stdout
     assert "corrects=live chosen=random" in hearthlog("cat", layer).stdout
     none = hearthlog("diff", logs, "live", "review")
     assert (none.returncode, none.stderr.count("\n")) == (1, 1)

@@ -141,7 +141,7 @@ def test_where_it_is_named_it_is_one_line(command, homes, tmp_path, kind, words)
 def test_a_link_that_leads_nowhere_is_not_passed_over(command, homes, tmp_path):
     (tmp_path / "a.mcap").symlink_to(homes["plain"])
     (tmp_path / "b.mcap").symlink_to(tmp_path / "nowhere")
-    result = command(homes["plain"], "info HERE")
+    result = command(homes["plain"], "info HERE --verbose")
     assert result.returncode == 3
     assert "\n1 file, " in result.stdout
     assert result.stderr == (

@@ -17,7 +17,8 @@ from hearthlog.analyzer.review.viewer.viewer import open_hidden
 
 SECOND = 1_000_000_000
 MARGIN = 20 * SECOND
-_AXIS = 18  # pixels, for the numbers of an axis
+_LEFT = 190  # pixels at the left of the plot of what is asked
+_LANES, _SPECTRUM = 202, slice(110, 230)  # where the spectrogram is, at 1920 x 1080
 _NEAR = 14  # of 255: how far a colour may be off
 
 
@@ -62,7 +63,7 @@ def ask(view, logs, start, end):
 
 def is_asked(picture, start, end):
     """Whether a light band lies from the start of a span to its end, and ends there."""
-    left = picture.shape[1] // 6 + _AXIS
+    left = _LEFT
     scale = (picture.shape[1] - left) / (end - start + 2 * MARGIN)
     first, last = (left + round(edge * scale) for edge in (MARGIN, MARGIN + end - start))
     inside = picture[:, first + 5 : last - 5].min(axis=2) > 150
@@ -75,7 +76,7 @@ def share_of_right_columns(picture, timeline, start, end):
     shares = timeline.microphones["mic"].plots[SHARES, "live"]
     names, values = shares.names, shares.values
     first, last = start - MARGIN, end + MARGIN
-    words = picture.shape[1] // 6 + 2
+    words = 174  # pixels of the names of lanes
     left = words + int(np.argmax((pixels_of_bands(picture, names) > 40).any(axis=1)[words:][:80]))
     width = picture.shape[1] - left
     right = []
@@ -128,19 +129,22 @@ def test_the_viewer_hardly_grows_with_the_spans_that_it_showed(view, logs, timel
     assert memory[-1] - memory[3] < 8 * 8_000_000
 
 
-def test_a_sound_is_shown_as_long_as_it_lasts_and_none_without_an_error(view, timeline):
-    def rows_of_hiss():
-        """The rows that are light from left to right, as far as the view of the sound goes."""
-        picture = pixels(patiently(view.picture))
-        left = picture[:, picture.shape[1] // 50 : picture.shape[1] * 2 // 5]
-        return ((left.min(axis=2) > 110).mean(axis=1) > 0.9).sum()
+def test_the_spectrogram_of_a_span_shows_its_sound_where_it_was_kept(view, logs, timeline):
+    def seconds_of_hiss(start):
+        """The first and the last second in which the spectrogram is bright; none if it is dark."""
+        picture = pixels(patiently(view.picture))[_SPECTRUM, _LANES:]
+        red, _, blue = np.moveaxis(picture, 2, 0)
+        bright = ((red > 120) & (blue > 40)).mean(axis=0) > 0.3
+        columns = np.flatnonzero(bright) / len(bright) * (MARGIN * 2 + SECOND) / SECOND
+        return [round(float(columns[k])) + start // SECOND for k in (0, -1)] if len(columns) else []
 
-    found = {}
-    for second in (0, 62, 70):
+    for second, expected in ((0, []), (62, [60, 65]), (100, []), (70, [60, 65])):
         start = timeline.grid.start + second * SECOND
+        close = read_timeline([logs], start - MARGIN, start + SECOND + MARGIN)
+        close.microphones["mic"].clips.extend(timeline.microphones["mic"].clips)
+        view.draw_close_up(close)
         view.show(start, start + SECOND, MARGIN)
         patiently(view.cursor, lambda cursor, start=start: cursor == start)
-        patiently(view.picture)
-        found[second] = rows_of_hiss()
+        begin = (second * SECOND) - MARGIN
+        patiently(lambda begin=begin: [seconds_of_hiss(begin)], lambda f, e=expected: f == [e])
         assert view.state().errors == []
-    assert found[62] > max(found[0], found[70]) + 5

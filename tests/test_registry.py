@@ -167,7 +167,7 @@ def test_models_are_listed_as_a_table_and_as_json(folder, capfd):
         "F1",
         "ECE",
         "sha256",
-        "size",
+        "MB",
     ]
     assert [row.split()[0] for row in rows] == ["broad", "one", "two", *STARTERS]
     assert rows[3].split()[1] == "starter"
