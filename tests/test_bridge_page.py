@@ -29,7 +29,7 @@ from hearthlog.analyzer.bridge.page import server
 from hearthlog.analyzer.bridge.page.day import day_picture
 from hearthlog.analyzer.bridge.page.home_page import HomePage
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
-from hearthlog.analyzer.bridge.page.status import CurrentSounds, health_list
+from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
 from hearthlog.analyzer.bridge.wording import ENGLISH
@@ -546,7 +546,7 @@ def test_a_microphone_that_is_away_is_not_said_to_listen(said, why):
     state.push([segments("mic", (now - 60 * NANOSECONDS, now - 30 * NANOSECONDS, "silence"))])
     state.health["mic"] = Health(0, said)
     news = News(state, [], [], today(now, UTC), UTC)
-    (heard,) = CurrentSounds().describe(news)["rooms"]
+    (heard,) = RoomStatus().describe(news)["rooms"]
     assert (heard["words"], heard["why"]) == ("Not listening", why)
     health = health_list(news, "home", now)[0]
     assert health["text"] == (f"not listening: {why}" if why else "not listening")

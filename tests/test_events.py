@@ -205,7 +205,7 @@ def kept(tmp_path, capfd):
 
 
 def test_the_kept_sound_is_played(kept, pulse_microphone):
-    """What a speaker gets is recorded, by PulseAudio."""
+    """PulseAudio records the signal that a speaker would get."""
     pulse_microphone.stop()
     env = pulse_microphone.speaker_env()
     words = "--start", "2026-03-02T08:00", "--label", "coughing", "--play"

@@ -1,4 +1,4 @@
-"""What is heard now is a line in the terminal: the word, how sure, for how long, how loud."""
+"""The current sound is a line in the terminal: its class, how sure, how long and how loud."""
 
 import os
 import pty

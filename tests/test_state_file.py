@@ -204,6 +204,7 @@ def test_a_file_that_cannot_be_used_for_a_while_is_read_and_written_later(tmp_pa
     state = state_in(tmp_path, say=said.append)
     state.claim(tmp_path)
     assert "cannot be used (" in said[0]
+    assert entry_of(state).load() == [1]
     entry_of(state).save([1, 2])
     state.remove(["gone"])
     (tmp_path / "state.sqlite3-wal").rmdir()
@@ -212,6 +213,31 @@ def test_a_file_that_cannot_be_used_for_a_while_is_read_and_written_later(tmp_pa
     with closing(state_in(tmp_path)) as later:
         assert entry_of(later).load() == [1, 2]
         assert later.names("") == ["list"]
+
+
+def test_what_cannot_be_carried_into_the_file_stays_in_memory_and_is_carried_later(
+    tmp_path, monkeypatch
+):
+    with closing(state_in(tmp_path)) as state:
+        state.write("list", "[1]")
+    monkeypatch.setattr(bridge_state, "_AGAIN_SECONDS", 0.0)
+    (tmp_path / "state.sqlite3-wal").mkdir()
+    said = []
+    state = state_in(tmp_path, say=said.append)
+    entry_of(state).save([1, 2])
+    (tmp_path / "state.sqlite3-wal").rmdir()
+    with closing(sqlite3.connect(tmp_path / "state.sqlite3")) as database:
+        database.execute(
+            "CREATE TRIGGER refuse BEFORE INSERT ON entries BEGIN SELECT RAISE(FAIL, 'no'); END"
+        )
+        database.commit()
+        assert entry_of(state).load() == [1, 2]
+        assert said[-1].endswith("(no); entries stay in memory until it can be")
+        database.execute("DROP TRIGGER refuse")
+        database.commit()
+    assert entry_of(state).load() == [1, 2]
+    state.close()
+    assert entry_of(state_in(tmp_path)).load() == [1, 2]
 
 
 def fill(path):

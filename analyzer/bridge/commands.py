@@ -99,7 +99,7 @@ _BY_WORDS = {spelt(row.words): row.name for row in CLASSES}
 
 
 class Correction(NamedTuple):
-    """What a person called an event; `is_own` on the page."""
+    """Correction of an event by a person; `is_own` if it was made on the page."""
 
     label: str
     is_own: bool

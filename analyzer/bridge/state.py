@@ -190,23 +190,32 @@ class BridgeState:
         """Open the file, or begin to keep entries in memory."""
         try:
             database = self._open_file()
+            if self._opened is not None:
+                self._carry_over(self._opened, database)
         except (OSError, sqlite3.Error) as error:
             self._due = time.monotonic() + _AGAIN_SECONDS
             self._say(
-                f"{self.path}: cannot be used ({_reason(error)}); nothing is saved until then"
+                f"{self.path}: cannot be used ({_reason(error)}); entries stay in memory until "
+                "it can be"
             )
             if self._opened is None:
                 self._opened, self._is_in_memory = self._copy(), True
             return
-        if self._opened is not None:
-            with _transaction(database):
-                rows = self._opened.execute("SELECT * FROM entries WHERE node = ?", (self.node,))
-                database.executemany("INSERT OR REPLACE INTO entries VALUES (?, ?, ?)", rows)
-                self._is_in_memory = False
-                self._remove(database, self._removed)
-            self._opened.close()
+        self._is_in_memory = False
         self._opened = database
         self._take_files()
+
+    def _carry_over(self, memory: sqlite3.Connection, database: sqlite3.Connection) -> None:
+        """Bring the entries that were kept in memory into the file; close what is not used."""
+        try:
+            with _transaction(database):
+                rows = memory.execute("SELECT * FROM entries WHERE node = ?", (self.node,))
+                database.executemany("INSERT OR REPLACE INTO entries VALUES (?, ?, ?)", rows)
+                self._remove(database, tuple(self._removed))
+        except sqlite3.Error:
+            database.close()
+            raise
+        memory.close()
 
     def _open_file(self) -> sqlite3.Connection:
         private_folder(self.folder)
@@ -238,7 +247,7 @@ class BridgeState:
         """Return the entries of a file that can only be read, if it can, in memory."""
         memory = sqlite3.connect(":memory:", check_same_thread=False, isolation_level=None)
         # Without a write-ahead log nothing needs to be created to read the file.
-        has_log = self.path.with_name(f"{_NAME}-wal").exists()
+        has_log = self.path.with_name(f"{_NAME}-wal").is_file()
         address = f"{self.path.absolute().as_uri()}?{'mode=ro' if has_log else 'immutable=1'}"
         with suppress(sqlite3.Error):
             source = sqlite3.connect(address, uri=True)

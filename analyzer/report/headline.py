@@ -59,7 +59,8 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
         counts = [(count, day) for day in known if (count := day.count(name)) and count.labelled]
         if counts:
             total = sum((count for count, _ in counts), Count())
-            text = f"{amount(name, total)} on {number_in_words(len(counts))} days"
+            on = f"{number_in_words(len(counts))} day{'s' * (len(counts) > 1)}"
+            text = f"{amount(name, total)} on {on}"
             most, day = max(counts, key=lambda pair: pair[0].labelled)
             if len(counts) > 1 and most.labelled > total.labelled / len(days):
                 text += f", most on {short_day(day.day)} ({most.labelled})"

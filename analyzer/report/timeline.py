@@ -1,4 +1,4 @@
-"""DayTimeline of a day: a lane of events for each class, night, hours, time without a record."""
+"""Timeline of a day: a lane of events for each class, night, hours, time without a record."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple

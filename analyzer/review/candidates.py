@@ -343,10 +343,10 @@ def _where(changed: ChangedTime, side: NamedLabelling) -> Events:
     """Return the changed time in which a labelling agrees with the first model."""
     classes, labels = changed.changes.classes, side.called_as(changed.changes.classes)
     every = list(dict.fromkeys([*classes, *labels.classes]))
-    said = indexed_events(labels.labelling, every)
-    parts = overlay([changed.spans, said]).in_all()
+    current = indexed_events(labels.labelling, every)
+    parts = overlay([changed.spans, current]).in_all()
     pairs = changed.spans.labels[parts.rows[0]]
-    same = pairs // len(classes) == said.labels[parts.rows[1]]
+    same = pairs // len(classes) == current.labels[parts.rows[1]]
     return Events(parts.starts[same], parts.ends[same], pairs[same])
 
 

@@ -24,7 +24,7 @@ from hearthlog.analyzer.bridge.page.sounds import (
     bouts,
     events_between,
 )
-from hearthlog.analyzer.bridge.page.status import CurrentSounds, health_list, scenario_lines
+from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scenario_lines
 from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, page_token
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
@@ -52,7 +52,7 @@ class PageView:
     def __init__(self, words: Words) -> None:
         self.words = words
         self.board = Board()
-        self.now = CurrentSounds(words)
+        self.now = RoomStatus(words)
         self.keys: dict[str, Any] = {}  # of the parts that change seldom
 
     def put(self, name: str, content: Any) -> None:

@@ -253,7 +253,7 @@ _ENTRANCE = (
 
 
 class PageContent(Protocol):
-    """What the page shows, and does; called from many threads."""
+    """Content and actions of the page; called from many threads."""
 
     def words(self, accepted: str) -> Words:
         """Return the words for an `Accept-Language`."""

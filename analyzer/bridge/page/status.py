@@ -22,7 +22,7 @@ class _Current(NamedTuple):
     since: int  # in nanoseconds of UTC; 0: unknown
 
 
-class CurrentSounds:
+class RoomStatus:
     """Current sounds of each microphone, with their start times."""
 
     def __init__(self, words: Words = ENGLISH) -> None:

@@ -346,7 +346,8 @@ class Viewer(ABC):
             ]
             self.refresh()
 
-    def _size(self) -> ViewerSize | None:  # noqa: B027
+    @abstractmethod
+    def _size(self) -> ViewerSize | None:
         """Return the size of the viewer; None if unknown."""
 
     def _align(self, blueprint: Blueprint) -> bool:
