@@ -19,7 +19,7 @@ from hearthlog.analyzer.activity.segments import read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.home_state import follow_home
 from hearthlog.analyzer.bridge.output import Totals
-from hearthlog.analyzer.bridge.page.day import day_picture
+from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -95,7 +95,7 @@ def test_the_bridge_counts_what_the_report_counts(logs, followed):
 
 def test_the_page_shows_the_counts_of_the_report(logs, followed):
     moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
-    (room,) = day_picture(followed.microphones.values(), moment, ZONE)["rooms"]
+    (room,) = picture_of(HomeDay([*followed.microphones.values()], moment, ZONE))["rooms"]
     (own,) = followed.microphones.values()
     for lane in room["lanes"]:
         name = lane["label"]

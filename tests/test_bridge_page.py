@@ -26,7 +26,7 @@ from hearthlog.analyzer.bridge.commands import REVIEWER, EventCorrections, class
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page import server
-from hearthlog.analyzer.bridge.page.day import day_picture
+from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.home_page import HomePage
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list
@@ -467,7 +467,7 @@ def test_a_day_on_which_the_clock_is_changed_has_the_hours_of_the_clock(day, hou
     noon = at(zone, *day, 12)
     state = HomeState()
     state.push([segments("mic", (noon, noon + 120 * NANOSECONDS, "speech"))])
-    picture = day_picture(state.microphones.values(), today(noon + 60, zone), zone)
+    picture = picture_of(HomeDay([*state.microphones.values()], today(noon + 60, zone), zone))
     clock = [hour for _, hour in picture["hours"]]
     assert len(clock) == hours
     assert sorted({*clock}) == sorted({*range(24)} - ({2} if hours == 23 else set()))
@@ -485,7 +485,7 @@ def test_an_event_from_before_midnight_reaches_into_the_day_and_counts_for_the_n
     state = HomeState()
     state.push([segments("mic", (begin - 60 * minute, begin + 60 * minute, "music"))])
     now = today(begin + 600 * minute, UTC)
-    (lane,) = day_picture(state.microphones.values(), now, UTC)["rooms"][0]["lanes"]
+    (lane,) = picture_of(HomeDay([*state.microphones.values()], now, UTC))["rooms"][0]["lanes"]
     assert lane["bars"] == "9" * 30 + "0" * 690
     assert (lane["today"], lane["night"], lane["told"]) == (0, 1, "Music: never today")
 
@@ -514,7 +514,8 @@ def test_a_0_is_said_only_where_it_was_listened_for(first, gap, today_known, nig
     microphone.names, microphone.seen = ["silence", "coughing"], time.monotonic()
     now = today(begin + 10 * hour, UTC)
     lanes = {
-        each["words"]: each for each in day_picture([microphone], now, UTC)["rooms"][0]["lanes"]
+        each["words"]: each
+        for each in picture_of(HomeDay([microphone], now, UTC))["rooms"][0]["lanes"]
     }
     cough = lanes["Coughing"]
     assert cough["today"] == (0 if today_known else None)
@@ -534,7 +535,7 @@ def test_what_was_not_heard_is_marked_as_such():
     (microphone,) = state.microphones.values()
     microphone.heard.time, microphone.seen = begin + 18 * hour, time.monotonic() - 60
     now = today(begin + 20 * hour, UTC)
-    gaps = day_picture([microphone], now, UTC)["rooms"][0]["gaps"]
+    gaps = picture_of(HomeDay([microphone], now, UTC))["rooms"][0]["gaps"]
     assert gaps == [(0, 0.25), (0.5, 0.5833), (0.75, 0.8333)]
 
 
@@ -575,7 +576,9 @@ def test_a_day_of_thousands_of_sounds_is_small():
             segments("mic", *((s, s + NANOSECONDS, labels[i % 8]) for i, s in enumerate(starts))),
         ]
     )
-    picture = day_picture(state.microphones.values(), today(begin + 5000 * step, UTC), UTC)
+    picture = picture_of(
+        HomeDay([*state.microphones.values()], today(begin + 5000 * step, UTC), UTC)
+    )
     assert sum(lane["today"] for lane in picture["rooms"][0]["lanes"]) == 5000
     assert len(json.dumps(picture)) < 40_000
 

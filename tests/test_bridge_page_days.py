@@ -20,7 +20,7 @@ from viewers import browsing, patiently
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
-from hearthlog.analyzer.bridge.page.day import HomeDay, ListenedTime, picture_of
+from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import bouts
 from hearthlog.analyzer.bridge.settings import PageSettings
@@ -65,13 +65,12 @@ def home_at(hour, *parts, language="en"):
         "confidence": np.ones(len(rows), np.float32),
     }
     columns = Columns("/mic/segment", message_types.SEGMENT, {}, ends, ends, ends, fields)
-    state, listened = HomeState(), ListenedTime()
+    state = HomeState()
     state.push([columns])
-    listened.add([columns])
     (own,) = state.microphones.values()
     own.names, own.seen = ["silence", "coughing", "crying", "speech"], time.monotonic()
     moment = today(MIDNIGHT + int(hour * HOUR), UTC)
-    return HomeDay([own], moment, UTC, listened, words_of(language))
+    return HomeDay([own], moment, UTC, words_of(language))
 
 
 NIGHT = [(2.17, 3, "coughing"), (6.22, 3, "coughing")]
@@ -117,6 +116,8 @@ def test_hours_that_no_log_has_are_hatched_and_no_0_is_said_of_them():
     assert room["gaps"] == [(0, round(7 / 24, 4))]
     assert {lane["night"] for lane in room["lanes"]} == {None}
     assert {lane["today"] for lane in room["lanes"]} == {0}
+    (microphone,) = home.microphones  # what MQTT publishes
+    assert microphone.counts("coughing", home.moment, microphone.known_of(home.moment)) == (0, None)
 
 
 # Sounds that are folded

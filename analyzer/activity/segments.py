@@ -190,7 +190,7 @@ class _Rows:
             self._known = sounds
 
 
-class _GrowingSpans:
+class GrowingSpans:
     """Growing list of time spans, added mostly in order."""
 
     def __init__(self) -> None:
@@ -227,8 +227,8 @@ class SegmentCollector:
     def __init__(self) -> None:
         self.classes: dict[str, set[str]] = {}
         self._rows: defaultdict[Key, _Rows] = defaultdict(_Rows)
-        self._coverage: dict[str, _GrowingSpans] = {}
-        self._written = _GrowingSpans()
+        self._coverage: dict[str, GrowingSpans] = {}
+        self._written = GrowingSpans()
 
     def add_segments(self, source: str, columns: Columns) -> None:
         """Add segments, with the fields `SEGMENT_FIELDS`."""
@@ -239,7 +239,7 @@ class SegmentCollector:
 
     def add_segment(self, source: str, start: int, end: int, label: str, confidence: float) -> None:
         """Add a segment."""
-        covered = self._coverage.setdefault(source, _GrowingSpans())
+        covered = self._coverage.setdefault(source, GrowingSpans())
         covered.add(start, end, FRAME_NANOSECONDS)
         self._written.add(start, end, _PAUSE)  # a long segment has one message, at its end
         name = class_name(label)

@@ -12,14 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, SoundEvent
+from hearthlog.analyzer.activity.segments import GrowingSpans
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.never_tell import read_list
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.files import is_layer, log_name
 from hearthlog.schemas.logs.follow import follow_messages
@@ -92,6 +93,7 @@ class LiveMicrophone:
         self._records: dict[str, EventRecord] = {}
         self._unended: set[str] = set()  # classes with an event that may go on
         self._latest = 0  # end of the last segment, in nanoseconds of UTC
+        self._coverage = GrowingSpans()  # segments tile the time that was listened to
         self._replaced: list[SoundEvent] = []  # ended by the start of another event of the class
 
     @property
@@ -148,6 +150,7 @@ class LiveMicrophone:
         )
         fields = (columns[name].tolist() for name in FIELDS[message_types.SEGMENT])
         for start, duration, label, confidence in zip(*fields, strict=True):
+            self._coverage.add(start, start + max(duration, 0), FRAME_NANOSECONDS)
             is_full = len(self._records) >= _MOST_CLASSES
             if label in self._unnamed or (label not in self._records and is_full):
                 continue
@@ -184,19 +187,26 @@ class LiveMicrophone:
 
     def known_of(self, today: Today) -> ListeningThreshold:
         """Return whether coverage of the day and the night is sufficient for a count of 0."""
-        night = self._listened_share(today.night, min(today.morning, today.now))
-        return ListeningThreshold(
-            self._listened_share(today.midnight, today.now) > 0, night >= MOST
-        )
+        night = self.listened_share(today.night, min(today.morning, today.now))
+        return ListeningThreshold(self.listened_share(today.midnight, today.now) > 0, night >= MOST)
 
-    def _listened_share(self, start: int, end: int) -> float:
+    def listened_share(self, start: int, end: int) -> float:
         """Return the share of a time span, up to now, in which the microphone listened."""
+        return 1 - self.not_listened(start, end).length / max(end - start, 1)
+
+    def not_listened(self, start: int, end: int) -> Spans:
+        """Return the parts of a time span, up to now, in which the microphone did not listen.
+
+        A log without messages of gaps has them between its segments.
+        """
+        own = self._coverage.spans(FRAME_NANOSECONDS)
         spans = [(start, self.since or end), *self.gaps]
+        spans += zip(own.ends[:-1].tolist(), own.starts[1:].tolist(), strict=True)
         if not self.is_listening():
             spans.append((max(self.heard.time, self._latest), end))
         inside = [(max(a, start), min(b, end)) for a, b in spans]
         starts, ends = np.array([(a, b) for a, b in inside if a < b], np.int64).reshape(-1, 2).T
-        return 1 - joined(starts, ends).length / max(end - start, 1)
+        return joined(starts, ends)
 
     def ended_events(self) -> list[SoundEvent]:
         """Return the events that have ended since the last call."""
@@ -215,6 +225,7 @@ class LiveMicrophone:
         """Drop events before `before`, except the last of each class, and events after `after`."""
         for record in self._records.values():
             record.forget(before, after)
+        self._coverage.forget_before(before)
         if self.gaps and self.gaps[0][1] < before:
             self.gaps = [gap for gap in self.gaps if gap[1] >= before]
 

@@ -4,10 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import tzinfo
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from hearthlog.analyzer.activity.events import SoundEvent
-from hearthlog.analyzer.activity.sources import is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.home_state import MOST, ListeningThreshold, LiveMicrophone
 from hearthlog.analyzer.bridge.wording import ENGLISH, Words, clock, room
 from hearthlog.analyzer.colours import colour_on_paper
@@ -19,12 +16,9 @@ from hearthlog.analyzer.logs.local_time import (
     day_span,
     local_time,
 )
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, union
+from hearthlog.analyzer.logs.spans import joined
 from hearthlog.models.classes import COUGHING, CRYING, PHONE_RING, SILENCE, YELLING, ordered
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.logs.columns import Columns
-from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import parse_topic
 
 BIN = 120 * NANOSECONDS  # as in the picture of the report
 IMPORTANT = frozenset({COUGHING, CRYING, YELLING, PHONE_RING})  # classes that need a look
@@ -33,38 +27,6 @@ _LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
 _MOST_TIMES = 40  # of a count
 _SILENT = 60 * NANOSECONDS  # shortest gap that is drawn
 _DIGITS = 4  # decimals of a position in the day, 0 to 1
-
-
-class ListenedTime:
-    """The time in which each microphone listened, by the segments of its log.
-
-    Segments tile the time that was listened to, so this holds also without messages of gaps.
-    """
-
-    def __init__(self) -> None:
-        self._spans: dict[str, Spans] = {}
-
-    def add(self, columns: Iterable[Columns]) -> None:
-        """Add the segments among the messages of a log."""
-        for part in columns:
-            name = parse_topic(part.topic) if part.type == message_types.SEGMENT else None
-            source = None if name is None else labelling_source(name)
-            if source is None or is_of_scenario(source):
-                continue
-            starts = np.asarray(part["header.stamp"], np.int64)
-            ends = starts + np.maximum(np.asarray(part["duration"], np.int64), 0)
-            new = joined(starts, ends, _SILENT)
-            self._spans[source] = union(self._spans.get(source, NONE), new, pause=_SILENT)
-
-    def forget(self, before: int) -> None:
-        """Drop the spans before a time."""
-        for name, spans in self._spans.items():
-            if len(spans.ends) and spans.ends[0] < before:
-                self._spans[name] = cut(spans, before, int(spans.ends[-1]))
-
-    def of(self, microphone: str) -> Spans:
-        """Return the spans of a microphone."""
-        return self._spans.get(microphone, NONE)
 
 
 class DaySpan(NamedTuple):
@@ -92,7 +54,6 @@ class HomeDay(NamedTuple):
     microphones: Sequence[LiveMicrophone]
     moment: Today
     zone: tzinfo
-    listened: ListenedTime
     words: Words = ENGLISH
     is_past: bool = False
 
@@ -100,45 +61,6 @@ class HomeDay(NamedTuple):
         """Return the day from midnight to midnight."""
         date = local_time(self.moment.midnight, self.zone).date()
         return DaySpan(*day_span(date, self.zone), self.zone)
-
-    def unheard(self, microphone: LiveMicrophone, start: int, end: int) -> Spans:
-        """Return the time up to now in which a microphone did not listen."""
-        own = self.listened.of(microphone.name)
-        now = min(end, self.moment.now)
-        spans = [(start, microphone.since or now), *microphone.gaps]
-        spans += zip(own.ends[:-1].tolist(), own.starts[1:].tolist(), strict=True)
-        if not microphone.is_listening() or self.is_past:
-            ends = [int(own.ends[-1])] if len(own.ends) else []
-            events = (microphone.last_event(label) for label in microphone.labels())
-            ends += [event.end for event in events if event is not None]
-            spans.append((max([microphone.heard.time, *ends]), now))
-        inside = np.array([(max(a, start), min(b, now)) for a, b in spans], np.int64)
-        some = inside[inside[:, 0] < inside[:, 1]]
-        return joined(some[:, 0], some[:, 1])
-
-    def listened_share(self, microphone: LiveMicrophone, start: int, end: int) -> float:
-        """Return the share of a time span, up to now, in which a microphone listened."""
-        end = min(end, self.moment.now)
-        return 1 - self.unheard(microphone, start, end).length / max(end - start, 1)
-
-    def known_of(self, microphone: LiveMicrophone) -> ListeningThreshold:
-        """Return whether a microphone listened enough for a count of 0."""
-        moment = self.moment
-        night = self.listened_share(microphone, moment.night, moment.morning)
-        day = self.listened_share(microphone, moment.midnight, moment.now)
-        return ListeningThreshold(day > 0, night >= MOST)
-
-
-def day_picture(
-    microphones: Iterable[LiveMicrophone],
-    today: Today,
-    zone: tzinfo,
-    listened: ListenedTime | None = None,
-    words: Words = ENGLISH,
-) -> Any:
-    """Return the picture of the current day for JSON."""
-    known = ListenedTime() if listened is None else listened
-    return picture_of(HomeDay([*microphones], today, zone, known, words))
 
 
 def picture_of(home: HomeDay) -> Any:
@@ -163,7 +85,7 @@ def picture_of(home: HomeDay) -> Any:
 
 
 def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
-    known = home.known_of(microphone)
+    known = microphone.known_of(home.moment)
     return {
         "room": room(microphone.name),
         "gaps": [(day.place(a), day.place(b)) for a, b in _gaps(microphone, day, home)],
@@ -177,7 +99,7 @@ def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
 
 def _gaps(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> list[tuple[int, int]]:
     """Return the gaps of a microphone in a day, up to now, without short ones."""
-    gaps = home.unheard(microphone, day.start, day.end)
+    gaps = microphone.not_listened(day.start, min(day.end, home.moment.now))
     long = gaps.ends - gaps.starts >= _SILENT
     shown = joined(gaps.starts[long], gaps.ends[long], BIN - 1)  # two minutes and more apart
     return [*zip(shown.starts.tolist(), shown.ends.tolist(), strict=True)]
@@ -257,7 +179,7 @@ def day_sentence(home: HomeDay) -> str:
     end = min(moment.morning, moment.now)
     words, found = home.words, _events_of(home, moment.night, moment.morning)
     is_over = moment.now >= moment.morning
-    if not all(home.known_of(each).night for each in home.microphones) or not home.microphones:
+    if not all(each.known_of(moment).night for each in home.microphones) or not home.microphones:
         when = words.text("night.partly")
     elif _is_quiet(found, end - moment.night):
         when = words.text("night.quiet" if is_over else "night.quiet so far")
@@ -270,7 +192,7 @@ def day_sentence(home: HomeDay) -> str:
 def _sentence_of_day(home: HomeDay) -> str:
     moment, words = home.moment, home.words
     found = _events_of(home, moment.midnight, home.span().end)
-    shares = [home.listened_share(m, moment.midnight, moment.now) for m in home.microphones]
+    shares = [m.listened_share(moment.midnight, moment.now) for m in home.microphones]
     if min(shares, default=0) < MOST:
         when = words.text("day.past partly" if home.is_past else "day.partly")
         return _sentence(when, found, home)

@@ -13,7 +13,7 @@ from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.commands import EventCorrections, class_of, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, ListenedTime, day_picture, picture_of
+from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
@@ -83,7 +83,6 @@ class HomePage:
         self._events: dict[str, SoundEvent] = {}  # of today and the last night, by id
         self._bouts: dict[str, Bout] = {}  # by id
         self._events_key: Any = None
-        self._listened = ListenedTime()
         self._corrections = EventCorrections(home.folder, home.node)
         self._recurring = RecurringSounds(home.folder)
         self._past = PastDays(home)
@@ -135,7 +134,6 @@ class HomePage:
 
     def update(self, news: News) -> None:
         """Update the page, at most once a second."""
-        self._listened.add(news.columns)
         with self._lock:
             views = [*self._views.values()]
         for view in views:
@@ -148,7 +146,6 @@ class HomePage:
             self._is_read_back = True
             threading.Thread(target=self._read_back, daemon=True).start()
         first = min(news.today.midnight, news.today.night)
-        self._listened.forget(first - _DAY)
         key = _events_key(news)
         if key != self._events_key:
             self._events_key = key
@@ -174,12 +171,8 @@ class HomePage:
         day = local_time(moment.now, news.zone).date()
         key = self._events_key, self._corrections.number, day, _classes_key(news)
         view.put_changed("events", key, lambda: self._last_bouts(news, words))
-        every = [*news.state.microphones.values()]
-        view.put_changed(
-            "day",
-            _day_key(news),
-            lambda: day_picture(every, news.today, news.zone, self._listened, words),
-        )
+        home = HomeDay([*news.state.microphones.values()], news.today, news.zone, words)
+        view.put_changed("day", _day_key(news), lambda: picture_of(home))
 
     def close(self) -> None:
         """Stop the server and its streams."""
@@ -281,7 +274,7 @@ class HomePage:
         day = self._past.read(requested, self._state.never_tell)
         moment, zone = day.moment, self._home.zone
         microphones = [*day.state.microphones.values()]
-        home = HomeDay(microphones, moment, zone, day.listened, words, is_past=True)
+        home = HomeDay(microphones, moment, zone, words, is_past=True)
         every = bouts(events_between(microphones, moment.midnight, moment.now + 1))
         shown = self._shown(words, moment.now, is_alone=len(microphones) == 1, marks=day.marks)
         return picture_of(home) | {"events": [shown.describe(b) for b in every[:_MOST_OF_DAY]]}

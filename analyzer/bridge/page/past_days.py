@@ -11,7 +11,6 @@ from typing import NamedTuple
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
-from hearthlog.analyzer.bridge.page.day import ListenedTime
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, find_home_logs
@@ -41,7 +40,6 @@ class PastDay(NamedTuple):
 
     moment: Today
     state: HomeState
-    listened: ListenedTime
     marks: Sequence[Mark]
     events: Mapping[str, SoundEvent]  # by id
 
@@ -98,9 +96,9 @@ def _read(logs: HomeLogs, node: str, day: date, zone: tzinfo) -> PastDay:
     night = at_hour(before, EVENING, zone), at_hour(day, MORNING, zone)
     late = end + SEGMENT_DELAY  # a segment is written at its end
     entries = [each for each in logs.between(night[0], late) if each.node == node]
-    state, listened, marks = HomeState(), ListenedTime(), list[Mark]()
+    state, marks = HomeState(), list[Mark]()
     for entry in entries:
-        marks += _read_log(entry, (night[0], late), end, state, listened)
+        marks += _read_log(entry, (night[0], late), end, state)
     for each in state.every():
         each.forget(night[0], end - 1)
         each.since = min(each.since, end) if each.since else 0
@@ -110,12 +108,10 @@ def _read(logs: HomeLogs, node: str, day: date, zone: tzinfo) -> PastDay:
         for label in each.all_labels()
         for event in each.events(label, night[0])
     }
-    return PastDay(Today(end - 1, start, *night), state, listened, marks, events)
+    return PastDay(Today(end - 1, start, *night), state, marks, events)
 
 
-def _read_log(
-    entry: HomeLog, limits: tuple[int, int], end: int, state: HomeState, listened: ListenedTime
-) -> list[Mark]:
+def _read_log(entry: HomeLog, limits: tuple[int, int], end: int, state: HomeState) -> list[Mark]:
     """Add the segments and gaps of a log; return its marks.
 
     A log that cannot be read adds nothing: its time then counts as not listened to.
@@ -129,7 +125,6 @@ def _read_log(
             ]
             columns = read_columns([entry.path], topics, *limits, FIELDS[kind])
             state.push([*columns.values()])
-            listened.add(columns.values())
         if entry.start < end:
             _name_classes(entry.path, state)
             return read_marks(entry.path) if review_path(entry.path).exists() else []
