@@ -139,6 +139,18 @@ def test_the_routine_counts_and_measures_what_the_report_does(logs):
     assert {figure.kind for figure in values} >= {COUNT, LENGTH}
 
 
+def test_the_contents_of_logs_name_the_counts_of_the_report(logs, capfd):
+    found = json.loads(run(capfd, "info", logs, "--json").stdout)["day"]
+    _, day = day_metrics(logs)
+    assert found["date"] == DAY.isoformat()
+    assert found["counts"] == {
+        name: {"counted": count.labelled, "television": day.beside_television(name)}
+        for name in day.home.classes
+        if (count := day.count(name)) is not None and count.labelled + day.beside_television(name)
+    }
+    assert sum(each["counted"] for each in found["counts"].values()) > 10
+
+
 def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(logs, capfd):
     hearthlog = partial(run, capfd)
 

@@ -66,24 +66,26 @@ def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(
     figures = json.loads(hearthlog("info", logs, "--json").stdout)
     what, heard, state, title, *rest = hearthlog("info", logs).stdout.splitlines()
     assert what.startswith("Home flat, microphone hall: 3.0 min, 2026-0")
-    assert heard.startswith("Listened: 3.0 min of 3.0 min; heard most: ")
+    assert heard.startswith("Listened: 3.0 min of 3.0 min; labelled most: ")
     assert state == f"All is well; next: {figures['next']}"
     assert state.endswith(f"review ten spans: hearthlog review {logs} --queue")
-    assert title == "hall: time with each sound, and number of segments"
-    minutes, segments = figures["segment_minutes"]["hall"], figures["segments"]["hall"]
+    assert title == "hall: time labelled as each sound, also that of a television"
+    minutes = figures["segment_minutes"]["hall"]
     rows = rest[: len(minutes)]
     assert [row.split("  ")[1] for row in rows] == [in_words(name) for name in ordered(minutes)]
     for row, name in zip(rows, ordered(minutes), strict=True):
-        amount, number, unit, count = row.split()[-4:]
+        amount, number, unit = row.split()[-3:]
         length = 60 * float(number) if unit == "min" else float(number)
         assert length == pytest.approx(60 * minutes[name], abs=3)
-        assert int(count) == segments[name]
         assert set(amount) <= (set("█▏▎▍▌▋▊▉") if name != SILENCE else set(in_words(name)))
     longest = max(rows, key=lambda row: row.count("█"))
     assert longest.count("█") == 24
     doubt = figures["unsure"]["hall"]
-    assert rest[len(rows)].startswith("hall is unsure of ")
-    assert rest[len(rows)].endswith(f"({doubt['segments']}) of these")
+    assert rest[len(rows)] == f"hall is unsure of {60 * doubt['minutes']:.0f} s of these"
+    counts = figures["day"]["counts"]
+    parts = [f"{in_words(name).lower()} {counts[name]['counted']}" for name in ordered(counts)]
+    assert rest[len(rows) + 1].startswith("On Sunday, 2026-03-01, as the report counts sounds: ")
+    assert all(part in rest[len(rows) + 1] for part in parts)
     assert len(re.findall(r"minutes|frame", "".join(rest))) == 0, "one set of amounts"
     assert figures["streams"][0]["starter"] is False
 
@@ -103,7 +105,7 @@ def test_info_tells_times_of_the_home_and_trouble_and_names_no_class_that_is_hid
     assert result.returncode == 3
     what, heard, state, _, *rest = result.stdout.splitlines()
     assert re.search(r"2026-03-02 02:00:00 to 2026-03-03 01:00:00 \(Europe/Vienna\)", what)
-    assert heard.endswith("; heard most: talking 2 h 30 min and coughing 1.5 min")
+    assert heard.endswith("; labelled most: talking 2 h 30 min and coughing 1.5 min")
     assert state.startswith("Not heard: 1 gap, together 3600.000 s")
     assert [row.split()[0] for row in rest[:3]] == ["Coughing", "Talking", "Quiet"]
     assert "gap: mic 2026-03-02 21:00:00 3600.000 s" in result.stdout

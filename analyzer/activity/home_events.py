@@ -1,13 +1,16 @@
 """Events of a home in a time span: what a report counts, one by one."""
 
 from collections.abc import Iterator, Sequence
+from datetime import date, tzinfo
 from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.activity.daily_metrics import HomeMetrics
-from hearthlog.analyzer.activity.home_data import HomeData
+from hearthlog.analyzer.activity.daily_metrics import HomeMetrics, whole_home
+from hearthlog.analyzer.activity.home_data import HomeData, read_home
+from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
     NONE,
@@ -20,6 +23,9 @@ from hearthlog.analyzer.logs.spans import (
 )
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.topics import LIVE
+
+_BEFORE = 3600 * NANOSECONDS  # an event that goes on at midnight, and a television, begin earlier
 
 
 class HomeEvent(NamedTuple):
@@ -49,6 +55,35 @@ class HomeEvent(NamedTuple):
     microphones: tuple[str, ...]
     reviewed: bool
     television: bool
+
+
+class EventTotal(NamedTuple):
+    """Events of a class that a report counts, and those beside something like a television."""
+
+    counted: int
+    television: int
+
+
+def event_totals(metrics: HomeMetrics, start: int, end: int) -> dict[str, EventTotal]:
+    """Count the events of each class that begin in a time span, in nanoseconds of UTC."""
+    own = metrics.between(start, end)
+    totals = {}
+    for name in own.classes:
+        starts = own.events.get(name, NONE.starts)
+        counted = len(own.minutes.counted(name, starts))
+        if len(starts):
+            totals[name] = EventTotal(counted, len(starts) - counted)
+    return totals
+
+
+def read_day_totals(logs: HomeLogs, day: date, zone: tzinfo) -> dict[str, EventTotal]:
+    """Read the logs of a local day, and count its events as a report does.
+
+    Raise `DataError` without labels, `LogError` if segments are invalid.
+    """
+    start, end = day_span(day, zone)
+    data = read_home(logs, LIVE, start - _BEFORE, (start, end))
+    return event_totals(whole_home(data), start, end)
 
 
 def home_events(

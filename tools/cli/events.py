@@ -1,6 +1,5 @@
 """`hearthlog events`: the sounds of a home one by one, as a report counts them."""
 
-from collections import Counter
 from collections.abc import Collection, Sequence
 from datetime import date, timedelta, tzinfo
 from functools import reduce
@@ -79,7 +78,7 @@ def events(
         wrong_use("--play and --json exclude each other")
     from hearthlog.analyzer.activity.daily_metrics import whole_home
     from hearthlog.analyzer.activity.home_data import read_home
-    from hearthlog.analyzer.activity.home_events import home_events
+    from hearthlog.analyzer.activity.home_events import event_totals, home_events
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone, midnight
 
@@ -105,7 +104,11 @@ def events(
                     for start, end in zip(missing.starts, missing.ends, strict=True)
                 ],
                 "events": [_fields(event, labels, zone) for event in found],
-                "counts": _counts(found),
+                "counts": {
+                    name: total._asdict()
+                    for name, total in event_totals(metrics, *span[:2]).items()
+                    if name in classes
+                },
             }
         )
     else:
@@ -212,16 +215,6 @@ def _fields(event: "HomeEvent", labelling: str, zone: tzinfo) -> dict[str, objec
     times = {"start": _time(event.start, zone), "end": _time(event.end, zone)}
     values = {"seconds": round(event.seconds, 2), "confidence": round(event.confidence, 3)}
     return event._asdict() | times | values | {"labelling": labelling}
-
-
-def _counts(found: Sequence["HomeEvent"]) -> dict[str, dict[str, int]]:
-    """Count the events of each class: those of a report, and those beside a television."""
-    counted = Counter(event.label for event in found if not event.television)
-    beside = Counter(event.label for event in found if event.television)
-    return {
-        name: {"counted": counted[name], "television": beside[name]}
-        for name in sorted(counted | beside)
-    }
 
 
 _MINUTE = 60  # seconds

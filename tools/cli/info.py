@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from datetime import UTC, tzinfo
+from datetime import UTC, date, tzinfo
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,6 +25,7 @@ from hearthlog.tools.cli.terminal import (
 )
 
 if TYPE_CHECKING:
+    from hearthlog.analyzer.activity.home_events import EventTotal
     from hearthlog.analyzer.logs.catalog import Catalog, HomeTotals, LabelAmount
     from hearthlog.analyzer.logs.summary import LogSummary
     from hearthlog.schemas.logs.contents import Status
@@ -54,7 +55,7 @@ def info(
     from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.models.modelfile.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
-    from hearthlog.tools.cli.info_summary import Overview, next_step
+    from hearthlog.tools.cli.info_summary import Overview, day_line, next_step
 
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
@@ -66,18 +67,28 @@ def info(
         stream["starter"] = is_starter(stream["model"], stream["model_sha256"])
     following, accuracy = next_step(summary, path), _accuracy(summary, path)
     scenarios = _scenarios(summary, path)
+    zone, hidden = _zone_and_hidden(path)
+    day = _last_day(summary, path, zone)
     if as_json:
         checked = None if accuracy is None else accuracy.as_json()
         said = {
             "scenarios": [one._asdict() for one in scenarios],
             "checked": checked,
             "next": following,
+            "day": None
+            if day is None
+            else {
+                "date": day[0].isoformat(),
+                "counts": {name: total._asdict() for name, total in day[1].items()},
+            },
         }
         print(json.dumps(_as_json(summary) | said, indent=2))
     else:
-        overview = Overview(summary, *_zone_and_hidden(path))
+        overview = Overview(summary, zone, hidden)
         print_lines(overview.lines(following))
         _print_amounts(overview)
+        if day is not None:
+            print_lines([day_line(*day)])
         print_lines(_stream_lines(summary))
         print_lines(_model_lines(summary, path, scenarios))
         print_lines(() if accuracy is None else accuracy.lines())
@@ -131,6 +142,25 @@ def _scenarios(summary: "LogSummary", path: Path) -> "list[RecordedScenario]":
         for one in recorded_scenarios(record):
             last.setdefault((record.get("node", ""), one.microphone, one.name), one)
     return [last[key] for key in sorted(last)]
+
+
+def _last_day(
+    summary: "LogSummary", path: Path, zone: tzinfo
+) -> "tuple[date, dict[str, EventTotal]] | None":
+    """Return the last complete day and its events; None without any."""
+    from hearthlog.analyzer.activity.home_events import read_day_totals
+    from hearthlog.analyzer.errors import DataError
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+
+    if not summary.segments:
+        return None
+    try:
+        logs = find_home_logs([path])
+        day = logs.last_complete_day(zone)
+        totals = read_day_totals(logs, day, zone)
+    except (DataError, LogError):  # of no home, or without labels
+        return None
+    return (day, totals) if totals else None
 
 
 def _accuracy(summary: "LogSummary", path: Path) -> "Accuracy | None":
@@ -248,13 +278,12 @@ def _print_amounts(overview: "Overview") -> None:
 
     for microphone, amounts in overview.bars():
         texts = [amount_text(one) for one in amounts]
-        lengths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+        width = max(map(len, texts), default=0)
         name = max((len(one.words) for one in amounts), default=0)
-        print(printable(f"{microphone}: time with each sound, and number of segments"))
-        for one, (minutes, segments) in zip(amounts, texts, strict=True):
+        print(printable(f"{microphone}: time labelled as each sound, also that of a television"))
+        for one, minutes in zip(amounts, texts, strict=True):
             bar = long_bar(one.share, _BAR_WIDTH)
-            figures = f"{minutes:>{lengths[0]}}  {segments:>{lengths[1]}}"
-            print(printable(f"  {one.words:{name}}  {bar:{_BAR_WIDTH}}  {figures}"))
+            print(printable(f"  {one.words:{name}}  {bar:{_BAR_WIDTH}}  {minutes:>{width}}"))
     print_lines(overview.doubts())
 
 

@@ -2,8 +2,8 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from datetime import tzinfo
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from datetime import date, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from hearthlog.analyzer.activity.checked_minutes import (
     read_reviewed_labels,
 )
 from hearthlog.analyzer.activity.event_counts import FEWEST, SET_APART
+from hearthlog.analyzer.activity.home_events import EventTotal
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.local_time import local_time
@@ -31,15 +32,14 @@ from hearthlog.tools.cli.terminal import JUDGED_BY, number
 
 _DAY = 86_400  # seconds
 _NO_SOUNDS = {SILENCE, UNKNOWN}
-_MOST_NAMED = 3  # classes in the line of what was heard most
+_MOST_NAMED = 3  # classes in the line of what was labelled most
 
 
 class ClassAmount(NamedTuple):
-    """Segments of a class; `share` is their length relative to the longest, 0 for silence."""
+    """Time of a class; `share` is relative to the longest, 0 for silence."""
 
     words: str
     minutes: float
-    segments: int
     share: float
 
 
@@ -69,7 +69,6 @@ class Overview:
             name: each for name, each in self._summary.segment_seconds.items() if _scenario(name)
         }
         for microphone, seconds in (self._segments() | of_scenarios).items():
-            segments = self._summary.segments.get(microphone, Counter())
             sounds = [name for name in seconds if class_name(name) != SILENCE]
             longest = max((seconds[name] for name in sounds), default=0.0)
             yield (
@@ -78,7 +77,6 @@ class Overview:
                     ClassAmount(
                         in_words(name),
                         seconds[name] / 60,
-                        segments[name],
                         seconds[name] / longest if name in sounds and longest else 0.0,
                     )
                     for name in ordered(seconds)
@@ -92,7 +90,7 @@ class Overview:
             unsure = self._summary.unsure.get(microphone, Counter())
             if seconds:
                 minutes = _minutes(unsure["seconds"] / 60)
-                yield f"{microphone} is unsure of {minutes} ({unsure['segments']}) of these"
+                yield f"{microphone} is unsure of {minutes} of these"
 
     def local(self, time: int) -> str:
         """Format a time (ns of UTC) in the zone of the home."""
@@ -130,7 +128,7 @@ class Overview:
             for name in sounds
             if class_name(name) not in self._hidden
         ][:_MOST_NAMED]
-        return f"{text}; heard most: {listed(most, 'and')}" if most else text
+        return f"{text}; labelled most: {listed(most, 'and')}" if most else text
 
     def _trouble(self) -> str:
         summary = self._summary
@@ -190,9 +188,18 @@ def _minutes(minutes: float) -> str:
     return f"{minutes:.1f} min" if minutes < 100 else Duration.show(minutes)
 
 
-def amount_text(one: ClassAmount) -> tuple[str, str]:
-    """Format the minutes and the number of segments of a class."""
-    return _minutes(one.minutes), f"{one.segments:,}"
+def amount_text(one: ClassAmount) -> str:
+    """Format the time of a class."""
+    return _minutes(one.minutes)
+
+
+def day_line(day: date, totals: Mapping[str, EventTotal]) -> str:
+    """Return how often each sound occurred on a day, those beside a television apart."""
+    parts = []
+    for name, (counted, television) in totals.items():
+        text = f"{in_words(name).lower()} {counted or 'none'}"
+        parts.append(f"{text} (and {television} beside a television)" if television else text)
+    return f"On {day:%A, %Y-%m-%d}, as the report counts sounds: {listed(parts, 'and')}"
 
 
 def next_step(summary: LogSummary, path: Path) -> str | None:
