@@ -418,6 +418,20 @@ def test_another_model_and_none_are_drawn_too(day, model_file, other_model, tmp_
         server.show(found)
 
 
+def test_a_class_that_no_output_shows_is_in_no_lane_and_no_plot(logs):
+    live = LiveTimeline()
+    _, states = lane_states(news(logs, live), RECORDER)
+    hidden = next(name for name in states if name not in {None, "silence", "unknown"})
+    live = LiveTimeline()
+    live.hidden = {hidden}
+    found = news(logs, live)
+    assert hidden not in lane_states(found, RECORDER)[1]
+    assert len(lane_states(found, RECORDER)[1]) == len(states)
+    shares = [each for each in found if isinstance(each, Plot) and each.kind is SHARES]
+    assert all(hidden not in each.names for each in shares)
+    assert all(each.values.shape[1] == len(each.names) for each in shares)
+
+
 def test_what_is_kept_does_not_grow_with_what_was_watched(logs):
     live = LiveTimeline()
     news(logs, live)

@@ -139,6 +139,11 @@ class CurrentSounds:
                 own = self.microphones.setdefault(topic.microphone, CurrentSound(topic.microphone))
                 self._add(path, columns, own)
 
+    @property
+    def hidden(self) -> frozenset[str]:
+        """Classes that no output shows."""
+        return self._recorded | self._listed
+
     def hide(self) -> None:
         """Read which classes no output shows; a damaged list hides what it hid before."""
         try:
@@ -148,8 +153,8 @@ class CurrentSounds:
 
     def words(self, sound: CurrentSound) -> str:
         """Return the displayed name of the class."""
-        hidden = class_name(sound.label) in self._recorded | self._listed
-        return _HIDDEN if hidden else plain(in_words(sound.label))
+        is_hidden = class_name(sound.label) in self.hidden
+        return _HIDDEN if is_hidden else plain(in_words(sound.label))
 
     def _add(self, path: Path, columns: Columns, sound: CurrentSound) -> None:
         if columns.type == message_types.FEATURES:

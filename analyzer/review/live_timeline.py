@@ -1,6 +1,6 @@
 """Timeline updates from growing logs, second by second, within bounded memory."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -30,7 +30,7 @@ from hearthlog.analyzer.review.lanes import (
     state_lane,
 )
 from hearthlog.analyzer.review.timeline import LabelledSpans, LogLines, Plot, PlotKind
-from hearthlog.models.classes import ordered
+from hearthlog.models.classes import UNKNOWN, class_name, ordered
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
@@ -79,9 +79,16 @@ def last_time(folder: Path) -> int | None:
 
 
 class LiveTimeline:
-    """Converts messages into updates of lanes and plots."""
+    """Converts messages into updates of lanes and plots.
+
+    Attributes
+    ----------
+    hidden : collection of str
+        Classes that no output shows; a lane has `unknown` in their place.
+    """
 
     def __init__(self) -> None:
+        self.hidden: Collection[str] = frozenset()
         self._ends: dict[tuple[PlotKind, str, tuple[str, ...]], int] = {}  # of the last frame
         self._scales: dict[tuple[str, ...], _Scale] = {}
         self._open: dict[str, Int64] = {}  # seconds without a segment yet, by microphone
@@ -94,7 +101,7 @@ class LiveTimeline:
         """
         for columns in decode_types(path, batch, FIELDS):
             for rows in read_rows(path, columns):
-                yield from self._update(rows)
+                yield from map(self._shown, self._update(rows))
 
     def _update(self, rows: Rows) -> Iterator[Update]:
         match rows:
@@ -113,6 +120,20 @@ class LiveTimeline:
             case LaneRows() if is_scenario(rows.labelling):
                 kind = scenario_kind(rows.labelling)
                 yield state_lane(kind, rows.microphone, scenario_sounds(rows.spans))
+
+    def _shown(self, update: Update) -> Update:
+        """Return an update without hidden classes."""
+        if isinstance(update, StateLane):
+            states = [UNKNOWN if self._is_hidden(state) else state for state in update.states]
+            return update._replace(states=states)
+        if isinstance(update, Plot) and update.kind is SHARES:
+            rows = [row for row, name in enumerate(update.names) if not self._is_hidden(name)]
+            names = tuple(update.names[row] for row in rows)
+            return update._replace(names=names, values=update.values[:, rows])
+        return update
+
+    def _is_hidden(self, name: str | None) -> bool:
+        return name is not None and class_name(name) in self.hidden
 
     def _add_seconds(self, rows: Plot) -> Iterator[Plot | StateLane]:
         starts, times, means = self._by_second(rows)

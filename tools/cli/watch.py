@@ -355,14 +355,16 @@ def _follow(
 
     damaged = ReportOnce()
     live, sounds, zone = LiveTimeline(), CurrentSounds(logs, damaged), None
+    sounds.hide()
     for path, batch in follow_messages(logs, start=start, stop=stop, damaged=damaged, ticks=True):
         try:
             if path == logs:
                 sounds.is_live = True
             else:
                 zone = zone or zone_of([logs], timezone)
-                server.show(live.take(path, batch), zone)
                 sounds.push(path, batch)
+                live.hidden = sounds.hidden
+                server.show(live.take(path, batch), zone)
         except LogError as error:
             damaged(error)
         if zone is not None and sounds.is_live:
