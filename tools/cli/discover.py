@@ -237,13 +237,16 @@ def _renamed(
 
 def _print(summary: "GroupsSummary", zone: "tzinfo") -> None:
     from hearthlog.analyzer.discover.summary import busiest_hours
+    from hearthlog.models.classes import in_words
 
     head = ("group", "name", "heard as", "listen to", "times", "days", "hours", "seconds", "alike")
     rows = [
         (
             str(each.number),
             each.name,
-            ", ".join(f"{name} {100 * s:.0f} %" for name, s in [*each.labels.items()][:_LABELS]),
+            ", ".join(
+                f"{in_words(name)} {100 * s:.0f} %" for name, s in [*each.labels.items()][:_LABELS]
+            ),
             _place(each, zone),
             str(each.times),
             str(each.days),
@@ -407,6 +410,7 @@ def _print_voices(
     summaries: "Sequence[VoiceSummary]", speech: "HomeSpeech", zone: "tzinfo"
 ) -> None:
     from hearthlog.analyzer.discover.summary import busiest_hours
+    from hearthlog.models.classes import in_words
 
     head = ("voice", "name", "listen to", "minutes", "turns", "days", "hours")
     rows = [

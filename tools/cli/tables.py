@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from hearthlog.models.classes import in_words, ordered
 from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.terminal import NAME_WIDTH, moment, print_confusion, print_table
@@ -22,19 +23,20 @@ def print_scores(scores: "Scores", detections: "Detections | None" = None, hours
     """Print scores by class and confusions; false alarms are per number of hours."""
     rows = [
         (
-            shortened(name, NAME_WIDTH),
+            _words(name),
             str(one.support),
             *map(share, (one.precision, one.recall, one.f1)),
             between(one.f1_interval),
             *_events(detections, name, hours),
         )
-        for name, one in scores.per_class.items()
+        for name in ordered(scores.per_class)
+        for one in (scores.per_class[name],)
     ]
     macro = map(share, (scores.macro_precision, scores.macro_recall, scores.macro_f1))
     interval = between(scores.macro_f1_interval)
     events = _events(detections, None, hours)
     rows.append(("macro", str(scores.segments), *macro, interval, *events))
-    alarms = "false alarms/day" if hours == 24 else "false alarms/h"
+    alarms = "alarms/day" if hours == 24 else "alarms/h"
     print_table((*_CLASS, *_EVENTS, alarms) if detections else _CLASS, rows)
     print()
     print_counts(scores.classes, scores.confusion)
@@ -54,7 +56,17 @@ def _events(detections: "Detections | None", name: str | None, hours: int) -> tu
 def print_counts(classes: Sequence[str], confusion: Sequence[Sequence[int]]) -> None:
     """Print a confusion matrix of counts."""
     counts = [[str(count) for count in row] for row in confusion]
-    print_confusion(classes, counts, "confusion: true class in rows, predicted in columns")
+    _print_confusion(classes, counts, "confusion: true class in rows, predicted in columns")
+
+
+def _print_confusion(classes: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
+    places = [classes.index(name) for name in ordered(classes)]
+    cells = [[rows[row][column] for column in places] for row in places]
+    print_confusion([_words(classes[place]) for place in places], cells, title)
+
+
+def _words(name: str, width: int = NAME_WIDTH) -> str:
+    return shortened(in_words(name), width)
 
 
 def print_reliability(bins: "Sequence[Bin]", error: float) -> None:
@@ -73,7 +85,7 @@ def print_scenes(scenes: "Sequence[SceneScores]") -> None:
         rows.append(("mean", *_scene([sum(column) / len(column) for column in columns])))
         rows.append(("lowest", *_scene([min(column) for column in columns])))
         rows.append(("highest", *_scene([max(column) for column in columns])))
-    print_table(("scene", "macro F1", "event F1", "false alarms/h"), rows)
+    print_table(("scene", "macro F1", "event F1", "alarms/h"), rows)
 
 
 def _scene(figures: Sequence[float]) -> tuple[str, str, str]:
@@ -120,7 +132,7 @@ def print_difference(difference: "LabellingDifference", spans: int) -> None:
     print(f"compared where both have a label; days are those of UTC, {span}")
     for name, only in ((a, difference.only_a), (b, difference.only_b)):
         if only:
-            print(f"only {name} has: {', '.join(only)}")
+            print(f"only {name} has: {', '.join(map(in_words, ordered(only)))}")
     rows = list(_amounts("all", difference.total))
     if len(days) > 1:
         for day, amounts in difference.days.items():
@@ -130,7 +142,7 @@ def print_difference(difference: "LabellingDifference", spans: int) -> None:
     print()
     minutes = [[f"{value:.1f}" for value in row] for row in difference.confusion]
     title = "confusion in minutes: classes of a in rows, of b in columns"
-    print_confusion(difference.classes, minutes, title)
+    _print_confusion(difference.classes, minutes, title)
     print()
     _print_disagreements(difference, spans)
 
@@ -146,10 +158,11 @@ def _amounts(title: str, amounts: "Amounts") -> Iterator[tuple[str, ...]]:
         f"{amounts.agreement:.1%}",
         "-" if amounts.kappa is None else f"{amounts.kappa:.3f}",
     )
-    for name, one in amounts.per_class.items():
+    for name in ordered(amounts.per_class):
+        one = amounts.per_class[name]
         minutes = (f"{value:.1f}" for value in (one.minutes_a, one.minutes_b, one.minutes_both))
         events = str(one.events_a), str(one.events_b)
-        yield f"  {shortened(name, NAME_WIDTH - 2)}", *minutes, *events, "", ""
+        yield f"  {_words(name, NAME_WIDTH - 2)}", *minutes, *events, "", ""
 
 
 def _print_disagreements(difference: "LabellingDifference", spans: int) -> None:
@@ -159,7 +172,7 @@ def _print_disagreements(difference: "LabellingDifference", spans: int) -> None:
         return
     which = "" if count <= spans else f": {spans} of them"
     print(f"{count} disagreements, longest first{which}")
-    names = [shortened(name, NAME_WIDTH) for name in difference.classes]
+    names = [_words(name) for name in difference.classes]
     columns = (column[:spans].tolist() for column in difference.disagreements)
     rows = [
         (*_span(start, end), names[a], names[b]) for start, end, a, b in zip(*columns, strict=True)
@@ -172,7 +185,7 @@ def print_queue(queue: "ReviewQueue") -> None:
     spans = queue.spans
     figures = (queue.scores, queue.uncertainty, queue.disagreement, queue.novelty)
     rows = [
-        (*_span(start, end), *(shortened(name, NAME_WIDTH) for name in names), *values)
+        (*_span(start, end), *map(_words, names), *values)
         for start, end, names, values in zip(
             spans.starts.tolist(),
             spans.ends.tolist(),
