@@ -410,7 +410,6 @@ def _print_voices(
     summaries: "Sequence[VoiceSummary]", speech: "HomeSpeech", zone: "tzinfo"
 ) -> None:
     from hearthlog.analyzer.discover.summary import busiest_hours
-    from hearthlog.models.classes import in_words
 
     head = ("voice", "name", "listen to", "minutes", "turns", "days", "hours")
     rows = [
