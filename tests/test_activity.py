@@ -25,9 +25,12 @@ from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, today
 from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
+from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 
 DAY, ZONE = date(2026, 3, 29), ZoneInfo("Europe/Vienna")  # an hour is missing in this night
 SOUNDS = [name for name in GENERAL if name != SILENCE]
@@ -149,6 +152,37 @@ def test_the_contents_of_logs_name_the_counts_of_the_report(logs, capfd):
         if (count := day.count(name)) is not None and count.labelled + day.beside_television(name)
     }
     assert sum(each["counted"] for each in found["counts"].values()) > 10
+
+
+def test_a_relabelling_has_the_counts_of_its_own_report_and_changes_no_other(logs, capfd):
+    layers = []
+    for log in [path for path in find_logs(logs) if not is_layer(path)]:
+        segments = read_columns([log])["/mic/segment"]
+        fields = dict(segments.fields)
+        fields["label"] = ["laughing" if n == "yelling" else n for n in fields["label"]]
+        topic = "/mic/relabel/new_2/segment"
+        topics = [
+            type(each)(topic, each.type) if each.name.endswith("/segment") else each
+            for each in layer_topics("mic", "x", GENERAL)
+        ]
+        layer = log.with_name(f"{log.stem}.relabel-new-2.mcap")
+        writer = LogWriter(layer, topics, {"version": "0", "node": "home"})
+        writer.write_columns([TopicBatch(topic, segments.log_times, fields)])
+        layers.append(writer.finish())
+    try:
+        for labelling in ("live", "new-2"):
+            words = "events", logs, "--day", DAY, "--json", "--labels", labelling
+            found = json.loads(run(capfd, *words).stdout)["counts"]
+            _, day = day_metrics(logs, labelling)
+            for name in SOUNDS:
+                counts = found.get(name, {"counted": 0, "television": 0})
+                count = day.count(name)
+                assert counts["counted"] == (0 if count is None else count.labelled), name
+                assert counts["television"] == day.beside_television(name), name
+            assert ("yelling" in found) == (labelling == "live")
+    finally:
+        for layer in layers:
+            layer.unlink()
 
 
 def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(logs, capfd):

@@ -120,7 +120,7 @@ def between(interval: "Interval | None") -> str:
     return "-" if interval is None else f"{interval[0]:.3f}-{interval[1]:.3f}"
 
 
-_AMOUNTS = "minutes a", "minutes b", "both", "events a", "events b", "agreement", "kappa"
+_AMOUNTS = "minutes a", "minutes b", "both", "segments a", "segments b", "agreement", "kappa"
 
 
 def print_difference(difference: "LabellingDifference", spans: int) -> None:
