@@ -1,6 +1,7 @@
 """Outputs of the bridge are opened one by one, and again where that failed."""
 
 import json
+import subprocess
 import sys
 import threading
 import time
@@ -185,3 +186,18 @@ def test_a_package_that_is_missing_stops_no_other_output(home, tmp_path, monkeyp
     assert "no such file of a ping address; trying again" in said[-1]
     for output in opened.values():
         output.close()
+
+
+def test_a_bridge_loads_nothing_that_records_trains_or_draws_random_numbers():
+    modules = ("bridge", "page.home_page", "mqtt.publisher", "alerts.output")
+    code = "import sys\n" + "".join(f"import hearthlog.analyzer.bridge.{m}\n" for m in modules)
+    run = subprocess.run(
+        [sys.executable, "-c", code + "print(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    loaded = set(run.stdout.split())
+    ours = {name.removeprefix("hearthlog.") for name in loaded if name.startswith("hearthlog.")}
+    assert not {"numpy.random", "scipy", "soundfile", "soxr", "sklearn"} & loaded
+    assert not {"recorder.recording", "recorder.sources", "analyzer.training"} & ours

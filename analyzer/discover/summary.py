@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from datetime import tzinfo
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
@@ -18,10 +18,6 @@ from hearthlog.analyzer.discover.clusters import (
     Occurrences,
     StrictModel,
 )
-from hearthlog.analyzer.discover.groups import Groups
-from hearthlog.analyzer.discover.sounds import HomeSounds
-from hearthlog.analyzer.discover.speech import HomeSpeech
-from hearthlog.analyzer.discover.voices import HomeVoices
 from hearthlog.analyzer.errors import DataError
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.errors import printable, shortened
@@ -29,6 +25,12 @@ from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import NANOSECONDS, read_time, time_text
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.new_files import replaced_file
+
+if TYPE_CHECKING:  # the page of the home reads summaries, and needs nothing that makes them
+    from hearthlog.analyzer.discover.groups import Groups
+    from hearthlog.analyzer.discover.sounds import HomeSounds
+    from hearthlog.analyzer.discover.speech import HomeSpeech
+    from hearthlog.analyzer.discover.voices import HomeVoices
 
 SUMMARY: Final = "groups.safetensors.json"  # in a folder of logs, next to the groups file
 MOST_LABELS, MOST_MICROPHONES = 8, 64  # per group
@@ -163,7 +165,7 @@ _SHOWN = 3
 
 
 def summarise(
-    sounds: HomeSounds, groups: Groups, of: Int64, points: Float64, zone: tzinfo
+    sounds: "HomeSounds", groups: "Groups", of: Int64, points: Float64, zone: tzinfo
 ) -> list[GroupSummary]:
     """Summarise the groups of some sounds, largest first."""
     apart = _typical_distance(points)
@@ -197,7 +199,7 @@ def summarise(
 
 
 def summarise_voices(
-    speech: HomeSpeech, voices: HomeVoices, of: Int64, zone: tzinfo
+    speech: "HomeSpeech", voices: "HomeVoices", of: Int64, zone: tzinfo
 ) -> list[VoiceSummary]:
     """Summarise the voices that speak, most speech first.
 

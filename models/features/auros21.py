@@ -423,7 +423,7 @@ _NOISE = (-95.0, -55.0)  # dB in each band
 _NEPER = 10.0 / np.log(10.0)  # dB of a factor e in power
 
 
-def augmented(windows: Float32, rng: np.random.Generator) -> Float32:
+def augmented(windows: Float32, rng: "np.random.Generator") -> Float32:
     """Return each window as another microphone in another room might have captured it.
 
     Gain, tilt and bumps of the spectrum, and the noise of a microphone, act on the mel bands that
@@ -457,7 +457,7 @@ def _power_sum(first: Float64, second: Float64) -> Float64:
     return np.logaddexp(first / _NEPER, second / _NEPER) * _NEPER
 
 
-def _curves(count: int, rng: np.random.Generator) -> tuple[Float64, Float64]:
+def _curves(count: int, rng: "np.random.Generator") -> tuple[Float64, Float64]:
     """Draw a gain, shape (n, 1), and a frequency response, shape (n, bands), in dB."""
 
     def some(values: Float64) -> Float64:

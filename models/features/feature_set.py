@@ -66,7 +66,8 @@ class FeatureSet:
     inputs: Mapping[str, Inputs]
     power: Callable[[NDArray[Any]], NDArray[Any]]
     band_powers: Callable[[Float32], Float64] | None = None
-    augmented: Callable[[Float32, np.random.Generator], Float32] | None = None
+    # in quotes: recorder and bridge never load `numpy.random`, which takes 5 MB
+    augmented: "Callable[[Float32, np.random.Generator], Float32] | None" = None
     digest: str = ""
 
     @property
