@@ -117,6 +117,24 @@ def test_close_ups_are_right_and_the_span_is_marked_also_when_the_queue_jumps_ba
     assert view.state().errors == []
 
 
+def test_the_layout_stays_when_the_cursor_is_within_the_timeline(view, logs, timeline):
+    start = timeline.grid.start + 40 * SECOND
+    ask(view, logs, start, start + 3 * SECOND)
+    patiently(view.picture, lambda png: is_asked(pixels(png), start, start + 3 * SECOND))
+    before = columns_of(view)
+    assert before
+    view._size_due = 0.0
+    view.refresh()
+    assert columns_of(view) == before
+
+
+def columns_of(view):
+    """The widths of columns, by container."""
+    blueprint = view._blueprint()
+    shares = {path: one.get("ContainerBlueprint", {}) for path, one in blueprint.items()}
+    return {path: one["col_shares"] for path, one in shares.items() if one.get("col_shares")}
+
+
 def test_the_viewer_hardly_grows_with_the_spans_that_it_showed(view, logs, timeline):
     ours = psutil.Process().children(recursive=True)
     (viewer,) = [each for each in ours if each.name() == "rerun"]

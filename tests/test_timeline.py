@@ -825,6 +825,21 @@ def test_what_is_not_in_a_lane_any_more_is_hidden_and_what_is_new_is_drawn(tmp_p
     assert column(path, f"{root}000001", "Scalars:scalars")[0][1] == 30 * SECOND
 
 
+def test_texts_of_one_length_are_drawn_in_the_same_order_in_every_process(tmp_path):
+    stream = rr.RecordingStream("test")
+    sink = rr.binary_stream(stream)
+    canvas = Canvas(stream, home_clock(UTC, 0, HOUR))
+    names = ["yelling", "speech", "music", "coughing", "crying", "laughing"]
+    marks = [(10 * n, 10 * n + 5, name) for n, name in enumerate(names)]
+    drawn = DrawnLane("mic/lanes/all/00", 0.5, 10 * SECOND)
+    drawn.show(reviewed_lane("mic", "", spans_at(*marks), no_spans()), canvas)
+    path = tmp_path / "a.rrd"
+    path.write_bytes(sink.read())
+    roots = sorted(entities(path))
+    texts = [fixed(path, root, "SeriesLines:names")[0] for root in roots]
+    assert (len(texts), texts) == (6, sorted(texts))
+
+
 def test_bands_are_filled_from_one_probability_to_the_next(recording, timeline):
     names, values = (getattr(plot(timeline, SHARES, "live"), name) for name in ("names", "values"))
     times, cells = column(recording, "/mic/live/shares", "Scalars:scalars")

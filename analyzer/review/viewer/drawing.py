@@ -74,7 +74,7 @@ class DrawnLane:
                 del self._parts[entity]
         fresh = wanted.difference(*self._parts.values())
         parts = self._divide(fresh).items()
-        for (is_long, text), strips in sorted(parts, key=lambda part: -_length(part[1])):
+        for (is_long, text), strips in sorted(parts, key=lambda part: (-_length(part[1]), part[0])):
             layer = 0 if text == REVIEWED else 1  # the viewer draws in name order
             places = self._height, _THICK if is_long else _THIN
             entity = f"{self._root}/{layer}/{self._count:06}"

@@ -509,14 +509,18 @@ class WindowViewer(Viewer):
         """
         return self._client.take_screenshot()
 
+    _scale = 1.0  # pixels of a point of the screen
+
     def _size(self) -> ViewerSize | None:
         with Image.open(io.BytesIO(self._client.take_screenshot())) as image:
-            light = np.asarray(image.convert("L"))[:-6, : image.width // 2] > _LIGHT
-            # The time cursor is a line from the ruler's left end down to the lower edge.
-            lengths = np.argmin(light[::-1], axis=0)
-            left = int(np.argmax(lengths))
-            scale = left / _RULER_LEFT if lengths[left] > _SHORTEST else 1.0
-            return ViewerSize(image.width / scale, image.height / scale)
+            if self._is_at_start():
+                self._scale = _scale_of(image)
+            return ViewerSize(image.width / self._scale, image.height / self._scale)
+
+    def _is_at_start(self) -> bool:
+        """Whether the time cursor is where the timeline starts."""
+        cursor, grid = self.cursor(), self._grid
+        return cursor is not None and grid is not None and abs(cursor - grid.start) < grid.step
 
     def _blueprint(self) -> Blueprint:
         return self._client.get_blueprint().blueprint
@@ -530,6 +534,15 @@ class WindowViewer(Viewer):
             timestamp=np.datetime64(nanoseconds, "ns"),
             play_state="playing" if play else "paused",
         )
+
+
+def _scale_of(image: Image.Image) -> float:
+    """Return the pixels of a point, from a picture with the time cursor at the start."""
+    light = np.asarray(image.convert("L"))[:-6, : image.width // 2] > _LIGHT
+    # The cursor is a line from the ruler's left end down to the lower edge.
+    lengths = np.argmin(light[::-1], axis=0)
+    left = int(np.argmax(lengths))
+    return left / _RULER_LEFT if lengths[left] > _SHORTEST else 1.0
 
 
 def open_window(port: int | None = None, data: str | None = None) -> WindowViewer:
@@ -549,12 +562,14 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
     return _opened(port, "--connect", data, "--memory-limit", _MEMORY)
 
 
-def open_hidden(port: int | None = None) -> WindowViewer:
-    """Run the viewer without a window, for pictures.
+def open_hidden(port: int | None = None, size: tuple[int, int] = (1920, 1080)) -> WindowViewer:
+    """Run the viewer without a window, for pictures of a width and height.
 
     Raise `DataError` if the viewer is not installed, or the port is in use.
     """
-    return _opened(port, "--expect-data-soon", "--headless")
+    width, height = size
+    window = "--window-size", f"{width}x{height}"
+    return _opened(port, "--expect-data-soon", "--headless", *window)
 
 
 def _opened(port: int | None, *more: str) -> WindowViewer:
