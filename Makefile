@@ -2,8 +2,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test test-fast test-lab test-wheel test-lowest test-3.13 test-ros check docs bench bench-history \
-	bench-check starter dist clean
+.PHONY: install demo test test-fast test-lab test-wheel test-lowest test-3.13 test-ros check docs pictures bench \
+	bench-history bench-check starter dist clean
 
 # What a machine with a microphone and a screen needs, in .venv.
 install: $(VENV)/.analyzer
@@ -79,6 +79,10 @@ build/checked/hearthlog: Makefile $(wildcard tools/package/hearthlog/*.py)
 # The documentation site, from docs/ and the docstrings of the public API.
 docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --fresh-env -d build/doctrees docs build/site
+
+# The pictures of docs/, from a simulated home, in Rerun's viewer and Chromium; five minutes.
+pictures: $(VENV)/.dev
+	$(BIN)/python -m hearthlog.tools.lab.pictures
 
 # The sdist, and the wheel that is built from it.
 dist: $(VENV)/.dev

@@ -19,12 +19,15 @@ from typer.testing import CliRunner
 
 pytest.importorskip("hearthlog.tools.lab.month", reason="the wheel leaves what developers run out")
 
+from hearthlog.analyzer.review.viewer import drawing
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.main import make_app
 from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.lab.classifiers import classifiers as compare_classifiers
 from hearthlog.tools.lab.home.__main__ import home as simulate_home
 from hearthlog.tools.lab.month.__main__ import month as simulate_month
+from hearthlog.tools.lab.pictures.__main__ import outdated
+from hearthlog.tools.lab.pictures.__main__ import pictures as make_pictures
 from hearthlog.tools.lab.routine import main as judge_routines
 
 ROOT = Path(__file__).parents[1]
@@ -78,6 +81,7 @@ DEVELOPERS.command()(simulate_home)
 DEVELOPERS.command()(simulate_month)
 DEVELOPERS.command()(judge_routines)
 DEVELOPERS.command()(compare_classifiers)
+DEVELOPERS.command()(make_pictures)
 OPTIONS = {
     name
     for verb in (*VERBS.values(), *typer.main.get_command(DEVELOPERS).commands.values())
@@ -419,3 +423,16 @@ def test_a_typical_change_touches_at_most_three_files_that_exist(what, paths):
     assert tested
     for path in chain(*paths):
         assert (ROOT / path).exists(), f"{what}: {path}"
+
+
+def test_the_pictures_show_the_program_of_today():
+    lines = outdated(ROOT)
+    if lines:
+        pytest.fail("\n".join(lines), pytrace=False)
+
+
+def test_a_picture_is_older_than_what_it_shows_once_that_is_drawn_otherwise(monkeypatch):
+    monkeypatch.setattr(drawing, "_THICK", 99.0)
+    reviews = "review-day", "first-evening-review", "first-evening-queue"
+    told = "shows an earlier program: run `make pictures`"
+    assert outdated(ROOT) == [f"docs/images/{name}.png {told}" for name in reviews]

@@ -1,0 +1,1 @@
+"""The pictures of docs, made of a simulated home."""
