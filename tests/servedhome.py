@@ -266,6 +266,12 @@ class Phone:
     def until(self, expression):
         return patiently(lambda: self.of(f"!!({expression})"), bool)
 
+    def wait_until_drawn(self):
+        """Let the page draw twice."""
+        self._browser.wait_for(
+            "new Promise(f => requestAnimationFrame(() => requestAnimationFrame(() => f(true))))"
+        )
+
     def text(self, selector):
         return self.of(f"document.querySelector({selector!r})?.innerText")
 

@@ -13,11 +13,13 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 from homelife import GENERAL, at, write_day
+from livehome import LiveHome
 from pydantic import ValidationError
 from servedhome import JSON, PALE_TEXTS, Phone, proxying, serving
 from viewers import browsing, patiently
 
 from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.bridge.commands import explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
@@ -26,6 +28,7 @@ from hearthlog.analyzer.bridge.page.sounds import bouts
 from hearthlog.analyzer.bridge.settings import PageSettings
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import languages, preferred_language, words_of
+from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time, today
 from hearthlog.models.classes import CLASSES
 from hearthlog.schemas.frames import NANOSECONDS
@@ -56,6 +59,23 @@ def tiled(hours, *sounds):
 
 def home_at(hour, *parts, language="en"):
     """A home at an hour of the day, by the segments of its log."""
+    return home_of_rooms(hour, {"mic": parts}, language)
+
+
+def home_of_rooms(hour, rooms, language="en"):
+    """A home with a microphone in each room, by the segments of its log."""
+    state = HomeState()
+    for name, parts in rooms.items():
+        columns = segments_of(name, parts)
+        state.push([columns])
+        own = state.microphones[name]
+        own.names, own.seen = ["silence", "coughing", "crying", "speech"], time.monotonic()
+    moment = today(MIDNIGHT + int(hour * HOUR), UTC)
+    microphones = [*state.microphones.values()]
+    return HomeDay(microphones, moment, UTC, words_of(language))
+
+
+def segments_of(name, parts):
     rows = [row for part in parts for row in part]
     starts, ends = (MIDNIGHT + np.array([row[i] for row in rows]) for i in (0, 1))
     fields = {
@@ -64,13 +84,7 @@ def home_at(hour, *parts, language="en"):
         "label": np.array([row[2] for row in rows], object),
         "confidence": np.ones(len(rows), np.float32),
     }
-    columns = Columns("/mic/segment", message_types.SEGMENT, {}, ends, ends, ends, fields)
-    state = HomeState()
-    state.push([columns])
-    (own,) = state.microphones.values()
-    own.names, own.seen = ["silence", "coughing", "crying", "speech"], time.monotonic()
-    moment = today(MIDNIGHT + int(hour * HOUR), UTC)
-    return HomeDay([own], moment, UTC, words_of(language))
+    return Columns(f"/{name}/segment", message_types.SEGMENT, {}, ends, ends, ends, fields)
 
 
 NIGHT = [(2.17, 3, "coughing"), (6.22, 3, "coughing")]
@@ -100,6 +114,27 @@ def test_the_sentence_is_true_and_calls_nothing_quiet_that_was_not_listened_to(
     hour, hours, sounds, sentence
 ):
     assert picture_of(home_at(hour, tiled(hours, *sounds)))["sentence"] == sentence
+
+
+@pytest.mark.parametrize(
+    ("language", "sentence"),
+    [
+        ("en", "Today: coughing twice (Bath: 14:00 and 15:00), once (Kitchen: 14:00)."),
+        ("de", "Heute: zweimal Husten (Bath: 14:00 und 15:00), einmal (Kitchen: 14:00)."),
+    ],
+)
+def test_a_sound_that_two_rooms_may_have_heard_is_not_counted_twice(language, sentence):
+    rooms = {
+        "bath": [tiled((0, 16), (14, 2, "coughing"), (15, 2, "coughing"))],
+        "kitchen": [tiled((0, 16), (14, 2, "coughing"))],
+    }
+    assert picture_of(home_of_rooms(16, rooms, language))["sentence"] == sentence
+
+
+def test_a_night_is_quiet_if_it_is_so_in_each_room():
+    coughs = [(1 + n / 2, 2, "coughing") for n in range(4)]
+    rooms = {name: [tiled((-3, 9), *coughs)] for name in ("bath", "kitchen")}
+    assert picture_of(home_of_rooms(9, rooms))["sentence"].startswith("A quiet night: ")
 
 
 def test_the_counts_of_the_sentence_are_those_below_it():
@@ -197,6 +232,9 @@ def lived(tmp_path_factory):
         yield home
 
 
+DAY_MINUTES = 24 * 60
+
+
 def got(home, path, **fields):
     status, _, text = home.ask("GET", path, **fields)
     return status, json.loads(text)
@@ -222,6 +260,19 @@ def test_a_day_without_logs_is_one_line(lived, text):
     status, answer = got(lived, f"/day?{text}")
     assert (status, answer) == (422, {"error": "There are no logs of this day."})
     assert lived.ask("GET", f"/day?{lived.date}", cookie=None)[0] == 403
+
+
+def test_a_day_within_one_longer_log_is_one_of_the_days(tmp_path):
+    home = LiveHome(tmp_path, minutes_ago=4 * DAY_MINUTES)
+    for days in (4, 3, 2):
+        home.heard("speech", days * DAY_MINUTES)
+    home.close()
+    logs = find_home_logs([tmp_path])
+    assert len(logs.entries) == 1
+    first, last = (local_time(time, UTC).date() for time in (home.start, logs.end() - 1))
+    between = first + timedelta(days=1)
+    assert last > between
+    assert logs.days(UTC) == [first, between, last]
 
 
 def test_a_day_is_read_once_and_only_some_are_kept(lived, monkeypatch):
@@ -318,6 +369,28 @@ def test_no_sound_leaves_a_home_whose_owner_did_not_allow_it(tmp_path):
 
 def placeholders(text):
     return {*re.findall(r"\{(\w+)\}", text)}
+
+
+def test_a_refusal_speaks_the_language_of_the_browser(lived):
+    _, _, text = lived.ask("GET", "/", cookie=None, **GERMAN)
+    assert text.startswith("Diese Seite öffnet sich nur mit ihrer vollständigen Adresse")
+    _, _, text = lived.ask("GET", f"/?token={'x' * 20}", cookie=None, **GERMAN)
+    assert text.startswith("Der Schlüssel (token) in dieser Adresse ist falsch. Diese Seite öffnet")
+    _, _, text = lived.ask("GET", "/", Host="box.local", **GERMAN)
+    assert "unter dem Namen box.local, den" in text
+    assert 'names = ["box.local"] in [bridge.page]' in text
+    status, _, text = lived.ask("POST", "/mark", "{}", **GERMAN, **JSON)
+    assert (status, text) == (
+        403,
+        "Eine Anfrage, die etwas ändert, muss ihre Seite nennen (Origin).\n",
+    )
+
+
+def test_a_refusal_keeps_its_cause_in_another_language():
+    words = words_of("de")
+    error = explained(BridgeError("disk full"))
+    assert words.translated(str(error)) == "Es wurde nicht gespeichert: disk full"
+    assert words.translated("nothing of ours") == "nothing of ours"
 
 
 @pytest.mark.parametrize("language", sorted(languages() - {"en"}))
@@ -500,6 +573,55 @@ def test_at_1366_the_sounds_stand_beside_the_picture(phone, lived):
     edges = "document.querySelector('{}').getBoundingClientRect().{}"
     right = phone.of(edges.format(".picture", "right"))
     assert right < phone.of(edges.format("#sounds", "left"))
+
+
+_SHIFTS = """
+window.moved = [];
+new PerformanceObserver((list) => moved.push(...list.getEntries().map(({ value, sources }) =>
+  [value, sources.map(({ node }) => node?.id || node?.nodeName).join()])))
+  .observe({ type: "layout-shift", buffered: true });
+"""
+
+
+@pytest.mark.parametrize("width", [390, 1366])
+def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, width):
+    with serving(tmp_path) as home:
+        home.log.heard("silence", 350, 60)
+        for minutes, label in ((90, "coughing"), (60, "speech"), (30, "music")):
+            home.log.heard(label, minutes, 30)
+        home.log.hears("silence")
+        added = phone._browser.call("Page.addScriptToEvaluateOnNewDocument", source=_SHIFTS)
+        phone.open(home, width)
+        for label, words in (("speech", "Talking"), ("silence", "Quiet")):
+            home.log.heard(label, 0.05)
+            home.log.hears(label)
+            phone.shows("#heard", words)
+        home.log.says("mic", 1, "too loud for this microphone, in one second of five")
+        phone.until("document.querySelector('.warning #attention')")
+        phone.wait_until_drawn()
+        assert sum(value for value, _ in phone.of("moved")) < 0.02, phone.of("moved")
+        phone._browser.call("Page.removeScriptToEvaluateOnNewDocument", **added)
+
+
+def test_what_can_be_operated_has_a_name_of_its_own(phone, tmp_path):
+    with serving(tmp_path, microphones=("bath", "kitchen")) as home:
+        for name in ("bath", "kitchen"):
+            home.log.heard("silence", 350, 60, microphone=name)
+            home.log.heard("coughing", 60, 4, microphone=name)
+            home.log.hears("silence", name)
+        phone.open(home)
+        phone.until("document.querySelectorAll('#look details').length === 2")
+        nodes = phone._browser.call("Accessibility.getFullAXTree")["nodes"]
+    operable = [
+        (node["role"]["value"], node["name"]["value"])
+        for node in nodes
+        if not node["ignored"]
+        and any(each["name"] == "focusable" for each in node.get("properties", []))
+    ]
+    assert len(operable) > 20
+    assert all(name for _, name in operable)
+    answers = [name for role, name in operable if role == "DisclosureTriangle"]
+    assert len({*answers}) == len(answers) == 3
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

@@ -20,6 +20,7 @@ _LANGUAGE = re.compile(r"([a-z]{2,3})\.json")
 _DEFAULT = "en"
 _LONGEST_HEADER = 500  # characters of an `Accept-Language`
 _CLASS = "class."
+_WITH_CAUSE = ("error.not saved", "error.not played")
 
 
 class Words:
@@ -55,9 +56,18 @@ class Words:
         return listed(texts, self.texts[last])
 
     def translated(self, english: str) -> str:
-        """Return the text in place of an English one of the same key; itself if there is none."""
+        """Return the text in place of an English one of the same key; itself if there is none.
+
+        An error that ends with a cause keeps the cause.
+        """
         key = _keys_of_english().get(english)
-        return english if key is None else self.texts[key]
+        if key is not None:
+            return self.texts[key]
+        for key in _WITH_CAUSE:
+            begin, _, _ = ENGLISH.texts[key].partition("{text}")
+            if english.startswith(begin):
+                return self.text(key, text=self.translated(english.removeprefix(begin)))
+        return english
 
     def when(self, time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
         """Format a time relative to now: `14:05`, `yesterday 23:10`, `3 May 14:05`.

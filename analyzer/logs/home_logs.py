@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, tzinfo
+from datetime import UTC, date, datetime, timedelta, tzinfo
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -28,6 +28,8 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 
 _TAIL = 60 * NANOSECONDS  # a complete day may lack this much at its end
+
+_MOST_DAYS = 366  # of a log
 
 
 class HomeLog(NamedTuple):
@@ -125,12 +127,15 @@ class HomeLogs:
         Returns
         -------
         list of date
-            The days on which logs begin, and the day of the last message; ascending.
+            Days from the first to the last message of each log; ascending.
         """
-        days = {local_time(entry.start, zone).date() for entry in self.between()}
-        end = self.end()
-        if end is not None:
-            days.add(local_time(end - 1, zone).date())
+        begun = {local_time(entry.start, zone).date() for entry in self.between()}
+        days = set(begun)
+        for entry in self.between():
+            first = local_time(entry.start, zone).date()
+            following = first if entry.end == NEVER else local_time(entry.end - 1, zone).date()
+            if entry.end == NEVER or not begun.issuperset(_dates(first, following)):
+                days |= _dates(first, local_time(_last_time(entry), zone).date())
         return sorted(days)
 
     def last_complete_day(self, zone: tzinfo) -> date:
@@ -163,6 +168,23 @@ class HomeLogs:
             if span is not None:
                 return span[1]
         return None
+
+
+def _dates(first: date, last: date) -> set[date]:
+    """Return the dates of a span; only both ends if it is too long for a log."""
+    count = (last - first).days + 1
+    if count > _MOST_DAYS:
+        return {first, last}
+    return {first + timedelta(days=number) for number in range(count)}
+
+
+def _last_time(entry: HomeLog) -> int:
+    """Return the time just before the end of a log; its start if it cannot be read."""
+    try:
+        span = time_span(entry.path)
+    except LogError:
+        span = None
+    return entry.start if span is None else max(entry.start, min(span[1], entry.end) - 1)
 
 
 def find_home_logs(paths: Iterable[Path]) -> HomeLogs:

@@ -167,6 +167,9 @@ _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 3  # of a class
 
 
+SoundsOfRooms = dict[str, dict[str, Sequence[SoundEvent]]]  # by class and microphone
+
+
 def day_sentence(home: HomeDay) -> str:
     """Return a sentence about the night, after noon about the day; its counts are those below it.
 
@@ -181,7 +184,7 @@ def day_sentence(home: HomeDay) -> str:
     is_over = moment.now >= moment.morning
     if not all(each.known_of(moment).night for each in home.microphones) or not home.microphones:
         when = words.text("night.partly")
-    elif _is_quiet(found, end - moment.night):
+    elif all(_is_quiet(own, end - moment.night) for own in _by_room(found).values()):
         when = words.text("night.quiet" if is_over else "night.quiet so far")
         found = {name: own for name, own in found.items() if name in IMPORTANT}
     else:
@@ -207,15 +210,24 @@ def _sentence_of_day(home: HomeDay) -> str:
     return words.text(key, when=when, classes=words.listed(names, "or")) + "."
 
 
-def _events_of(home: HomeDay, start: int, end: int) -> dict[str, list[SoundEvent]]:
-    """Return the events of each class that begin in a time span, the most important class first."""
-    found: dict[str, list[SoundEvent]] = {}
+def _events_of(home: HomeDay, start: int, end: int) -> SoundsOfRooms:
+    """Return the events that begin in a time span, the most important class first."""
+    found: SoundsOfRooms = {}
     for microphone in home.microphones:
         for label in microphone.labels():
             own = [event for event in microphone.events(label, start) if event.start < end]
             if own and label != SILENCE:
-                found.setdefault(label, []).extend(own)
-    return {name: sorted(found[name], key=lambda event: event.start) for name in ordered(found)}
+                found.setdefault(label, {})[microphone.name] = own
+    return {name: found[name] for name in ordered(found)}
+
+
+def _by_room(found: SoundsOfRooms) -> dict[str, dict[str, Sequence[SoundEvent]]]:
+    """Return events by microphone and class."""
+    rooms: dict[str, dict[str, Sequence[SoundEvent]]] = {}
+    for label, own in found.items():
+        for microphone, events in own.items():
+            rooms.setdefault(microphone, {})[label] = events
+    return rooms
 
 
 def _is_quiet(found: Mapping[str, Sequence[SoundEvent]], length: int) -> bool:
@@ -224,7 +236,7 @@ def _is_quiet(found: Mapping[str, Sequence[SoundEvent]], length: int) -> bool:
     return important <= _QUIET_EVENTS and seconds * NANOSECONDS <= _QUIET_SHARE * length
 
 
-def _sentence(when: str, found: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:
+def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     words = home.words
     names = [name for name in found if name in IMPORTANT] or [*found]
     parts = [_class_and_times(name, found[name], home) for name in names[:_MOST_CLASSES]]
@@ -234,14 +246,26 @@ def _sentence(when: str, found: Mapping[str, Sequence[SoundEvent]], home: HomeDa
     return words.text("sentence", when=when, what=what) + "."
 
 
-def _class_and_times(name: str, events: Sequence[SoundEvent], home: HomeDay) -> str:
+def _class_and_times(name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:
+    """Format the counts of a class, by room: rooms may hear the same sound, so none are added."""
     words = home.words
     shown = words.inside(words.class_words(name))
-    values = {"class": shown, "times": words.times(len(events))}
+    parts = []
+    for microphone, events in rooms.items():
+        where = _where(name, microphone, events, home)
+        key = "times and clocks" if parts else "class and times" if where else "class and count"
+        values = {"class": shown, "times": words.times(len(events)), "clocks": where}
+        parts.append(words.text(key, **values))
+    return ", ".join(parts)
+
+
+def _where(name: str, microphone: str, events: Sequence[SoundEvent], home: HomeDay) -> str:
+    """Format in which of several rooms, and for an important class when, a sound was heard."""
+    words, place = home.words, room(microphone) if len(home.microphones) > 1 else ""
     if name not in IMPORTANT:
-        return words.text("class and count", **values)
+        return place
     clocks = [*dict.fromkeys(clock(event.start, home.zone) for event in events)]
     when = words.listed(clocks)
     if len(clocks) > _MOST_CLOCKS:
         when = words.text("range", first=clocks[0], last=clocks[-1])
-    return words.text("class and times", **values, clocks=when)
+    return words.text("room and clocks", room=place, clocks=when) if place else when

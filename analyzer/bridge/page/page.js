@@ -9,6 +9,7 @@ const LEVELS = ["well", "warning", "wrong"], SIGNS = ["✓", "!", "✕"];
 function showNow({ nothing, rooms }) {
   const sentences = rooms.length ? rooms.map(({ sentence }) => sentence) : [nothing];
   keep(place("heard"), sentences, () => make("span"), (child, text) => write(child, `${text} `));
+  if (today) keepHeight();
   keep(place("levels"), rooms.filter(({ level }) => level), () => {
     const bar = make("div", { class: "bar", role: "meter", "aria-valuemin": 0, "aria-valuemax": 100 },
       make("span"));
@@ -68,8 +69,16 @@ function showToday(day) {
   const isNext = today?.date !== day.date;
   today = day;
   write(place("day-sentence"), day.sentence);
-  if (isNext) readDates();
+  if (isNext) { sentence.style.minHeight = ""; readDates(); }
   if (!chosen) showChosen(day);
+  document.body.classList.remove("waiting"); // the last part of the first news: now nothing moves
+}
+
+// The sentence keeps its height when it gets shorter, so that what is below stays where it is.
+const sentence = document.querySelector(".sentence");
+
+function keepHeight() {
+  sentence.style.minHeight = `${sentence.offsetHeight}px`;
 }
 
 function showChosen(day) {
@@ -220,7 +229,10 @@ function connect() {
 addEventListener("offline", () => trouble(say("offline")));
 let width = innerWidth;
 addEventListener("resize", () => {
-  if (innerWidth !== width) drawAgain();
+  if (innerWidth !== width) {
+    sentence.style.minHeight = "";
+    drawAgain();
+  }
   width = innerWidth;
 });
 connect();

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol, cast
 from urllib.parse import unquote
 
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import Words
+from hearthlog.analyzer.bridge.wording import ENGLISH, Words
 from hearthlog.analyzer.http import (
     SECONDS,
     HttpHandler,
@@ -32,10 +32,6 @@ from hearthlog.schemas.errors import HearthlogError
 
 _YEAR = 365 * 24 * 3600
 _PLAIN = re.compile(r"[a-z0-9.:-]{1,253}")  # a name or address that is safe in a message
-_WHOLE = (
-    "This page opens only with its full address: copy all of it, including what follows "
-    "`?token=`. `hearthlog bridge` prints at its start which file has the address."
-)
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,7 @@ class PageAdmission:
         is_ours = compare_digest(text.encode(), self._pass(int(until)).encode())
         return is_ours and time.time() < int(until)
 
-    def refusal(
+    def refusal(  # noqa: PLR0913
         self,
         target: str,
         host: str,
@@ -88,6 +84,7 @@ class PageAdmission:
         *,
         changes: bool,
         has_pass: bool = False,
+        words: Words = ENGLISH,
     ) -> str:
         """Check a request.
 
@@ -98,24 +95,22 @@ class PageAdmission:
         """
         origins = fields["Origin"]
         if not self._is_named(host):
-            return _by_name(host_name(f"//{host}"))
+            name = host_name(f"//{host}")
+            key = "refusal.name" if _PLAIN.fullmatch(name) else "refusal.host"
+            return words.text(key, name=name)
         if len(origins) > 1 or (changes and not origins):
-            return "A request that changes something must name its page (Origin)."
+            return words.text("refusal.no origin")
         if origins and not self._is_own(origins[0].lower(), host):
-            return (
-                "Another page asked. If it is this one behind a proxy, write its name into the "
-                "configuration as it is in the address, with a port if there is one: "
-                'names = ["home.example"] in [bridge.page].'
-            )
+            return words.text("refusal.origin")
         cookies = self._cookies(fields["Cookie"])
         if has_pass or has_token(target, self.token) or any(map(self.is_pass, cookies)):
             return ""
-        reason = ""
+        reasons = ["refusal.address"]
         if target.startswith("/?token="):
-            reason = "The token in this address is wrong. "
+            reasons.insert(0, "refusal.token")
         elif cookies:
-            reason = "The cookie of this browser is no longer valid. "
-        return f"{reason}{_WHOLE}"
+            reasons.insert(0, "refusal.cookie")
+        return " ".join(map(words.text, reasons))
 
     def _is_named(self, host: str) -> bool:
         """Whether the host of a request is allowed."""
@@ -139,16 +134,6 @@ class PageAdmission:
     def _cookies(self, fields: Sequence[str]) -> list[str]:
         given = [pair.strip().partition("=") for each in fields for pair in each.split(";")]
         return [value for name, _, value in given if name == self._cookie_name]
-
-
-def _by_name(name: str) -> str:
-    if not _PLAIN.fullmatch(name):
-        return "Open this page by its IP address, or by an allowed name."
-    return (
-        f"This page does not open by the name {name}, which a foreign page could let point here. "
-        "Open it by the IP address of the box, or allow the name in the configuration: "
-        f'names = ["{name}"] in [bridge.page].'
-    )
 
 
 _STALE_SECONDS = 15.0
@@ -437,7 +422,7 @@ class _Handler(HttpHandler):
         fields = {name: self.headers.get_all(name, []) for name in ("Origin", "Cookie")}
         self._path, has_pass = self._without_pass()
         refusal = self._server.admission.refusal(
-            self.path, self.host, fields, changes=changes, has_pass=has_pass
+            self.path, self.host, fields, changes=changes, has_pass=has_pass, words=self._words
         )
         if refusal:
             self.send_text(HTTPStatus.FORBIDDEN, refusal)

@@ -176,7 +176,7 @@ function showBout(item, entry) {
   write(item.often, entry.times ? ` · ${entry.times}` : "");
   write(item.about, [entry.time, entry.length, entry.sure, entry.room].filter(Boolean).join(" · "));
   showAnswer(item, entry.said);
-  write(item.hint, ` (${entry.words}, ${entry.time})`);
+  write(item.hint, ` (${[entry.words, entry.time, entry.room].filter(Boolean).join(", ")})`);
 }
 
 let latest = null, shownIds = null, isPast = false;

@@ -175,7 +175,7 @@ class KeptSounds:
             with self._lock:
                 rate, samples = kept_sound(self._layers(start, end), _topic(event), start, end)
         except (HearthlogError, OSError) as error:
-            raise BridgeError(f"{event.id}: the sound cannot be read ({error})") from error
+            raise BridgeError(f"The sound cannot be read: {error}") from error
         if not rate:
             raise BridgeError("No sound was kept of this.")
         for other in hidden:
