@@ -590,6 +590,8 @@ def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, widt
         for minutes, label in ((90, "coughing"), (60, "speech"), (30, "music")):
             home.log.heard(label, minutes, 30)
         home.log.hears("silence")
+        with home.stream() as part:
+            part("day", lambda day: "".join(each["bars"] for each in day["rooms"][0]["lanes"]))
         added = phone._browser.call("Page.addScriptToEvaluateOnNewDocument", source=_SHIFTS)
         phone.open(home, width)
         for label, words in (("speech", "Talking"), ("silence", "Quiet")):
