@@ -593,6 +593,8 @@ def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, widt
         with home.stream() as part:
             part("day", lambda day: "".join(each["bars"] for each in day["rooms"][0]["lanes"]))
         added = phone._browser.call("Page.addScriptToEvaluateOnNewDocument", source=_SHIFTS)
+        # Scroll bars of a phone lie above the page.
+        phone._browser.call("Emulation.setScrollbarsHidden", hidden=width < 640)
         phone.open(home, width)
         for label, words in (("speech", "Talking"), ("silence", "Quiet")):
             home.log.heard(label, 0.05)
@@ -603,6 +605,7 @@ def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, widt
         phone.wait_until_drawn()
         assert sum(value for value, _ in phone.of("moved")) < 0.02, phone.of("moved")
         phone._browser.call("Page.removeScriptToEvaluateOnNewDocument", **added)
+        phone._browser.call("Emulation.setScrollbarsHidden", hidden=False)
 
 
 def test_what_can_be_operated_has_a_name_of_its_own(phone, tmp_path):

@@ -250,7 +250,7 @@ def _class_and_times(name: str, rooms: Mapping[str, Sequence[SoundEvent]], home:
     """Format the counts of a class, by room: rooms may hear the same sound, so none are added."""
     words = home.words
     shown = words.inside(words.class_words(name))
-    parts = []
+    parts: list[str] = []
     for microphone, events in rooms.items():
         where = _where(name, microphone, events, home)
         key = "times and clocks" if parts else "class and times" if where else "class and count"
