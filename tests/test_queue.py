@@ -27,7 +27,7 @@ from hearthlog.analyzer.review.candidates import (
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.ranking import cover, sample, worth
 from hearthlog.analyzer.review.review_list import ReviewSpan, read_list
-from hearthlog.analyzer.review.session import queue_spans, review_items
+from hearthlog.analyzer.review.review_queue import queue_spans, review_items
 from hearthlog.analyzer.review.spans import JudgeableSpans, labelling_model, span_sounds
 from hearthlog.analyzer.review.timeline import no_spans
 from hearthlog.models.starter import GENERAL, starter_file

@@ -30,14 +30,9 @@ from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_review
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.review_list import write_list
-from hearthlog.analyzer.review.session import (
-    ReviewItem,
-    ReviewSession,
-    queue_spans,
-    review_items,
-    sound_of,
-)
-from hearthlog.analyzer.review.timeline import SoundClip
+from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
+from hearthlog.analyzer.review.session import ReviewSession
+from hearthlog.analyzer.review.timeline import SoundClip, sound_of
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

@@ -30,7 +30,8 @@ from hearthlog.analyzer.marks.marks import (
 from hearthlog.analyzer.promotion.recent_time import reference
 from hearthlog.analyzer.review.lanes import timeline_lanes
 from hearthlog.analyzer.review.marking import Marking
-from hearthlog.analyzer.review.session import ReviewSession, queue_spans
+from hearthlog.analyzer.review.review_queue import queue_spans
+from hearthlog.analyzer.review.session import ReviewSession
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.training.home_recordings import lesson_recordings
 from hearthlog.analyzer.training.speakers import SPEAKERS, speaker_recordings

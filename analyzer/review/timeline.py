@@ -14,7 +14,7 @@ from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.local_time import home_zone, local_time
 from hearthlog.models.classes import in_words
-from hearthlog.schemas.arrays import Float64, Int16, Int64
+from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import scenario_name
 
@@ -272,6 +272,31 @@ class SoundClip(NamedTuple):
     def end(self) -> int:
         """End of the clip, in nanoseconds of UTC."""
         return self.start + len(self.samples) * NANOSECONDS // self.rate
+
+
+_SOUND_SCALE = np.float32(32768.0)
+
+
+def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Float32]:
+    """Return the kept sound of a span of time, without the holes.
+
+    Clips with a sample rate other than the first clip's are skipped.
+
+    Returns
+    -------
+    rate : int
+        Samples per second; 0 if no sound was kept.
+    samples : np.ndarray [shape=(n,)], float32
+        -1 to 1.
+    """
+    parts, rate = [np.empty(0, np.float32)], 0
+    for clip in clips:
+        if clip.start < end and clip.end > start and rate in {0, clip.rate}:
+            rate = clip.rate
+            first, last = ((t - clip.start) * rate // NANOSECONDS for t in (start, end))
+            samples = clip.samples[max(first, 0) : max(last, 0)].astype(np.float32)
+            parts.append(samples / _SOUND_SCALE)
+    return rate, np.concatenate(parts)
 
 
 _WINDOW_SECONDS = 0.032

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.logs.spans import Spans
     from hearthlog.analyzer.review.marking import Marking
     from hearthlog.analyzer.review.review_list import ReviewSpan, SoundFile
-    from hearthlog.analyzer.review.session import ReviewItem
+    from hearthlog.analyzer.review.review_queue import ReviewItem
     from hearthlog.analyzer.review.timeline import Key, Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
@@ -331,7 +331,7 @@ def _work(
     from hearthlog.analyzer.logs.spans import Spans
     from hearthlog.analyzer.review.marking import Marking
     from hearthlog.analyzer.review.review_list import corrected_name
-    from hearthlog.analyzer.review.session import review_items
+    from hearthlog.analyzer.review.review_queue import review_items
     from hearthlog.analyzer.review.timeline import no_spans
     from hearthlog.schemas.messages.topics import LIVE, scenario_name
 
@@ -451,7 +451,7 @@ def _queue_spans(
     choice: _Choice,
     audible: "Spans | None" = None,
 ) -> "list[ReviewSpan]":
-    from hearthlog.analyzer.review.session import queue_spans
+    from hearthlog.analyzer.review.review_queue import queue_spans
 
     with share_done("choosing spans") as progress:
         folder = models_folder()

@@ -21,7 +21,7 @@ from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.spans import NONE, rows_at
 from hearthlog.analyzer.review.ranking import USEFUL, make_queue
-from hearthlog.analyzer.review.session import ReviewItem
+from hearthlog.analyzer.review.review_queue import ReviewItem
 from hearthlog.analyzer.review.spans import judgeable_spans
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.home_training_set import home_lessons
