@@ -37,6 +37,7 @@ from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, is_layer
 
@@ -438,6 +439,121 @@ def test_a_queue_goes_on_by_itself_and_ends_after_the_last_span(home):
     assert all(
         a < item.start and b > item.end for (a, b), item in zip(sitting.closely, items, strict=True)
     )
+
+
+def seconds_of(folder):
+    """Labels with their starts and ends, in seconds from the start."""
+    return [((m.start - START) / SECOND, (m.end - START) / SECOND, m.label) for m in layers(folder)]
+
+
+def select(sitting, start, end):
+    sitting.screen.marked = (START + round(start * SECOND), START + round(end * SECOND))
+
+
+def test_the_ends_of_a_mark_are_moved_by_a_drag_over_it_and_undone(home):
+    sitting = Sitting(home)
+    for start, key in ((10, "2"), (14, "3")):
+        select(sitting, start, start + 2)
+        sitting.session.press(key)
+    before = layers(home)
+    select(sitting, 9.5, 14.5)  # over both, of the first one more
+    sitting.session.press("m")
+    assert seconds_of(home) == [(9.5, 14.5, "speech"), (14.5, 16, "coughing")]
+    assert sitting.screen.lane == [(m.start, m.end, m.label) for m in layers(home)]
+    assert sitting.said[-1].endswith("+ 5.0 s  talking moved")
+    sitting.session.press("z")
+    assert layers(home) == before
+    assert sitting.screen.lane == [(m.start, m.end, m.label) for m in before]
+
+
+def test_the_last_mark_is_moved_to_a_span_without_a_mark_but_an_older_one_is_not(home):
+    marking_of(home).mark(START + 60 * SECOND, START + 61 * SECOND, "music")
+    sitting = Sitting(home)
+    select(sitting, 20, 21)
+    sitting.session.press("m")
+    assert "no mark lies in this span" in sitting.said[-1]
+    sitting.session.press("2")
+    sitting.session.press("m")
+    assert "the mark has these ends" in sitting.said[-1]
+    select(sitting, 22, 22.5)
+    sitting.session.press("m")
+    assert seconds_of(home) == [(22, 22.5, "speech"), (60, 61, "music")]
+
+
+def test_a_mark_is_moved_into_the_next_log_and_back_and_marks_between_stay(home):
+    marking = marking_of(home)
+    edge = marking.coverage.starts[1]
+    marking.mark(edge - SECOND, edge, "music")
+    marking.mark(edge - 4 * SECOND, edge - 3 * SECOND, "yelling")
+    history = [layers(home)]
+    for start, end in (
+        (edge + SECOND, edge + 2 * SECOND),
+        (edge - SECOND // 4, edge + SECOND * 3 // 2),
+    ):
+        moved = marking.move(start, end)
+        assert (moved[0].start, moved[-1].end) == (start, end)
+        history.append(layers(home))
+    texts = [[mark.label for mark in found] for found in history]
+    assert texts == [["yelling", "music"], ["music", "yelling"], ["music", "yelling", "yelling"]]
+    marking.move(edge - SECOND // 2, edge + 3 * SECOND)  # both parts of it
+    assert [m.label for m in layers(home)] == ["music", "yelling", "yelling"]
+    for before in reversed(history):
+        marking.undo()
+        assert layers(home) == before
+
+
+def test_a_disk_that_fails_while_a_mark_is_moved_leaves_the_mark(home, monkeypatch):
+    marking = marking_of(home)
+    edge = marking.coverage.starts[1]
+    marking.mark(edge - 4 * SECOND, edge - 3 * SECOND, "yelling")
+    written = []
+
+    def fail_at_the_second(*arguments, **options):
+        written.append(arguments)
+        if len(written) == 2:
+            raise LogError("the disk is full")
+        return write_marks(*arguments, **options)
+
+    monkeypatch.setattr("hearthlog.analyzer.review.marking.write_marks", fail_at_the_second)
+    with pytest.raises(LogError):
+        marking.move(edge + SECOND, edge + 2 * SECOND)
+    assert (edge + SECOND, edge + 2 * SECOND, "yelling") in [(m[1:4]) for m in layers(home)]
+    monkeypatch.undo()
+    marking = marking_of(home)
+    marking.delete(edge - 4 * SECOND, edge - 3 * SECOND)
+    marking.mark(edge + SECOND, edge + 2 * SECOND, "yelling")
+    marking.move(edge - 4 * SECOND, edge - 3 * SECOND)
+    written.clear()
+    monkeypatch.setattr("hearthlog.analyzer.review.marking.write_marks", fail_at_the_second)
+    with pytest.raises(LogError):
+        marking.undo()
+    assert "yelling" in [mark.label for mark in layers(home)]
+
+
+def test_in_a_queue_what_is_reviewed_follows_the_mark_and_nothing_moves_without_a_drag(home):
+    items = items_of(2)
+    sitting = Sitting(home, items)
+    sitting.run("2")
+    sitting.session.press("m")  # the next item is selected by the queue, by nobody's hand
+    assert sitting.said[-1].startswith("drag the new span of the mark first")
+    select(sitting, 1, 3)
+    sitting.session.press("m")
+    assert seconds_of(home) == [(1, 3, "speech")]
+    assert [(s.start - START, s.end - START, s.chosen) for s in reviewed(home)] == [
+        (SECOND, 3 * SECOND, "queue")
+    ]
+    assert sitting.screen.shown[-1][0] == items[1].start
+    sitting.session.press("z")
+    assert [(s.start, s.end) for s in reviewed(home)] == [items[0][:2]]
+
+
+def test_each_end_of_the_selected_span_is_moved_alone(home):
+    sitting = Sitting(home)
+    select(sitting, 10, 13)
+    for second, key, expected in ((9, "[", (9, 13)), (12, "]", (9, 12)), (11, "[", (11, 12))):
+        sitting.screen.at = START + second * SECOND
+        sitting.session.press(key)
+        assert sitting.screen.marked == tuple(START + each * SECOND for each in expected)
 
 
 def test_in_a_queue_one_may_skip_go_back_and_accept(home):
@@ -851,8 +967,16 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
         patiently_without_layer(home)
         review.press("3")
         assert one_mark(home)[1:4] == (*selected, "music")
+        window.drag(y, x + 500, x + 560)  # the end of the selection
+        patiently(window.selection, lambda span: span != selected)
+        moved = window.dragged()
+        assert moved[0] == selected[0]
+        assert moved[1] > selected[1]
+        review.press("m")
+        review.wait_for("music moved")
+        assert one_mark(home)[1:4] == (*moved, "music")
         assert review.quit() == 0
-    assert review.lines[-2].startswith("1 span reviewed in")
+    assert review.lines[-2].startswith("2 spans reviewed in")
     assert review.lines[-1].endswith(f"hearthlog train --home {home}")
 
 

@@ -19,6 +19,7 @@ from hearthlog.analyzer.marks.marks import (
     write_marks,
 )
 from hearthlog.analyzer.review.timeline import LabelledSpans
+from hearthlog.schemas.frames import NANOSECONDS
 
 
 @dataclass
@@ -43,6 +44,7 @@ class Marking:
     labelled: LabelledSpans
     scenario: str = ""
     _done: list[list[_Change]] = field(default_factory=list)
+    _last: int = 0  # time at which this object made its last mark
     _marks: dict[Path, list[Mark]] = field(default_factory=dict)  # by log, as last read
     _reviewed: dict[Path, list[ReviewedSpan]] = field(default_factory=dict)
 
@@ -137,6 +139,82 @@ class Marking:
         """
         return self._write(start, end, [], deleted=True)
 
+    def move(self, start: int, end: int) -> list[Mark]:
+        """Move a mark to a span: the mark that overlaps it most, else the last one made.
+
+        Other marks in the span are replaced. A mark is written at its new place before it is
+        removed from the log of its old place.
+
+        Parameters
+        ----------
+        start, end : int
+            In nanoseconds of UTC; parts before or after all logs are cut off.
+
+        Returns
+        -------
+        list of Mark
+            The mark at its new place, in the part of each log.
+
+        Raises
+        ------
+        DataError
+            If there is no such mark, it has these ends, or a part of the span was not recorded.
+        LogError
+            If a layer is damaged or cannot be written; that layer is unchanged then.
+        """
+        old, pieces, now = self._mark_near(start, end), self._pieces(start, end), time.time_ns()
+        if (old[0].start, old[-1].end) == (pieces[0][1], pieces[-1][2]):
+            raise DataError("the mark has these ends: drag its new span, from start to end")
+        new = {
+            log: old[0]._replace(start=first, end=last, reviewer=self.reviewer, made=now)
+            for log, first, last in pieces
+        }
+        before = {log: [one for one in own if one in old] for log, own in self._marks.items()}
+        logs = [*new, *(log for log, own in before.items() if own and log not in new)]
+        # A judged item of a queue is reviewed from end to end: this follows the mark.
+        looked_at = {
+            log: [one for one in self._reviewed[log] if _is_of(one, before[log])] for log in logs
+        }
+        chosen = next((one for own in looked_at.values() for one in own), None)
+        changes = []
+        for log in logs:
+            spans = [*before[log], *([new[log]] if log in new else [])]
+            edges = min(one.start for one in spans), max(one.end for one in spans)
+            change = self._change(log, *edges, now, "")
+            change.not_reviewed += looked_at[log]
+            if chosen is not None and log in new:
+                own = chosen._replace(start=new[log].start, end=new[log].end, made=now)
+                change.reviewed.append(own)
+            instead_of = [MarkedSpan(*one[:3]) for one in before[log]]
+            placed = [new[log]] if log in new else []
+            self._change_layer(log, placed, instead_of, change.reviewed, change.not_reviewed)
+            changes.append(change)
+        self._done.append(changes)
+        self._last = now
+        return [*new.values()]
+
+    def _mark_near(self, start: int, end: int) -> list[Mark]:
+        """Return the mark that overlaps a span most, or the last one made, in all of its logs."""
+        self._read()
+        found = [(one, log) for log, own in self._marks.items() for one in own]
+        parts: list[list[Mark]] = []
+        last = None
+        for mark, log in sorted(found, key=lambda each: each[0]):
+            if mark.microphone != self.microphone:
+                continue
+            if last is not None and log != last and _is_continued(parts[-1][-1], mark):
+                parts[-1].append(mark)
+            else:
+                parts.append([mark])
+            last = log
+        common = [min(one[-1].end, end) - max(one[0].start, start) for one in parts]
+        if common and max(common) > 0:
+            return parts[int(np.argmax(common))]
+        made = [one for one in parts if one[0].made == self._last]
+        if not made:
+            raise DataError("no mark lies in this span: drag over the mark, from start to end")
+        return made[-1]
+
     def undo(self) -> tuple[int, int] | None:
         """Undo the last change.
 
@@ -153,11 +231,12 @@ class Marking:
         if not self._done:
             return None
         changes = self._done[-1]
-        for change in changes:
+        for change in reversed(changes):  # a moved mark is back before it is removed elsewhere
             kept, added = change.not_reviewed, change.reviewed
             self._change_layer(change.log, change.before, [change.span], kept, added)
         self._done.pop()
-        return changes[0].span.start, changes[-1].span.end
+        spans = [change.span for change in changes]
+        return min(span.start for span in spans), max(span.end for span in spans)
 
     def marks(self) -> LabelledSpans:
         """Return all marks of the microphone in these logs.
@@ -221,6 +300,7 @@ class Marking:
             span = MarkedSpan(self.microphone, first, last)
             self._change_layer(change.log, own, [span], change.reviewed, change.not_reviewed)
         self._done.append(changes)
+        self._last = now
         return made
 
     def _change_layer(
@@ -259,6 +339,18 @@ class Marking:
                     change.not_reviewed.append(one)
                     change.reviewed += _outside(one, start, end)
         return change
+
+
+def _is_continued(mark: Mark, other: Mark) -> bool:
+    """Return whether a mark goes on in the next log."""
+    same = mark._replace(start=0, end=0) == other._replace(start=0, end=0)
+    return same and other.start - mark.end < NANOSECONDS
+
+
+def _is_of(span: ReviewedSpan, marks: Sequence[Mark]) -> bool:
+    """Return whether a span was reviewed by one of these marks."""
+    places = {(mark.start, mark.end, mark.made) for mark in marks}
+    return (span.start, span.end, span.made) in places and span.chosen != RANDOM
 
 
 def _spans(rows: Sequence[tuple[int, int, str]]) -> LabelledSpans:

@@ -26,7 +26,7 @@ _POLL_SECONDS = 0.3
 _LEAST_MARGIN = 20 * NANOSECONDS
 _AROUND = 600 * NANOSECONDS
 _RIGHT = "."
-_CLASS_KEYS = "1234567890eghijklmorsvwxy"
+_CLASS_KEYS = "1234567890eghijklorsvwxy"
 _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time cursor; then"
 
 
@@ -149,6 +149,7 @@ class ReviewSession:
         for key, label in self._labels().items():
             actions[key] = _words(label), partial(self._mark_as, label)
         actions |= {
+            "m": ("move the mark here", self._move),
             "d": ("delete marks", lambda: self._mark(self.marking.delete)),
             "z": ("undo", self._undo),
             "p": ("or Space: play, stop", self._play),
@@ -244,6 +245,15 @@ class ReviewSession:
         if self.items and not self._in_minute:
             self._go(1)
 
+    def _move(self) -> None:
+        """Move the mark in the selected span, or the last one, to the ends of this span."""
+        span = self.screen.selection()
+        item = self.items[self._at] if self.items else None
+        if span is None or (item and span == (item.start, item.end)):
+            raise DataError("drag the new span of the mark first, from start to end")
+        made = self.marking.move(*span)
+        self._done(made[0].start, made[-1].end, f"{_words(made[0].label)} moved")
+
     def _done(self, start: int, end: int, text: str) -> None:
         self._judged.append(self._at)
         self.say(f"{self._text(start, end)}  {text}")
@@ -296,7 +306,13 @@ class ReviewSession:
         self.say(f"every frame from {self._text(cursor - _AROUND, cursor + _AROUND)}")
 
     def _begin_here(self) -> None:
-        self._begin = self._cursor()
+        """Begin a span, or move the start of the selected one."""
+        cursor, selection = self._cursor(), self.screen.selection()
+        if selection is not None and cursor < selection[1]:
+            self._begin = None
+            self._select(cursor, selection[1])
+            return
+        self._begin = cursor
         self.say(f"from {local_time(self._begin, self.zone):%H:%M:%S}; set the end with ]")
 
     def _end_here(self) -> None:
@@ -306,6 +322,9 @@ class ReviewSession:
         if start is None or start >= end:
             raise DataError("a span ends after it begins: put the cursor where it begins, press [")
         self._begin = None
+        self._select(start, end)
+
+    def _select(self, start: int, end: int) -> None:
         self.screen.show(start, end, _margin(start, end))
         self.say(self._text(start, end))
 
