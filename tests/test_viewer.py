@@ -39,6 +39,7 @@ from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.review.viewer.viewer import WindowViewer
 from hearthlog.analyzer.review.viewer.web import open_page
+from hearthlog.models.classes import ordered
 from hearthlog.schemas.logs.files import find_logs
 
 __all__ = ["display", "short_sounds", "viewer"]  # fixtures
@@ -46,9 +47,9 @@ __all__ = ["display", "short_sounds", "viewer"]  # fixtures
 HOUR = 3600 * 1_000_000_000
 MARKED = (START + 2 * HOUR, START + 3 * HOUR)
 _NEAR = 14  # of 255: how far a colour may be off
-_BAND = 0.4  # how much of a colour is left where the viewer draws it darker
 _CAP = 7  # pixels by which a strip is longer than its sound, and what is rounded
 _WHITE = 110
+_DARK = 13  # behind plots
 _LONG = 300 * 1_000_000_000
 _SAVING = """
 import re, sys
@@ -146,28 +147,28 @@ def lanes_are_right(png, timeline):
     return max(bottoms) < review.min() < missing.max() and len(set(bottoms)) == len(bottoms)
 
 
-def check_bands(png, timeline):
-    """Check that bands are as high as classes were probable where one of them was for long."""
+def check_rows(png, timeline):
+    """Check that the row of a class is as bright as it was probable, where it was for long."""
     shares = timeline.microphones["mic"].plots[SHARES, "live"]
     names, values = shares.names, shares.values
-    found = []
-    for time, text in blocks_of(timeline):
-        place = int(timeline.grid.find(np.array([time]))[0])
-        found.append((time, text, values[place - 1 : place + 2, names.index(text)].mean()))
+    rows = ordered(names)
     picture = Picture(png, timeline)
     night = START + 5 * HOUR  # when it is silent for hours
-    silence = max((share, time) for time, text, share in found if time < night)[0]
-    rows = np.flatnonzero(picture.is_coloured(night, colour("silence"), _BAND))
-    run = max(np.split(rows, np.flatnonzero(np.diff(rows) > 3) + 1), key=len)
-    height = len(run) / silence
-    assert height > 30
-    plot = slice(int(run[-1] - height), run[-1] + 1)
-    picture.begin_at_cursor(plot)
+    silent = np.flatnonzero(picture.is_coloured(night, colour("silence"), 0.8))
+    run = max(np.split(silent, np.flatnonzero(np.diff(silent) > 3) + 1), key=len)
+    assert rows[-1] == "silence"
+    assert len(run) > 8
+    picture.begin_at_cursor(slice(run[-1] - len(run) * len(rows), run[-1]))
     checked = set()
-    for time, text, share in found:
-        if share > 0.4 and time < START + 17 * HOUR:  # the legend is over the evening
-            seen = picture.is_coloured(time, colour(text), _BAND)[plot].sum() / height
-            assert abs(seen - share) < 0.2, (text, seen, share)
+    for time, text in blocks_of(timeline):
+        place = int(timeline.grid.find(np.array([time]))[0])
+        share = values[place - 1 : place + 2, names.index(text)].mean()
+        if share > 0.4:
+            above = len(rows) - rows.index(text) - 0.5  # rows to its middle, from below
+            row = int(run[-1] - above * len(run))
+            around = picture.image[row - 2 : row + 3, picture.place(time)].mean(axis=0)
+            expected = _DARK + share * (np.array(colour(text)) - _DARK)
+            assert np.abs(around - expected).max() < 0.25 * 255, (text, share, around)
             checked.add(text)
     assert len(checked) >= 4
 
@@ -178,7 +179,7 @@ def picture_of(take, timeline, path):
     def is_right(png):
         path.write_bytes(png)
         with suppress(AssertionError):
-            check_bands(png, timeline)
+            check_rows(png, timeline)
             return lanes_are_right(png, timeline)
         return False
 

@@ -522,6 +522,44 @@ def timeline_plots(timeline: Timeline) -> Iterator[Plot]:
             yield _shaded(plot) if plot.kind.style is Style.HEAT_MAP else plot
 
 
+def features_image(
+    microphone: MicrophoneTimeline, grid: TimelineGrid, shape: tuple[int, int]
+) -> tuple[Float64, str]:
+    """Draw the features of a span without sound, one below the other, the energy last.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows, and columns from the start of the grid to its end.
+
+    Returns
+    -------
+    shades : np.ndarray, float64
+        0 (low, or nothing recorded) to 1.
+    text : str
+        What is shown.
+    """
+    rows, columns = shape
+    plot = microphone.plots.get((FEATURES, ""))
+    if plot is None or np.isnan(plot.values).all():
+        return np.zeros(shape), "No sound was kept here, and no features"
+    order = sorted(range(len(plot.names)), key=lambda i: plot.names[i] == _ENERGY)
+    shades = _shades(plot.values)[:, order]
+    of_column = np.arange(columns) * grid.count // columns
+    of_row = np.arange(rows) * len(order) // rows
+    first, last = plot.names[order[0]], plot.names[order[-1]]
+    text = f"No sound was kept here: features, from {first} down to {last}"
+    return np.nan_to_num(shades)[of_column][:, of_row].T, text
+
+
+def _shades(values: NDArray[np.floating]) -> Float64:
+    """Scale each column from its low values (0) to its high values (1); NaN stays."""
+    known = values[~np.isnan(values).all(axis=1)]
+    lowest = np.nanmin(known, axis=0)
+    low, high = np.percentile(np.where(np.isnan(known), lowest, known), _HEAT_PERCENTILES, axis=0)
+    return np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
+
+
 def _shaded(plot: Plot) -> Plot:
     """Scale each column from its low values (0) to its high values (1), and limit the rows."""
     present = ~np.isnan(plot.values[:, 0])
@@ -530,9 +568,7 @@ def _shaded(plot: Plot) -> Plot:
         return plot._replace(times=times, values=values)
     absent = np.isnan(values)  # where the logs have another feature set
     times, values = _thin(times, np.where(absent, np.nanmin(values, axis=0), values))
-    low, high = np.percentile(values, _HEAT_PERCENTILES, axis=0)
-    shades = np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
-    return plot._replace(times=times, values=shades)
+    return plot._replace(times=times, values=_shades(values))
 
 
 def _thin(times: Int64, values: Float64) -> tuple[Int64, Float64]:

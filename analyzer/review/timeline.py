@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.local_time import home_zone, local_time
-from hearthlog.models.classes import in_words
+from hearthlog.models.classes import in_words, ordered
 from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import scenario_name
@@ -161,9 +161,10 @@ def no_spans() -> LabelledSpans:
 
 
 class Style(Enum):
-    """Drawing of values: stacked bands (shares of one), dark to bright (0 to 1), line, points."""
+    """Drawing of values: stacked bands or a row each (shares of one), dark to bright, and so on."""
 
     BANDS = auto()
+    ROWS = auto()
     HEAT_MAP = auto()
     LINE = auto()
     POINTS = auto()
@@ -228,10 +229,10 @@ class Plot(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Text next to the plot: its title, or the names of bands from the bottom."""
+        """Text next to the plot: its title, or the names of rows."""
         if self.kind.style is not Style.BANDS:
             return self.title
-        return f"From below: {', '.join(map(in_words, self.names))}"
+        return f"From above: {', '.join(map(in_words, ordered(self.names)))}"
 
 
 PlotKey = tuple[PlotKind, str]  # with the labelling

@@ -16,6 +16,12 @@ from hearthlog.models.classes import in_words
 from hearthlog.schemas.arrays import Float64, Int64
 
 _STROKE_WIDTH = 2.0  # pixels
+# Ends of lines are round and reach half a width too far, so thin lines side by side fill a strip.
+_STRIP_LINES, _STRIP_WIDTH = 8, 4.0  # screen points
+_ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 5, 5.0, 0.8
+ROWS_HEIGHT = 0.2  # of all rows: with numbers as wide as those of lanes, both begin at one place
+_SHADES = 15  # of a row; each change of its colour is a line of its own for the viewer
+_GROUND = np.array((13, 13, 13))  # behind the plots of the viewer
 _FILLING = 400  # texts that leave no pause in the data
 _LEAST_SHARE = 0.004  # a smaller share makes a band less than a pixel high
 _ROWS_AT_ONCE = 72_000  # an hour of frames
@@ -40,10 +46,12 @@ class Canvas:
     def draw_strips(
         self, entity: str, places: tuple[float, float], spans: Spans, name: str, colour: Colour
     ) -> None:
-        """Draw spans as strips, whose round ends stay visible from afar.
+        """Draw spans as strips that are at least some points wide, also from afar.
 
         Parameters
         ----------
+        places : (float, float)
+            Middle and thickness, in units of the view.
         spans : Spans
             At least one, in time order.
         colour : Colour
@@ -51,18 +59,23 @@ class Canvas:
         """
         height, thickness = places
         style = rr.SeriesLines(
-            names=[name], colors=[colour], widths=[thickness], aggregation_policy="off"
+            names=[name] * _STRIP_LINES,
+            colors=[colour] * _STRIP_LINES,
+            widths=[_STRIP_WIDTH] * _STRIP_LINES,
+            aggregation_policy="off",
         )
         self.recording.log(entity, style, static=True)
         starts, ends = spans  # a hole before each, or the first one is cut off in the middle
         times = np.stack([starts, starts, ends, ends], axis=1).ravel()
-        heights = np.tile([np.nan, height, height, np.nan], len(starts))
-        column = rr.Scalars.columns(scalars=heights)
-        self.recording.send_columns(entity, [self._time_column(times)], column)
+        lines = height + thickness * np.linspace(-0.5, 0.5, _STRIP_LINES)
+        holes = np.full(_STRIP_LINES, np.nan)
+        self.draw_lines(entity, times, np.tile([holes, lines, lines, holes], (len(starts), 1)))
 
     def hide(self, entity: str) -> None:
         """Hide strips; a recording cannot delete data."""
-        self.recording.log(entity, rr.SeriesLines(visible_series=[False]), static=True)
+        self.recording.log(
+            entity, rr.SeriesLines(visible_series=[False] * _STRIP_LINES), static=True
+        )
 
     def fill(self, entity: str, start: int, end: int) -> None:
         """Put empty texts in a span (ns of UTC).
@@ -115,6 +128,12 @@ class Canvas:
                 look = rr.SeriesLines(
                     names=names, colors=colours, widths=widths, aggregation_policy="MinMax"
                 )
+            case Style.ROWS:
+                look = rr.SeriesLines(
+                    names=np.repeat(names, _ROW_LINES).tolist(),
+                    widths=[_ROW_WIDTH] * count * _ROW_LINES,
+                    aggregation_policy="off",
+                )
             case Style.LINE:
                 look = rr.SeriesLines(names=names, colors=colours, aggregation_policy="average")
             case Style.POINTS:
@@ -150,6 +169,55 @@ class Canvas:
         steps = (np.arange(2 * strokes) + 0.5) / (2 * strokes) - 0.5
         places = times[:, np.newaxis] + (steps * length).astype(np.int64)
         self.draw_lines(entity, places.ravel(), ends.reshape(-1, shares.shape[1]))
+
+    def add_rows(
+        self,
+        entity: str,
+        times: Int64,
+        shares: NDArray[np.floating],
+        length: int,
+        colours: Sequence[Colour],
+    ) -> None:
+        """Draw shares of one as rows from above, the brighter the larger a share is.
+
+        Parameters
+        ----------
+        times : np.ndarray [shape=(n,)], int64
+            Middles of spans, in nanoseconds of UTC.
+        shares : np.ndarray [shape=(n, k)], float
+            0 to 1; NaN where there is nothing.
+        length : int
+            Of a span, in nanoseconds.
+        colours : sequence of Colour
+            k of them.
+        """
+        there = ~np.isnan(shares).all(axis=1)
+        levels = np.rint(np.nan_to_num(shares[there]) * _SHADES)
+        if not len(levels):
+            return
+        starts = times[there] - length // 2
+        first = np.append(True, np.diff(starts) > 1.5 * length)  # of a part without a hole
+        last = np.append(first[1:], True)
+        kept = first | np.append(True, (levels[1:] != levels[:-1]).any(axis=1))
+        ends = starts[last] + length
+        stamps = np.concatenate([starts[first], starts[kept], ends, ends])
+        shades = np.concatenate([levels[first], levels[kept], levels[last], levels[last]])
+        order = np.argsort(stamps, kind="stable")
+        count = levels.shape[1]
+        middles = count - np.arange(count) - 0.5
+        lines = np.linspace(-0.5, 0.5, _ROW_LINES) * _ROW_SHARE
+        places = (middles[:, np.newaxis] + lines).ravel() * (ROWS_HEIGHT / count)
+        heights = np.tile(places, (len(stamps), 1))
+        heights[: first.sum()] = heights[-last.sum() :] = np.nan
+        light = shades[order, :, np.newaxis] / _SHADES
+        mixed = _GROUND + light * (np.array(colours) - _GROUND)
+        drawn = np.repeat(mixed.round().astype(np.uint8), _ROW_LINES, axis=1)
+        lengths = [count * _ROW_LINES] * len(stamps)
+        columns = [
+            *rr.Scalars.columns(scalars=heights[order].ravel()).partition(lengths),
+            *rr.SeriesLines.columns(colors=drawn.reshape(-1, 3)).partition(lengths),
+        ]
+        self.recording.send_columns(entity, [self._time_column(stamps[order])], columns)
 
     def draw_lines(self, entity: str, times: Int64, values: NDArray[np.floating]) -> None:
         """Draw a line for each column of values.

@@ -17,6 +17,7 @@ from hearthlog.analyzer.review.lanes import (
     SHARES,
     Checked,
     Lane,
+    features_image,
     labelling_in_words,
     labellings_of,
     timeline_lanes,
@@ -29,8 +30,8 @@ from hearthlog.analyzer.review.timeline import (
     Timeline,
     spectrogram,
 )
-from hearthlog.analyzer.review.viewer.canvas import Canvas
-from hearthlog.models.classes import in_words
+from hearthlog.analyzer.review.viewer.canvas import ROWS_HEIGHT, Canvas
+from hearthlog.models.classes import in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 
@@ -39,10 +40,10 @@ SPECTRUM = "spectrum"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # suffix of a microphone's name
 ASKED, ASKED_WORDS = "asked", "words/asked"
-_CLOSE_STROKES, _ASKED_STROKES = 1_200, 600  # maximum strokes of a band
+_ASKED_STROKES = 600  # maximum strokes of a band
 _ASKED: Colour = (245, 240, 225)
 
-_THICK, _THIN = 12.0, 8.0  # in screen points
+_THICKNESS = 0.55  # of a strip, in lanes, without the width of its lines
 _HOUR = 3600 * NANOSECONDS
 _HOURS_FROM = 4 * _HOUR
 _DAY: Colour = (70, 80, 92)
@@ -51,16 +52,10 @@ _Strip = tuple[int, int, str]
 
 
 class DrawnLane:
-    """A lane in the viewer; drawn states can be hidden, but not changed.
+    """A lane in the viewer; drawn states can be hidden, but not changed."""
 
-    Parameters
-    ----------
-    long : int
-        Nanoseconds: shorter spans are drawn thinner, or many short sounds look like a long one.
-    """
-
-    def __init__(self, root: str, height: float, long: int) -> None:
-        self._root, self._height, self._long = root, height, long
+    def __init__(self, root: str, height: float) -> None:
+        self._root, self._height = root, height
         self._parts: dict[str, set[_Strip]] = {}
         self._count = 0
 
@@ -74,9 +69,9 @@ class DrawnLane:
                 del self._parts[entity]
         fresh = wanted.difference(*self._parts.values())
         parts = self._divide(fresh).items()
-        for (is_long, text), strips in sorted(parts, key=lambda part: (-_length(part[1]), part[0])):
+        for text, strips in sorted(parts, key=lambda part: (-_length(part[1]), part[0])):
             layer = 0 if text == REVIEWED else 1  # the viewer draws in name order
-            places = self._height, _THICK if is_long else _THIN
+            places = self._height, _THICKNESS * LANE_HEIGHT
             entity = f"{self._root}/{layer}/{self._count:06}"
             times = np.array(sorted(strip[:2] for strip in strips))
             spans = Spans(times[:, 0], times[:, 1])
@@ -84,10 +79,11 @@ class DrawnLane:
             self._parts[entity] = strips
             self._count += 1
 
-    def _divide(self, strips: Iterable[_Strip]) -> dict[tuple[bool, str], set[_Strip]]:
-        found: dict[tuple[bool, str], set[_Strip]] = {}
-        for start, end, text in strips:
-            found.setdefault((end - start >= self._long, text), set()).add((start, end, text))
+    @staticmethod
+    def _divide(strips: Iterable[_Strip]) -> dict[str, set[_Strip]]:
+        found: dict[str, set[_Strip]] = {}
+        for strip in strips:
+            found.setdefault(strip[2], set()).add(strip)
         return found
 
 
@@ -144,14 +140,13 @@ def draw(
         _draw_hours(timeline, canvas)
     for lane, place in placed_lanes(timeline, marking=marking):
         canvas.write(place.name, lane.name)
-        drawn = DrawnLane(place.entity, place.height, timeline.grid.step)
+        drawn = DrawnLane(place.entity, place.height)
         drawn.show(lane, canvas)
         if {REVIEWED, SELECTED} & lane.colours.keys():
             changing[lane.microphone, lane.name] = drawn
     for plot in timeline_plots(timeline):
         if len(plot.times):
-            configure_plot(plot, plot_entity(plot), canvas)
-            add_to_plot(plot, plot_entity(plot), canvas)
+            _draw_plot(plot, plot_entity(plot), canvas)
         canvas.write(text_entity(plot), plot.text)
     for microphone in timeline.microphones.values():
         if microphone.clips:
@@ -190,20 +185,17 @@ def write_checked(
 
 def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
     """Draw the close-ups of a short timeline next to the longer timeline around it."""
-    strokes = -(-_CLOSE_STROKES // timeline.grid.count)
     for plot in timeline_plots(timeline):
         if plot.kind.frame_step:
-            entity = plot_entity(plot, CLOSE_UP)
-            if not len(before.starts):
-                configure_plot(plot, entity, canvas)
             new = rows_at(before, plot.times) < 0
             part = plot._replace(times=plot.times[new], values=plot.values[new])
-            add_to_plot(part, entity, canvas, strokes)
+            _draw_plot(part, plot_entity(plot, CLOSE_UP), canvas, is_new=not len(before.starts))
     grid = timeline.grid
     for microphone in timeline.microphones.values():
+        text = "Kept sound, 0 to 8 kHz"
         shade = spectrogram(microphone.clips, grid.start, grid.end, _SPECTRUM_SHAPE)
-        text = "Kept sound, 0 to 8 kHz" if shade is not None else "No sound of this was kept"
-        shade = np.zeros(_SPECTRUM_SHAPE) if shade is None else shade
+        if shade is None:
+            shade, text = features_image(microphone, grid, _SPECTRUM_SHAPE)
         canvas.show_image(f"{microphone.name}/{SPECTRUM}", grid.start, shade, text)
 
 
@@ -242,6 +234,21 @@ def draw_frames(
             if plot.kind is LEVEL:
                 parts = map(_fifths, parts)
             canvas.draw_frames(entity, plot.names, parts, plot.kind.frame_step)
+
+
+def _draw_plot(plot: Plot, entity: str, canvas: Canvas, *, is_new: bool = True) -> None:
+    """Draw a plot of a review: bands fall apart where one zooms in, so shares are rows."""
+    if plot.kind is not SHARES:
+        if is_new:
+            configure_plot(plot, entity, canvas)
+        add_to_plot(plot, entity, canvas)
+        return
+    names = ordered(plot.names)
+    shades = [*map(colour, names)]
+    if is_new:
+        canvas.configure(entity, Style.ROWS, [in_words(name) for name in names])
+    values = plot.values[:, [plot.names.index(name) for name in names]]
+    canvas.add_rows(entity, plot.times, values, plot.length, shades)
 
 
 def configure_plot(plot: Plot, entity: str, canvas: Canvas, style: Style | None = None) -> None:
@@ -392,6 +399,8 @@ def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = Fa
     scale = kind.live_scale or kind.scale if live else kind.scale
     if kind.style is Style.HEAT_MAP:
         scale = (-0.5, len(plot.names) - 0.5)
+    elif kind is SHARES and not live:
+        scale = (0.0, ROWS_HEIGHT)
     legend = live and (kind.style is Style.BANDS or len(entities) > 1)
     return _time_series(plot.title, entities, scale, titlebar=live, legend=legend)
 

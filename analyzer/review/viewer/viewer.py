@@ -484,6 +484,8 @@ _MEMORY = "800MB"  # of a viewer with days of incoming data; then it drops the o
 class WindowViewer(Viewer):
     """A viewer in its own window, controlled over gRPC with Rerun's own client."""
 
+    _scale = 1.0  # pixels of a point
+
     @cached_property
     def _client(self) -> ViewerClient:
         return ViewerClient.connect(self._process.url)
