@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import soundfile
 from spliced import run
+from viewers import display, free_port, reviewing
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import kept_time
@@ -39,6 +40,8 @@ from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import plan_short_day
 from hearthlog.tools.home.simulate import record_composition
+
+__all__ = ["display"]  # a fixture
 
 START = 1_772_323_200 * NANOSECONDS
 LENGTH = 24  # minutes
@@ -87,6 +90,30 @@ def written(home, read):
 
 def marking(home):
     return Marking("mic", find_coverage(home)["mic"], "Ann", "live", no_spans())
+
+
+def test_the_queue_of_a_window_begins_with_what_can_be_heard(heard, display):
+    (layer,) = heard.rglob("*.audio.mcap")
+    kept = kept_time([layer], "/mic/audio", START, START + LENGTH * MINUTE)
+    options = ("--queue", "--port", free_port(), "--spans", "10", "--timezone", "UTC")
+    with reviewing(heard, *options, DISPLAY=display) as review:
+        for number in range(1, 11):
+            review.wait_for(f"{number}/10")
+            review.press("n")
+        review.process.wait(60)
+    pattern = re.compile(r"/10  \w+ \d+ \w+ (\d\d):(\d\d):(\d\d) \+ ([\d.]+) s  (.*)")
+    shown = [found.groups() for found in map(pattern.search, review.lines) if found]
+    assert len(shown) == 10
+    shares = []
+    for hours, minutes, seconds, length, text in shown:
+        if "minute" in text:
+            continue
+        clock = (int(hours) * 60 + int(minutes)) * 60 + int(seconds)
+        start = START - START % (24 * 60 * MINUTE) + clock * NANOSECONDS
+        end = start + round(float(length) * NANOSECONDS)
+        shares.append(cut(kept, start, end).length / (end - start))
+    assert len(shares) == 8
+    assert min(shares[:5]) > 0.5
 
 
 # Minutes

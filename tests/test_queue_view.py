@@ -1,6 +1,8 @@
 """A queue in the real viewer: what is asked, close up, and the sound of it."""
 
 import subprocess
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import psutil
@@ -10,10 +12,11 @@ from viewers import patiently, pixels
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.lanes import SHARES
+from hearthlog.analyzer.review.lanes import FEATURES, SHARES, features_image
 from hearthlog.analyzer.review.timeline import SoundClip
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.viewer import open_hidden
+from hearthlog.models.classes import ordered
 
 SECOND = 1_000_000_000
 MARGIN = 20 * SECOND
@@ -71,33 +74,36 @@ def is_asked(picture, start, end):
     return (inside.all(axis=1) & beside.all(axis=1)).sum() >= 10
 
 
-def share_of_right_columns(picture, timeline, start, end):
-    """In how many columns most of the bands has the colour of the most probable class."""
+def rows_of_classes(picture, names):
+    """The row of pixels in the middle of each class, by the names of the lowest plot."""
+    bright = np.abs(picture[:, _LANES:] - np.array(colour(names[-1]))).max(axis=2) <= _NEAR
+    lowest = np.flatnonzero(bright[len(picture) // 2 :].mean(axis=1) > 0.02) + len(picture) // 2
+    run = max(np.split(lowest, np.flatnonzero(np.diff(lowest) > 3) + 1), key=len)
+    assert len(run) > 5
+    height = len(run)
+    return [
+        round(run[-1] + 1 - (len(names) - number - 0.5) * height) for number in range(len(names))
+    ]
+
+
+def right_columns(picture, timeline, first, last):
+    """Whether the brightest row of some columns is that of the most probable class."""
     shares = timeline.microphones["mic"].plots[SHARES, "live"]
-    names, values = shares.names, shares.values
-    first, last = start - MARGIN, end + MARGIN
-    words = 174  # pixels of the names of lanes
-    left = words + int(np.argmax((pixels_of_bands(picture, names) > 40).any(axis=1)[words:][:80]))
-    width = picture.shape[1] - left
+    names = ordered(shares.names)
+    rows = rows_of_classes(picture, names)
+    colours = np.array([colour(name) for name in names])
     right = []
-    for share in np.linspace(0.05, 0.8, 60):  # the legend is on the right
-        time = first + int(share * (last - first))
-        place = int(timeline.grid.find(np.array([time]))[0])
-        column = picture[:, left + int(share * width)]
-        seen = [(np.abs(column - np.array(colour(n))).max(axis=1) <= _NEAR).sum() for n in names]
-        expected = values[place]
-        if expected.max() > 0.7:
-            right.append(int(np.argmax(seen)) == int(np.argmax(expected)))
+    for share in np.linspace(0.05, 0.95, 90):
+        place = int(timeline.grid.find(np.array([first + int(share * (last - first))]))[0])
+        values = [shares.values[place, shares.names.index(name)] for name in names]
+        if max(values) < 0.8:
+            continue
+        x = _LANES + int(share * (picture.shape[1] - _LANES))
+        seen = np.stack([picture[y - 2 : y + 3, x].mean(axis=0) for y in rows])
+        light = ((seen - 13) * (colours - 13)).sum(axis=1) / ((colours - 13) ** 2).sum(axis=1)
+        right.append(int(light.argmax()) == int(np.argmax(values)) and light.max() > 0.6)
     assert len(right) > 20
     return np.mean(right)
-
-
-def pixels_of_bands(picture, names):
-    """For each column how many pixels have the colour of each class."""
-    return np.stack(
-        [(np.abs(picture - np.array(colour(n))).max(axis=2) <= _NEAR).sum(axis=0) for n in names],
-        axis=1,
-    )
 
 
 def test_close_ups_are_right_and_the_span_is_marked_also_when_the_queue_jumps_back(
@@ -110,29 +116,59 @@ def test_close_ups_are_right_and_the_span_is_marked_also_when_the_queue_jumps_ba
 
         def is_right(png, start=start, end=end):
             picture = pixels(png)
-            right = share_of_right_columns(picture, timeline, start, end)
+            right = right_columns(picture, timeline, start - MARGIN, end + MARGIN)
             return right > 0.85 and is_asked(picture, start, end)
 
         patiently(view.picture, is_right)
     assert view.state().errors == []
 
 
-def test_the_layout_stays_when_the_cursor_is_within_the_timeline(view, logs, timeline):
-    start = timeline.grid.start + 40 * SECOND
-    ask(view, logs, start, start + 3 * SECOND)
-    patiently(view.picture, lambda png: is_asked(pixels(png), start, start + 3 * SECOND))
-    before = columns_of(view)
-    assert before
-    view._size_due = 0.0
-    view.refresh()
-    assert columns_of(view) == before
+def test_probabilities_are_rows_of_one_colour_at_every_zoom(timeline):
+    with open_hidden() as viewer:
+        viewer.draw(timeline, close_up=False)
+        viewer.wait_until_drawn()
+        middle = timeline.grid.start + 70 * SECOND
+        for half in (60 * SECOND, 10 * SECOND, SECOND):
+            viewer.show(middle - half, middle + half, 0, select=False)
+
+            def is_right(png, half=half):
+                with suppress(AssertionError, ValueError):
+                    return right_columns(pixels(png), timeline, middle - half, middle + half) > 0.85
+                return False
+
+            patiently(viewer.picture, is_right)
 
 
-def columns_of(view):
-    """The widths of columns, by container."""
-    blueprint = view._blueprint()
-    shares = {path: one.get("ContainerBlueprint", {}) for path, one in blueprint.items()}
-    return {path: one["col_shares"] for path, one in shares.items() if one.get("col_shares")}
+def test_a_window_keeps_its_layout_when_its_cursor_goes_elsewhere(view, timeline):
+    def layout():
+        view._size_due = 0.0  # the next refresh looks at the size
+        view.refresh()
+        shares = (one.get("ContainerBlueprint", {}) for one in view._blueprint().values())
+        return [one.get("col_shares") for one in shares]
+
+    before = layout()
+    start = timeline.grid.start + 90 * SECOND
+    view.show(start, start + SECOND, MARGIN)
+    patiently(view.cursor, lambda cursor: cursor == start)
+    patiently(view.picture)
+    assert layout() == before
+
+
+def test_where_no_sound_was_kept_there_are_features_one_below_the_other(timeline):
+    microphone, grid = timeline.microphones["mic"], timeline.grid
+    image, text = features_image(microphone, grid, (66, 1000))
+    plot = microphone.plots[FEATURES, ""]
+    assert text.startswith("No sound was kept here: features, from zero_crossing_rate down to")
+    assert text.endswith("energy")
+    energy = plot.values[np.arange(1000) * grid.count // 1000, plot.names.index("energy")]
+    order = np.argsort(energy)
+    assert (np.diff(image[-1, order]) >= 0).all()
+    assert image[-1].min() == 0.0
+    assert image[-1].max() == 1.0
+    bare = replace(microphone, plots={})
+    image, text = features_image(bare, grid, (66, 1000))
+    assert not image.any()
+    assert text == "No sound was kept here, and no features"
 
 
 def test_the_viewer_hardly_grows_with_the_spans_that_it_showed(view, logs, timeline):

@@ -1,16 +1,20 @@
 """Marks that a reviewer makes at a viewer: in the layer at once, undone, never lost."""
 
+import io
 import json
 import shutil
 import signal
 import socket
 import subprocess
 import time
+import wave
 from datetime import UTC
+from http.client import HTTPConnection
 from itertools import pairwise
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event as Flag
+from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
@@ -31,14 +35,15 @@ from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.review_list import write_list
 from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
-from hearthlog.analyzer.review.session import ReviewSession
+from hearthlog.analyzer.review.session import ReviewSession, sound_file
 from hearthlog.analyzer.review.timeline import SoundClip, sound_of
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.recorder.config import Settings
+from hearthlog.recorder.log.clips import ClipWriter, KeptSound
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
-from hearthlog.schemas.frames import FRAME_NANOSECONDS
+from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs, is_layer
 
 __all__ = ["display"]  # a fixture
@@ -855,6 +860,7 @@ def test_a_port_that_is_in_use_is_said(recorded_home, capfd):
     [
         (["--save", "a.rrd", "--web"], (2, "--save writes a file")),
         (["--save", "a.rrd", "--queue", "novel"], (2, "of a queue it is a label file")),
+        (["--sound"], (2, "needs --web")),
         (["--day", "2026-03-01", "--start", "2026-03-01T07:00"], (2, "--day excludes --start")),
         (["--day", "someday", "--save", "a.rrd"], (2, "not a day such as 2026-03-01")),
         (["--day", "2020-01-01", "--save", "a.rrd"], (1, "in this span of time")),
@@ -1002,6 +1008,74 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             patiently_without_layer(home)
             page.evaluate(f"{buttons}.find(each => each.textContent == 'quitq').click()")
             assert review.process.wait(60) == 0
+
+
+def request(port, path, **headers):
+    """Status, kind and content of a request to the page."""
+    connection = HTTPConnection("127.0.0.1", port, timeout=60)
+    connection.request("GET", path, headers={"Host": f"127.0.0.1:{port}", **headers})
+    answer = connection.getresponse()
+    return answer.status, answer.getheader("Content-Type"), answer.read()
+
+
+def test_the_page_plays_the_kept_sound_of_the_span_and_nobody_else_gets_it(home, tmp_path):
+    (log, *_) = [log for log in find_logs(home) if not is_layer(log)]
+    clips = ClipWriter(Settings(output=home, keep_audio="always"), ["mic"], lambda at: (log, at))
+    stamps = START + np.arange(100, 200) * FRAME_NANOSECONDS
+    tone = np.round(8000 * np.sin(np.arange(100 * FRAME_SAMPLES) * 0.3)).astype(np.int16)
+    assert clips.write("mic", [KeptSound(stamps, tone.reshape(100, -1))]) == []
+    clips.finish()
+    spans = tmp_path / "spans.csv"
+    row = "mic", START + 6 * SECOND, START + 8 * SECOND, "live", "speech", "", "", None, "novelty"
+    other = (*row[:1], START + 60 * SECOND, START + 62 * SECOND, *row[3:])
+    write_list(spans, [Listed(*row), Listed(*other)])
+    port = free_port()
+    options = ("--web", "--sound", "--port", port, "--queue", spans)
+    with reviewing(home, *options, BROWSER="true") as review:
+        line = review.wait_for("http://127.0.0.1:")
+        address = line[line.index("http:") :].split()[0]
+        secret = urlsplit(address).path
+        flags = ("--autoplay-policy=no-user-gesture-required",)
+        with browsing(address, tmp_path / "browser", flags=flags) as page:
+            review.wait_for("1/2")
+            status, kind, content = request(port, f"{secret}sound")
+            assert (status, kind) == (200, "audio/wav")
+            with wave.open(io.BytesIO(content)) as file:
+                assert (file.getframerate(), file.getnframes()) == (16_000, 32_000)
+                heard = np.frombuffer(file.readframes(32_000), "<i2")
+            assert np.abs(heard - tone[16_000:48_000]).max() <= 1
+            for path, headers in (
+                ("/sound", {}),
+                (f"/{'x' * 22}/sound", {}),
+                (f"{secret}sound", {"Host": "elsewhere.example"}),
+                (f"{secret}sound", {"Origin": "http://elsewhere.example"}),
+            ):
+                assert request(port, path, **headers)[0] == 404
+            button = (
+                "[...document.querySelectorAll('button')].find(b => b.textContent.includes('▶'))"
+            )
+            page.evaluate(f"{button}.click()")
+            patiently(page.text, lambda text: text == "playing 2.0 s; Space stops")
+            review.press("n")
+            review.wait_for("2/2")
+            found = patiently(lambda: request(port, f"{secret}sound"), lambda one: one[0] != 200)
+            assert (found[0], found[2]) == (404, b"no sound of this span was kept\n")
+            assert review.quit() == 0
+
+
+def test_a_page_has_no_sound_unless_it_is_asked_for(home):
+    port = free_port()
+    with reviewing(home, "--web", "--port", port, BROWSER="true") as review:
+        line = review.wait_for("http://127.0.0.1:")
+        secret = urlsplit(line[line.index("http:") :].split()[0]).path
+        assert request(port, f"{secret}sound")[0] == 404
+        assert json.loads(request(port, f"{secret}description")[2])["sound"] is False
+
+
+def test_a_page_is_sent_at_most_a_minute_of_sound():
+    clip = SoundClip(START, 8_000, np.ones(8_000 * 100, np.int16))
+    with wave.open(io.BytesIO(sound_file([clip], START, START + 100 * SECOND))) as file:
+        assert file.getnframes() == 60 * 8_000
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

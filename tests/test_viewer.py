@@ -47,7 +47,7 @@ __all__ = ["display", "short_sounds", "viewer"]  # fixtures
 HOUR = 3600 * 1_000_000_000
 MARKED = (START + 2 * HOUR, START + 3 * HOUR)
 _NEAR = 14  # of 255: how far a colour may be off
-_CAP = 7  # pixels by which a strip is longer than its sound, and what is rounded
+_CAP = 5  # pixels by which a strip is longer than its sound, and what is rounded
 _WHITE = 110
 _DARK = 13  # behind plots
 _LONG = 300 * 1_000_000_000
@@ -262,7 +262,7 @@ def check_seen(png, timeline):
             assert np.ptp(columns) >= 2
             lanes.setdefault(name, set()).update(rows.tolist())
             everywhere[:, picture.place(begin) - _CAP : picture.place(begin) + _CAP + 1] = False
-        assert max(lanes[name]) - min(lanes[name]) < 12, "one lane"
+        assert 15 < max(lanes[name]) - min(lanes[name]) < 36, "one lane"
         lane = everywhere[min(lanes[name]) : max(lanes[name]) + 1]
         assert lane.sum() <= 12, f"{name} where there was none"
     tops = sorted((min(rows), max(rows)) for rows in lanes.values())
@@ -321,7 +321,7 @@ def columns_of(picture, shade):
     """The first and the last column in which a strip of a colour is drawn, without round ends."""
     lanes = picture[_TITLES : len(picture) * 6 // 10, _LANES:]
     columns = np.flatnonzero((np.abs(lanes - shade).max(axis=2) <= _NEAR).sum(axis=0) > 3)
-    return (_LANES + columns[0] + 5, _LANES + columns[-1] - 5) if len(columns) else None
+    return (_LANES + columns[0] + 2, _LANES + columns[-1] - 2) if len(columns) else None
 
 
 @pytest.fixture

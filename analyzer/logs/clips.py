@@ -1,5 +1,7 @@
 """Audio clips in a log."""
 
+import io
+import wave
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +22,7 @@ CLIP_FIELDS = ("timestamp", "data", "format", "sample_rate", "number_of_channels
 SAMPLE_BYTES = 2
 _FORMAT = "pcm-s16"
 _FULL_SCALE = np.float32(32768.0)
+_WAV_SCALE = np.float32(32767.0)
 _RATES = range(1_000, 1_000_001)
 _CHANNELS = range(1, 257)
 _NEAR = 10 * NANOSECONDS  # maximum difference between the time of a message and of its sound
@@ -147,6 +150,15 @@ def kept_sound(layers: Sequence[Path], name: str, start: int, end: int) -> tuple
                     rate, sound = own_rate, np.zeros(length, np.float32)
                 sound[first:last] = samples[first - place : last - place]
     return rate, sound
+
+
+def wav_bytes(samples: Float32, rate: int) -> bytes:
+    """Return sound (-1 to 1) as a WAV file of 16 bits."""
+    content = io.BytesIO()
+    with wave.open(content, "wb") as sound:
+        sound.setparams((1, SAMPLE_BYTES, rate, 0, "NONE", ""))
+        sound.writeframes((np.clip(samples, -1.0, 1.0) * _WAV_SCALE).astype("<i2").tobytes())
+    return content.getvalue()
 
 
 def play_sound(samples: Float32, rate: int, *, wait: bool = False) -> None:

@@ -2,7 +2,6 @@
 
 import os
 import re
-import wave
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import LabellingDifference
-from hearthlog.analyzer.logs.clips import SAMPLE_BYTES, kept_sound, kept_time
+from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, pieces
@@ -222,7 +221,6 @@ def _time(where: str, text: str) -> int:
 _SUFFIX = ".queue.csv"
 _EVER = 1 << 62  # nanoseconds
 _SHORTEST = NANOSECONDS // 10  # minimum sound for a file
-_FULL_SCALE = 32767.0
 
 
 def queue_file(labels: Path) -> Path:
@@ -327,9 +325,8 @@ def write_sounds(
             rate, samples = kept_sound(near, kept.topic, file.start, file.end)
             path = temporary / file.name(lines)
             descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(descriptor, "wb") as stream, wave.open(stream, "wb") as sound:
-                sound.setparams((1, SAMPLE_BYTES, rate, 0, "NONE", ""))
-                sound.writeframes((samples * _FULL_SCALE).astype("<i2").tobytes())
+            with os.fdopen(descriptor, "wb") as stream:
+                stream.write(wav_bytes(samples, rate))
 
 
 def label_lines(

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.clips import play_sound
+from hearthlog.analyzer.logs.clips import play_sound, wav_bytes
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.marks.marks import PERSON, RANDOM, Mark
 from hearthlog.analyzer.review.marking import Marking
@@ -26,6 +26,7 @@ _POLL_SECONDS = 0.3
 _LEAST_MARGIN = 20 * NANOSECONDS
 _AROUND = 600 * NANOSECONDS
 _RIGHT = "."
+_NO_SOUND = "no sound of this span was kept"
 _CLASS_KEYS = "1234567890eghijklorsvwxy"
 _HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time cursor; then"
 
@@ -291,14 +292,23 @@ class ReviewSession:
             self.stop()
             self.say("stopped")
             return
-        item = self.items[self._at] if self.items else None
-        span = self.screen.selection() or (item and (item.start, item.end))
-        start, end = span or self._chosen()
+        start, end = self.span_to_play()
         seconds, text = self.listen(start, end)
         self._plays_until = time.monotonic() + seconds
         self.say(text)
         if seconds:
             self.screen.play(start)
+
+    def span_to_play(self) -> tuple[int, int]:
+        """Return the selected span, or the item, in nanoseconds of UTC.
+
+        Raise `DataError` without both. Raise `ConnectionError` or `TimeoutError` if the viewer does
+        not answer.
+        """
+        in_queue = 0 <= self._at < len(self.items)
+        item = self.items[self._at] if in_queue else None
+        span = self.screen.selection() or (item and (item.start, item.end))
+        return span or self._chosen()
 
     def _look_around(self) -> None:
         cursor = self._cursor()
@@ -390,6 +400,20 @@ def _margin(start: int, end: int) -> int:
     return max(_LEAST_MARGIN, (end - start) // 2)
 
 
+_LONGEST_SOUND = 60 * NANOSECONDS  # sent to a page: two megabytes
+
+
+def sound_file(clips: Sequence[SoundClip], start: int, end: int) -> bytes:
+    """Return the kept sound of the first minute of a span of time as a WAV file.
+
+    Raise `DataError` if none was kept.
+    """
+    rate, samples = sound_of(clips, start, min(end, start + _LONGEST_SOUND))
+    if not len(samples):
+        raise DataError(_NO_SOUND)
+    return wav_bytes(samples, rate)
+
+
 def listen(
     clips: Sequence[SoundClip],
     start: int,
@@ -412,7 +436,7 @@ def listen(
     """
     rate, samples = sound_of(clips, start, end)
     if not len(samples):
-        return 0.0, "no sound of this span was kept"
+        return 0.0, _NO_SOUND
     try:
         play(samples, rate)
     except LogError as error:

@@ -46,7 +46,8 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.review.marking import Marking
     from hearthlog.analyzer.review.review_list import ReviewSpan, SoundFile
     from hearthlog.analyzer.review.review_queue import ReviewItem
-    from hearthlog.analyzer.review.timeline import Key, Timeline
+    from hearthlog.analyzer.review.session import ReviewSession
+    from hearthlog.analyzer.review.timeline import Key, SoundClip, Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _QUEUE = "--queue"
@@ -71,6 +72,9 @@ def review(
         ),
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="Use a browser.")] = False,
+    sound: Annotated[
+        bool, typer.Option("--sound", help="With --web: play kept sound in the browser.")
+    ] = False,
     queue: Annotated[
         str | None,
         typer.Option(
@@ -111,6 +115,8 @@ def review(
     """
     if save is not None and (web or port):
         wrong_use("--save writes a file and excludes --web and --port")
+    if sound and not web:
+        wrong_use("--sound plays kept sound in the browser and needs --web")
     if day is not None and (start or end):
         wrong_use("--day excludes --start and --end")
     from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -145,7 +151,7 @@ def review(
             signal.signal(number, _end)  # otherwise the viewer would keep running, and listening
         with _open(web=web, port=port) as viewer:
             timeline = read()
-            _show(viewer, timeline, logs, chosen)
+            _show(viewer, timeline, logs, chosen, sound=sound)
     end_with_warnings(timeline.losses)
 
 
@@ -218,7 +224,9 @@ class _Choice(NamedTuple):
     limits: tuple[int | None, int | None]
 
 
-def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Choice) -> None:
+def _show(
+    viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Choice, *, sound: bool
+) -> None:
     """Show a timeline until the reviewer ends."""
     from hearthlog.analyzer.logs.clips import stop_sound
     from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -264,7 +272,7 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
         items,
     )
     keys: SimpleQueue[str] = SimpleQueue()
-    viewer.offer(session.keys, keys.put)
+    _offer(viewer, session, keys, heard.clips if sound else None)
     viewer.draw(timeline, close_up=bool(items))
     show_page(viewer.address)
     with read_keys(keys) as ended, suppress(KeyboardInterrupt):
@@ -280,6 +288,21 @@ def _show(viewer: "Viewer", timeline: "Timeline", logs: list[Path], choice: _Cho
             _say_next(logs, marking.scenario)
     if not marking.scenario:
         _report_accuracy(logs)
+
+
+def _offer(
+    viewer: "Viewer",
+    session: "ReviewSession",
+    keys: "SimpleQueue[str]",
+    clips: "Sequence[SoundClip] | None",
+) -> None:
+    """Show the keys in the page; with clips, the page plays them."""
+    from hearthlog.analyzer.review.session import sound_file
+
+    def sound() -> bytes:
+        return sound_file(clips or (), *session.span_to_play())
+
+    viewer.offer(session.keys, keys.put, None if clips is None else sound)
 
 
 def _print_keys(keys: "Sequence[Key]") -> None:

@@ -1,15 +1,11 @@
 """List of sounds on the page: events of one class folded, what needs a look, and their sound."""
 
-import io
-import wave
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.sources import source_microphone
@@ -18,7 +14,7 @@ from hearthlog.analyzer.bridge.page.day import IMPORTANT
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import Words, clock, room
 from hearthlog.analyzer.colours import colour_on_paper
-from hearthlog.analyzer.logs.clips import kept_sound, kept_time
+from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -128,7 +124,6 @@ class ShownBouts(NamedTuple):
 _LONGEST_SOUND = 60 * NANOSECONDS
 _NEAR = 10 * NANOSECONDS  # a clip may lie so far from its log time
 _MOST_KEPT = 2000  # remembered events with kept sound
-_FULL_SCALE = 32767
 
 
 class KeptSounds:
@@ -185,14 +180,7 @@ class KeptSounds:
                     for edge in (other.start, other.end)
                 )
                 samples[first : last + 1] = 0
-        content = io.BytesIO()
-        with wave.open(content, "wb") as sound:
-            sound.setnchannels(1)
-            sound.setsampwidth(2)
-            sound.setframerate(rate)
-            pcm = np.clip(samples * _FULL_SCALE, -_FULL_SCALE, _FULL_SCALE).astype("<i2")
-            sound.writeframes(pcm.tobytes())
-        return content.getvalue()
+        return wav_bytes(samples, rate)
 
     def _layers(self, start: int, end: int) -> list[Path]:
         """Return the layers that may have sound of a time span."""

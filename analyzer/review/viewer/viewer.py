@@ -134,9 +134,19 @@ class Viewer(ABC):
         """Set the time cursor, in nanoseconds of the clock of the home, and let it run."""
 
     def offer(  # noqa: B027 - in a window, the keys are typed in the terminal
-        self, keys: Sequence[Key], press: Callable[[str], None]
+        self,
+        keys: Sequence[Key],
+        press: Callable[[str], None],
+        sound: Callable[[], bytes] | None = None,
     ) -> None:
-        """Show buttons in the page of the viewer, if it has one."""
+        """Show buttons in the page of the viewer, if it has one.
+
+        Parameters
+        ----------
+        sound : callable, optional
+            Returns the sound of the current span as a WAV file, for the page to play; raises
+            `HearthlogError` if there is none.
+        """
 
     def say(self, text: str) -> None:  # noqa: B027 - lines are printed in the terminal, too
         """Show a line in the page of the viewer, if it has one."""
@@ -484,7 +494,7 @@ _MEMORY = "800MB"  # of a viewer with days of incoming data; then it drops the o
 class WindowViewer(Viewer):
     """A viewer in its own window, controlled over gRPC with Rerun's own client."""
 
-    _scale = 1.0  # pixels of a point
+    _scale = 1.0  # pixels of a point of the screen
 
     @cached_property
     def _client(self) -> ViewerClient:
@@ -510,8 +520,6 @@ class WindowViewer(Viewer):
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         return self._client.take_screenshot()
-
-    _scale = 1.0  # pixels of a point of the screen
 
     def _size(self) -> ViewerSize | None:
         with Image.open(io.BytesIO(self._client.take_screenshot())) as image:

@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from importlib.resources import files
+from itertools import count
 from typing import Any, cast
 
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, free_port
@@ -22,6 +23,7 @@ from hearthlog.analyzer.review.viewer.viewer import (
     ViewerSize,
     ViewerState,
 )
+from hearthlog.schemas.errors import HearthlogError
 
 # Messages of Rerun's viewer control (0.41), accepted by the page in a browser; a viewer in a
 # window has Rerun's own client. A field is a head, 8 * number + kind, and a value.
@@ -118,11 +120,12 @@ class Relay:
 
     keys: Sequence[Key] = ()
     press: Callable[[str], None] = lambda _: None
+    sound: Callable[[], bytes] | None = None
     texts: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
     requests: queue.SimpleQueue[tuple[int, bytes]] = field(default_factory=queue.SimpleQueue)
     answers: dict[int, "Future[bytes]"] = field(default_factory=dict)
     size: ViewerSize | None = None  # of the viewer in the page
-    _last: int = 0
+    _numbers: Iterator[int] = field(default_factory=lambda: count(1))
 
     def ask(self, request: bytes) -> bytes:
         """Send a request to the page, and wait for its answer.
@@ -130,8 +133,7 @@ class Relay:
         Raise `TimeoutError` if there is no answer within 15 seconds. Raise `ConnectionError` if the
         viewer in the page refused.
         """
-        self._last += 1
-        number, answer = self._last, Future[bytes]()
+        number, answer = next(self._numbers), Future[bytes]()
         self.answers[number] = answer
         self.requests.put((number, request))
         try:
@@ -204,7 +206,12 @@ class _Handler(HttpHandler):
             policy = {"Content-Security-Policy": self._policy()}
             self.send(HTTPStatus.OK, page, "text/html; charset=utf-8", policy)
         elif name == "description":
-            description = {"data": self._page.data, "keys": list(self._page.relay.keys)}
+            relay = self._page.relay
+            description = {
+                "data": self._page.data,
+                "keys": list(relay.keys),
+                "sound": relay.sound is not None,
+            }
             self.send(HTTPStatus.OK, json.dumps(description).encode(), "application/json")
         elif name == "next":
             number, request = self._page.relay.next()
@@ -212,6 +219,8 @@ class _Handler(HttpHandler):
             self.send(HTTPStatus.OK, request, kind, {"Number": str(number)})
         elif name == "text":
             self._send_text()
+        elif name == "sound" and self._page.relay.sound is not None:
+            self._send_sound(self._page.relay.sound)
         elif name in _VIEWER_FILES:
             kind = "text/javascript" if name.endswith(".js") else "application/wasm"
             with urllib.request.urlopen(f"{self._page.viewer_files}/{name}") as file:  # noqa: S310
@@ -245,18 +254,30 @@ class _Handler(HttpHandler):
         allowed = self._page.data.removeprefix("rerun+").removesuffix("/proxy")
         return (
             "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; "
-            f"style-src 'unsafe-inline'; img-src data: blob:; connect-src 'self' {allowed}"
+            "style-src 'unsafe-inline'; img-src data: blob:; media-src blob:; "
+            f"connect-src 'self' {allowed}"
         )
 
     def _name(self) -> str | None:
-        """Return the path after the secret; None for a wrong secret or host."""
+        """Return the path after the secret; None for a wrong secret or host, or another page."""
         secret, _, name = self.path.removeprefix("/").partition("/")
         hosts = {f"{host}:{self._page.server_port}" for host in (HOST, "localhost")}
         is_ours = secrets.compare_digest(secret.encode(), self._page.secret.encode())
-        if not is_ours or self.host not in hosts or not self._page.admit(self.connection):
+        origins = {f"http://{host}" for host in hosts}
+        is_ours &= self.host in hosts and set(self.headers.get_all("Origin", [])) <= origins
+        if not is_ours or not self._page.admit(self.connection):
             return None
         self._page.give_time(self.connection, _SECONDS)
         return name
+
+    def _send_sound(self, sound: Callable[[], bytes]) -> None:
+        """Send the sound of the current span, or a line that says why there is none."""
+        try:
+            self.send(HTTPStatus.OK, sound(), "audio/wav")
+        except HearthlogError as error:
+            self.send_text(HTTPStatus.NOT_FOUND, str(error))
+        except (ConnectionError, TimeoutError):
+            self.send_text(HTTPStatus.SERVICE_UNAVAILABLE, "the viewer did not answer")
 
     def _send_text(self) -> None:
         text = ""
@@ -283,8 +304,13 @@ class _PageViewer(Viewer):
         cursors = _numbers(_message(_message(shown[0], 3), 3), 1) if shown else []
         return ViewerState(_text(state, 6), len(views), errors, cursors[-1] if cursors else None)
 
-    def offer(self, keys: Sequence[Key], press: Callable[[str], None]) -> None:
-        self._relay.keys, self._relay.press = keys, press
+    def offer(
+        self,
+        keys: Sequence[Key],
+        press: Callable[[str], None],
+        sound: Callable[[], bytes] | None = None,
+    ) -> None:
+        self._relay.keys, self._relay.press, self._relay.sound = keys, press, sound
 
     def say(self, text: str) -> None:
         self._relay.texts.put(text)
