@@ -209,7 +209,8 @@ class Canvas:
         places = (middles[:, np.newaxis] + lines).ravel() * (ROWS_HEIGHT / count)
         heights = np.tile(places, (len(stamps), 1))
         heights[: first.sum()] = heights[-last.sum() :] = np.nan
-        light = shades[order, :, np.newaxis] / _SHADES
+        shades = shades[np.roll(order, 1)]  # the viewer draws a piece in the colour of its end
+        light = shades[:, :, np.newaxis] / _SHADES
         mixed = _GROUND + light * (np.array(colours) - _GROUND)
         drawn = np.repeat(mixed.round().astype(np.uint8), _ROW_LINES, axis=1)
         lengths = [count * _ROW_LINES] * len(stamps)

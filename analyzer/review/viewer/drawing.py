@@ -43,7 +43,7 @@ ASKED, ASKED_WORDS = "asked", "words/asked"
 _ASKED_STROKES = 600  # maximum strokes of a band
 _ASKED: Colour = (245, 240, 225)
 
-_THICKNESS = 0.55  # of a strip, in lanes, without the width of its lines
+_THICKNESS = 0.5  # of a strip, in lanes, without the width of its lines
 _HOUR = 3600 * NANOSECONDS
 _HOURS_FROM = 4 * _HOUR
 _DAY: Colour = (70, 80, 92)
