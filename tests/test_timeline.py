@@ -864,7 +864,7 @@ def test_each_class_has_a_row_that_is_as_bright_as_it_was_probable(recording, ti
         for shift, full in zip((24, 16, 8), colour(name), strict=True):
             # The viewer draws a piece in the colour of its end.
             seen = (shades[found + 1, number, 0] >> shift & 255).astype(float)
-            step = abs(full - 13) / 15 / 2 + 1
+            step = abs(full - 13) / 10 / 2 + 1
             np.testing.assert_allclose(seen, 13 + share * (full - 13), atol=step)
 
 

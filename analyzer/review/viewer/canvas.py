@@ -18,9 +18,9 @@ from hearthlog.schemas.arrays import Float64, Int64
 _STROKE_WIDTH = 2.0  # pixels
 # Ends of lines are round and reach half a width too far, so thin lines side by side fill a strip.
 _STRIP_LINES, _STRIP_WIDTH = 8, 4.0  # screen points
-_ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 5, 5.0, 0.8
+_ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 4, 6.0, 0.8
 ROWS_HEIGHT = 0.2  # of all rows: with numbers as wide as those of lanes, both begin at one place
-_SHADES = 15  # of a row; each change of its colour is a line of its own for the viewer
+_SHADES = 10  # of a row; each change of its colour is a line of its own for the viewer
 _GROUND = np.array((13, 13, 13))  # behind the plots of the viewer
 _FILLING = 400  # texts that leave no pause in the data
 _LEAST_SHARE = 0.004  # a smaller share makes a band less than a pixel high
