@@ -158,14 +158,15 @@ def check_rows(png, timeline):
     run = max(np.split(silent, np.flatnonzero(np.diff(silent) > 3) + 1), key=len)
     assert rows[-1] == "silence"
     assert len(run) > 8
-    picture.begin_at_cursor(slice(run[-1] - len(run) * len(rows), run[-1]))
+    height = (len(run) - 3) / 0.9  # it reaches three pixels into the row above
+    picture.begin_at_cursor(slice(int(run[-1] - height * len(rows)), run[-1]))
     checked = set()
     for time, text in blocks_of(timeline):
         place = int(timeline.grid.find(np.array([time]))[0])
         share = values[place - 1 : place + 2, names.index(text)].mean()
         if share > 0.4:
             above = len(rows) - rows.index(text) - 0.5  # rows to its middle, from below
-            row = int(run[-1] - above * len(run))
+            row = int(run[-1] - above * height)
             around = picture.image[row - 2 : row + 3, picture.place(time)].mean(axis=0)
             expected = _DARK + share * (np.array(colour(text)) - _DARK)
             assert np.abs(around - expected).max() < 0.25 * 255, (text, share, around)
