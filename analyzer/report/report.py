@@ -93,6 +93,23 @@ def make_report(  # noqa: PLR0913
     paths = [page] if draw is None else [page, picture]
     for path in paths:
         check_new(path)
+    account, losses = read_account(logs, period, labelling, progress)
+    text = day_page(account) if period.days == 1 else week_page(account)
+    with ExitStack() as files:
+        html, *png = [files.enter_context(new_file(path)) for path in paths]
+        html.write_text(text, "utf-8")
+        if draw is not None:
+            draw(png[0], account.days, account.earlier)
+    return WrittenReport(page, None if draw is None else picture, losses)
+
+
+def read_account(
+    logs: HomeLogs, period: Period, labelling: str = LIVE, progress: Progress = ignore_progress
+) -> tuple[Account, Sequence[str]]:
+    """Read the data of a page, and the read errors.
+
+    Raise `DataError` and `LogError` as `make_report` does.
+    """
     first, count, zone = period
     days = [first + timedelta(days=number) for number in range(count)]
     check_day(logs, days[0], days[-1], zone)
@@ -127,13 +144,7 @@ def make_report(  # noqa: PLR0913
         networks=network_changes(logs.between(since, close[1]), zone),
         hidden=data.never_told,
     )
-    text = day_page(account) if count == 1 else week_page(account)
-    with ExitStack() as files:
-        html, *png = [files.enter_context(new_file(path)) for path in paths]
-        html.write_text(text, "utf-8")
-        if draw is not None:
-            draw(png[0], account.days, account.earlier)
-    return WrittenReport(page, None if draw is None else picture, data.losses)
+    return account, data.losses
 
 
 def _model(logs: HomeLogs, close: tuple[int, int]) -> str:

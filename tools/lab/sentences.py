@@ -1,0 +1,635 @@
+"""`python -m hearthlog.tools.lab.sentences HOME …`: whether what people are told of a day is so.
+
+Each statement of the report of a day, of the page of the home and of `info` is compared with the
+table of the true sounds of a composed home, `events.csv`: start, end, label, and from whom.
+
+A statement holds if the truth is within its range, for a count with one; within a fifth or within
+one of it, for another count, minutes or hours; within a minute, for a time; and without sounds that
+count, for a quiet stretch. What is only said to be labelled so is not false; it is counted apart.
+"""
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from datetime import UTC, date
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import typer
+
+from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics
+from hearthlog.analyzer.activity.event_counts import MINUTE
+from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
+from hearthlog.analyzer.bridge.page.past_days import PastDays
+from hearthlog.analyzer.bridge.page.sounds import ShownBouts, bouts, events_between
+from hearthlog.analyzer.bridge.settings import RecorderAddress
+from hearthlog.analyzer.bridge.wording import ENGLISH
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.local_time import MORNING, at_hour
+from hearthlog.analyzer.logs.spans import NONE, Spans, common, cut, joined, lengths, one
+from hearthlog.analyzer.logs.summary import summarise
+from hearthlog.analyzer.report.headline import LIVELY_MINUTES
+from hearthlog.analyzer.report.page import day_page
+from hearthlog.analyzer.report.report import Period, read_account
+from hearthlog.analyzer.report.report_data import (
+    ASSESSED_ITEMS,
+    Account,
+    minutes_figure,
+    sections,
+)
+from hearthlog.analyzer.report.wording import several_in_words
+from hearthlog.models.classes import (
+    COUGHING,
+    SILENCE,
+    UNKNOWN,
+    in_words,
+)
+from hearthlog.tools.cli.info_summary import Overview
+from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.true_day import NEAR, TrueDay, TrueSound, read_sounds, true_day
+
+HOLDS, LABELLED, FALSE = "holds", "as labelled", "false"
+REPORT, PAGE, INFO = "report", "page", "info"
+_TOLERANCE = 0.2
+_COMPANY = 15 * MINUTE  # a television is known by the ten minutes around
+_SURE = 0.9
+_NO_SOUNDS = {SILENCE, UNKNOWN}
+_SHORTEST = MINUTE // 60  # of a sound that breaks a quiet stretch
+_MODEST = re.compile(r"labelled|up to|perhaps|may be")
+_CLOCK = re.compile(r"\b([0-2]\d:[0-5]\d)\b")
+_RUN = re.compile(r"\b([0-2]\d:[0-5]\d) to ([0-2]\d:[0-5]\d)\b")
+_WORDS = (
+    *("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"),
+    *("eleven", "twelve", "once", "twice"),
+)
+_NUMBERS = dict(zip(_WORDS, [*range(13), 1, 2], strict=True))
+_NUMBER = rf"(?:\d+|{'|'.join(_NUMBERS)})"
+_COUNT = re.compile(rf"({_NUMBER})(?: to ({_NUMBER}))?(?: times)?", re.IGNORECASE)
+_LENGTH = re.compile(r"(?:(\d+) h )?([\d.]+) (min|s|h)\b")
+
+
+class Statement(NamedTuple):
+    """What people are told, and what is true.
+
+    Attributes
+    ----------
+    surface : str
+        `report`, `page` or `info`.
+    verdict : str
+        `HOLDS`, `LABELLED` (wrong, if it did not say that it is as labelled) or `FALSE`.
+    is_range : bool
+        Whether it is a count with a range.
+    """
+
+    surface: str
+    text: str
+    truth: str
+    verdict: str
+    is_range: bool = False
+
+
+class _Page(HTMLParser):
+    """The texts of a page: its headline, paragraphs, and rows of its tables below their titles."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.paragraphs: list[tuple[str, str]] = []  # class of the paragraph or its section; text
+        self.rows: list[tuple[str, list[str], list[str]]] = []  # title, heads, cells
+        self._open: list[tuple[str, str]] = []
+        self._text: list[str] = []
+        self._title, self._heads, self._cells = "", list[str](), list[str]()
+        self.feed(text.split("</figure>", 1)[0].split("<figure", 1)[0])
+        self.feed(text.split("</figure>", 1)[-1])
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Begin an element."""
+        kind = dict(attrs).get("class") or ""
+        if tag in {"section", "footer"}:
+            self._open.append((tag, kind or tag))
+        elif tag in {"p", "h2", "th", "td"}:
+            self._text = []
+            self._open.append((tag, kind))
+        elif tag == "small":
+            self._text.append(" | ")
+
+    def handle_data(self, data: str) -> None:
+        """Add text."""
+        self._text.append(data)
+
+    def handle_endtag(self, tag: str) -> None:
+        """End an element."""
+        if not self._open or self._open[-1][0] != tag:
+            if tag == "thead":
+                self._heads, self._cells = self._cells, []
+            elif tag == "tr" and self._cells and self._open[-1:] != [("table", "")]:
+                if self._heads:
+                    self.rows.append((self._title, self._heads, self._cells))
+                    self._cells = []
+            elif tag == "table":
+                self._heads = []
+            return
+        _, kind = self._open.pop()
+        text = " ".join("".join(self._text).split())
+        if tag == "h2":
+            self._title = text
+        elif tag == "p":
+            outer = self._open[-1][1] if self._open else ""
+            self.paragraphs.append((kind or outer or self._title, text))
+        elif tag in {"th", "td"}:
+            self._cells.append(text)
+
+
+def is_modest(text: str) -> bool:
+    """Whether a text says that it is only as labelled."""
+    return bool(_MODEST.search(text))
+
+
+def is_close(number: float, true: float) -> bool:
+    """Whether a number without a range is true: within a fifth, or within one."""
+    return abs(number - true) <= max(1.0, _TOLERANCE * true)
+
+
+def read_count(text: str) -> tuple[int, int] | None:
+    """Read a count or its range: `4 to 9 (12 labelled)`, `8`, `twice`; None if there is none."""
+    match = _COUNT.match(text.strip())
+    if match is None:
+        return None
+    low, high = (_number(each) for each in (match[1], match[2] or match[1]))
+    return low, high
+
+
+def read_minutes(text: str) -> float | None:
+    """Read a length of time in minutes: `1 h 05 min`, `under 1 min`; None if there is none."""
+    match = _LENGTH.search(text)
+    if match is None:
+        return None
+    number = float(match[2]) * {"min": 1, "s": 1 / 60, "h": 60}[match[3]]
+    return 60 * int(match[1] or 0) + number * (0.5 if "under" in text else 1)
+
+
+def _number(text: str) -> int:
+    return int(text) if text.isdigit() else _NUMBERS[text.lower()]
+
+
+def _judged(surface: str, text: str, truth: str, *, right: bool, modest: bool) -> Statement:
+    return Statement(surface, text, truth, HOLDS if right else LABELLED if modest else FALSE)
+
+
+def _counted(
+    surface: str, text: str, said: tuple[int, int], true: float, *, modest: bool
+) -> Statement:
+    low, high = said
+    if low == high:
+        return _judged(surface, text, f"{true:g}", right=is_close(low, true), modest=modest)
+    right = low <= true <= high
+    return Statement(surface, text, f"{true:g}", HOLDS if right else FALSE, is_range=True)
+
+
+def _lasted(surface: str, text: str, said: float, true: float, *, modest: bool) -> Statement:
+    return _judged(surface, text, f"{true:.1f} min", right=is_close(said, true), modest=modest)
+
+
+def _at_times(
+    surface: str, text: str, name: str, clocks: Sequence[str], truth: TrueDay, *, modest: bool
+) -> Statement:
+    wrong = [each for each in clocks if not _is_true_time(truth, name, each)]
+    said = f"none at {', '.join(wrong)}" if wrong else "so it is"
+    return _judged(surface, text, said, right=not wrong, modest=modest)
+
+
+def _is_true_time(truth: TrueDay, name: str, clock: str) -> bool:
+    day = truth.metrics
+    times = [_time(day, clock), _time(day, clock) - 24 * HOUR]  # the evening before
+    return any(truth.near(name, time) for time in times)
+
+
+def _time(day: DayMetrics, clock: str) -> int:
+    hours, minutes = map(int, clock.split(":"))
+    return int(day.span.starts[0]) + hours * HOUR + minutes * MINUTE
+
+
+def report_statements(
+    account: Account, truth: TrueDay, before: Sequence[TrueDay]
+) -> Iterator[Statement]:
+    """Yield the statements of the report of a day.
+
+    Parameters
+    ----------
+    before : sequence of TrueDay
+        The days before, as far as they are heard, for the assessment of three days.
+    """
+    day, page = account.days[0], _Page(day_page(account))
+    for kind, text in page.paragraphs:
+        yield from _paragraph(kind, text, day, truth)
+    figures = {
+        (part.title, figure.title): figure
+        for part in sections(day.home.classes)
+        for figure in part.figures
+    }
+    for title, heads, cells in page.rows:
+        if title == "What was heard":
+            yield from _heard(heads, cells, day, truth)
+        elif (title, cells[0]) in figures:
+            yield from _figure(figures[title, cells[0]].value(truth.metrics), title, cells)
+        elif title.startswith("For the interRAI"):
+            yield from _assessed(heads, cells, [*before, truth])
+
+
+def _paragraph(kind: str, text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
+    if kind == "headline":
+        yield from _headline(text, truth)
+    elif kind == "gist":
+        yield from _gist(text, day, truth)
+    elif text.startswith("The longest quiet stretch"):
+        yield _quiet(text, truth)
+    elif text.startswith(("Coughing in the night", "Bouts of coughing in the night")):
+        yield from _night_coughs(text, truth)
+    elif text.startswith("Listened for"):
+        names = [n for n in day.home.classes if _mentions(text.partition(":")[2], n)]
+        for name in names:
+            yield _counted(
+                REPORT,
+                f"never labelled: {in_words(name)}",
+                (0, 0),
+                _count(truth, name),
+                modest=True,
+            )
+
+
+def _sounds_of(day: DayMetrics) -> list[str]:
+    return [name for name in day.home.classes if name not in _NO_SOUNDS]
+
+
+def _mentions(text: str, name: str) -> bool:
+    words = {in_words(name), several_in_words(name).removeprefix("Bouts of ")}
+    return any(re.search(rf"\b{re.escape(each.lower())}\b", text.lower()) for each in words)
+
+
+def _count(truth: TrueDay, name: str) -> float:
+    value = truth.metrics.count(name)
+    return 0 if value is None else value.labelled
+
+
+def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
+    day, first, *rest = truth.metrics, *re.split(r"(?<=\.) ", text)
+    hours, modest = day.sound_by_hour, is_modest(first)
+    lively = hours >= LIVELY_MINUTES
+    if runs := _RUN.findall(first):
+        told = np.zeros(len(hours), bool)
+        for start, end in runs:
+            told[int(start[:2]) : int(end[:2])] = True
+        slack = 1 + _TOLERANCE
+        wrong = (told & (hours * slack < LIVELY_MINUTES)) | (
+            ~told & (hours > LIVELY_MINUTES * slack)
+        )
+        yield _judged(
+            REPORT,
+            first,
+            f"wrong at {np.flatnonzero(wrong).tolist()} h",
+            right=not wrong.any(),
+            modest=modest,
+        )
+    elif match := re.search(r"sound in (\d+) of|for (\w+) hours", first):
+        said = _number(match[1] or match[2])
+        yield _counted(REPORT, first, (said, said), int(lively.sum()), modest=modest)
+    elif "quiet" in first:
+        yield _judged(
+            REPORT, first, f"{lively.sum()} hours with sound", right=not lively.any(), modest=modest
+        )
+    for sentence in rest:
+        yield from _counts_in(REPORT, sentence, truth)
+
+
+def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statement]:
+    """Check counts of classes in a sentence: of the night, after 07:00, or of the day."""
+    day = truth.metrics
+    after = one(int(day.night.ends[0]), int(day.span.ends[0]))
+    names = [name for name in _sounds_of(day) if _mentions(sentence, name)]
+    for name in names:
+        words = "|".join({re.escape(w.lower()) for w in (in_words(name), several_in_words(name))})
+        for part in re.split(r" and (?=\w+ after 07:00)", sentence):
+            bare = re.sub(r"\([^)]*\)", "", part)
+            match = re.search(
+                rf"(?:{words}) ({_NUMBER})(?: times)?", bare, re.IGNORECASE
+            ) or re.search(
+                rf"({_NUMBER})(?: to ({_NUMBER}))?"
+                rf"(?= (?:bouts? of |times of )?(?:{words})| after| in the)",
+                bare,
+                re.IGNORECASE,
+            )
+            if match is None:
+                continue
+            low = _number(match[1])
+            high = _number(match[2]) if match.lastindex == 2 else low
+            span = day.night if "night" in part else after if "07:00" in part else day.span
+            true = day.home.minutes.between(span).count(name, None).labelled
+            modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
+            yield _counted(surface, part, (low, high), true, modest=modest)
+            if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
+                yield _at_times(surface, part, name, clocks, truth, modest=modest)
+
+
+def _gist(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
+    true, modest = truth.metrics, is_modest(text)
+    if match := re.search(r"Most of the sound[^:]*: (.*)\.", text):
+        names = [name for name in day.home.classes if name != SILENCE]
+        lasting = sorted(names, key=lambda name: -_minutes(true, name))
+        said = [name for name in names if _mentions(match[1], name)]
+        shown = ", ".join(f"{in_words(n)} {_minutes(true, n):.0f}" for n in lasting[: len(said)])
+        yield _judged(REPORT, text, shown, right={*said} == {*lasting[: len(said)]}, modest=modest)
+    elif "It was quiet." in text:
+        yield _judged(
+            REPORT, text, f"{_sound(true):.1f} min", right=_sound(true) <= 2, modest=modest
+        )
+    elif "television" in text and (runs := _RUN.findall(text)):
+        for run_ in runs:
+            start, end = (_time(true, each) for each in run_)
+            end += 24 * HOUR * (end < start)
+            wide = joined(truth.television.starts - _COMPANY, truth.television.ends + _COMPANY)
+            inside = cut(wide, start, end).length / max(end - start, 1)
+            told = f"{' to '.join(run_)}: {text}"
+            yield _judged(
+                REPORT, told, f"{inside:.0%} of it", right=inside >= 1 - _TOLERANCE, modest=modest
+            )
+    elif text.startswith("In the night"):
+        yield from _counts_in(REPORT, text, truth)
+        if (said := read_minutes(text)) is not None and true.night_sound is not None:
+            yield _lasted(REPORT, text, said, true.night_sound.minutes, modest=modest)
+    elif match := re.search(r"only short sounds", text):
+        before = re.search(r"until (\d\d:\d\d)", text)
+        after = re.search(r"after (\d\d:\d\d)", text)
+        spans = [(int(true.span.starts[0]), _time(true, before[1]))] if before else []
+        spans += [(_time(true, after[1]) + MINUTE, int(true.span.ends[0]))] if after else []
+        most = max(_busiest(true.home.sound, start, end) for start, end in spans)
+        yield _judged(
+            REPORT,
+            text,
+            f"at most {most:.1f} of ten minutes",
+            right=most <= 1 + _TOLERANCE,
+            modest=modest,
+        )
+
+
+def _busiest(sound: Spans, start: int, end: int) -> float:
+    """Return the most minutes of sound in ten minutes of a span."""
+    edges = np.arange(start, max(end, start + 1), 10 * MINUTE)
+    return float(max(lengths(sound, np.append(edges, end)) / MINUTE)) if end > start else 0.0
+
+
+def _minutes(day: DayMetrics, name: str) -> float:
+    return common(day.home.spans.get(name, NONE), day.span).length / MINUTE
+
+
+def _sound(day: DayMetrics) -> float:
+    return common(day.home.sound, day.span).length / MINUTE
+
+
+def _quiet(text: str, truth: TrueDay) -> Statement:
+    """Check that no sound of a second lies in a quiet stretch, a minute at its ends aside."""
+    day = truth.metrics
+    start, end = (_time(day, each) for each in _CLOCK.findall(text)[:2])
+    inside = cut(day.home.sound, start + NEAR, end - NEAR)
+    long = int((inside.ends - inside.starts >= _SHORTEST).sum())
+    return _judged(
+        REPORT,
+        text,
+        f"{long} sounds, {inside.length / MINUTE:.1f} min",
+        right=not long,
+        modest=is_modest(text),
+    )
+
+
+def _night_coughs(text: str, truth: TrueDay) -> Iterator[Statement]:
+    modest = is_modest(text)
+    if hours := re.findall(r"(\d+) after (\d\d):00", text):
+        for number, hour in hours:
+            start = _time(truth.metrics, f"{hour}:00") - 24 * HOUR * (int(hour) >= 22)
+            starts = truth.everywhere.home.events.get(COUGHING, NONE.starts)
+            true = int(((starts >= start) & (starts < start + HOUR)).sum())
+            yield _counted(
+                REPORT, f"{number} after {hour}:00", (int(number),) * 2, true, modest=modest
+            )
+    else:
+        yield _at_times(REPORT, text, COUGHING, _CLOCK.findall(text)[-16:], truth, modest=modest)
+
+
+def _heard(
+    heads: Sequence[str], cells: Sequence[str], day: DayMetrics, truth: TrueDay
+) -> Iterator[Statement]:
+    """Check a row of the table of sounds: how often, when and how long."""
+    name = next(
+        (n for n in [*_sounds_of(day), SILENCE] if in_words(n) == cells[0].partition(" | ")[0]),
+        None,
+    )
+    if name is None:
+        return
+    often, when, lasting = cells[1:4]
+    where = f"{cells[0]}: "
+    if (said := read_count(often.partition(" | ")[0])) is not None:
+        modest = is_modest(heads[1] + cells[0] + re.sub(r"\(\d+ labelled\)", "", often))
+        yield _counted(REPORT, where + often, said, _count(truth, name), modest=modest)
+    if clocks := _CLOCK.findall(when):
+        yield _at_times(
+            REPORT, where + when, name, clocks, truth, modest=is_modest(heads[2] + when)
+        )
+    if (minutes := read_minutes(lasting.partition(" | ")[0])) is not None:
+        value = minutes_figure(name).value(truth.metrics)
+        true = 0 if value is None else value.middle
+        yield _lasted(REPORT, where + lasting, minutes, true, modest=is_modest(heads[3] + lasting))
+
+
+def _figure(value: object, title: str, cells: Sequence[str]) -> Iterator[Statement]:
+    text, shown = f"{title}, {cells[0]}: {cells[1]}", cells[1].partition(" | ")[0]
+    modest = is_modest(cells[0] + re.sub(r"\(\d+ labelled\)", "", cells[1]))
+    middle = getattr(value, "middle", 0)
+    if _CLOCK.fullmatch(shown):
+        hours, minutes = map(int, shown.split(":"))
+        right = abs(60 * hours + minutes - middle) <= 10
+        yield _judged(REPORT, text, getattr(value, "text", "never"), right=right, modest=modest)
+    elif (lasting := read_minutes(shown)) is not None:
+        yield _lasted(REPORT, text, lasting, middle, modest=modest)
+    elif (said := read_count(shown)) is not None:
+        yield _counted(REPORT, text, said, middle, modest=modest)
+
+
+def _assessed(
+    heads: Sequence[str], cells: Sequence[str], days: Sequence[TrueDay]
+) -> Iterator[Statement]:
+    item = next((each for each in ASSESSED_ITEMS if each.topic == cells[0]), None)
+    if item is None:
+        return
+    values = [item.value(day.metrics) for day in days]
+    true = sum(value.middle for value in values if value is not None)
+    text = f"interRAI, {cells[0]}: {cells[2]}"
+    modest = is_modest(heads[2] + re.sub(r"\(\d+ labelled\)", "", cells[2]))
+    if (lasting := read_minutes(cells[2])) is not None:
+        yield _lasted(REPORT, text, lasting, true, modest=modest)
+    elif (said := read_count(cells[2])) is not None:
+        yield _counted(REPORT, text, said, true, modest=modest)
+
+
+def page_statements(home: HomeDay, truth: TrueDay) -> Iterator[Statement]:
+    """Yield the statements of the page of the home about a past day, and of its morning."""
+    picture = picture_of(home)
+    yield from _page_sentence(picture["sentence"], home, truth, truth.everywhere.span)
+    morning = home._replace(
+        moment=home.moment._replace(now=at_hour(truth.metrics.day, MORNING, home.zone) + HOUR),
+        is_past=False,
+    )
+    yield from _page_sentence(picture_of(morning)["sentence"], home, truth, truth.everywhere.night)
+    for lane in (each for each in picture["rooms"][0]["lanes"] if each["label"] != UNKNOWN):
+        name, modest = lane["label"], is_modest(lane["told"])
+        for key, span, what in (
+            ("today", truth.metrics.span, "today"),
+            ("night", truth.metrics.night, "last night"),
+        ):
+            if lane[key] is not None:
+                text = f"{lane['words']}, {what}: {lane[key]}"
+                yield _counted(
+                    PAGE, text, (lane[key],) * 2, _of_page(truth, lane, name, span), modest=modest
+                )
+        times = [time for time, *_ in lane["times"][0]["times"]]
+        if times and len(times) <= 5:
+            text = f"{lane['words']} at {', '.join(times)}"
+            yield _at_times(PAGE, text, name, times, truth, modest=modest)
+    yield from _sureness(home, truth)
+
+
+def _of_page(truth: TrueDay, lane: object, name: str, span: Spans) -> int:
+    """Count the true events; beside a television only if the page does not set those apart."""
+    metrics = truth.metrics if "television" in str(lane) else truth.everywhere
+    return metrics.home.minutes.between(span).count(name, None).labelled
+
+
+def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Iterator[Statement]:
+    day, modest = truth.everywhere, is_modest(text)
+    if "television" in text:
+        day = truth.metrics
+    minutes = day.home.minutes.between(span)
+    names = [n for n in home.microphones[0].names if n not in _NO_SOUNDS and _mentions(text, n)]
+    if match := re.search(r"[Nn]o ([^.:(]*)\.$", text):
+        for name in (n for n in names if _mentions(match[1], n)):
+            true = minutes.count(name, None).labelled
+            yield _counted(PAGE, f"{text} [{in_words(name)}]", (0, 0), true, modest=modest)
+        return
+    if "quiet night" in text:
+        sound = common(day.home.sound, span).length / MINUTE
+        limit = (1 + _TOLERANCE) * 0.01 * span.length / MINUTE
+        yield _judged(PAGE, text, f"{sound:.1f} min of sound", right=sound <= limit, modest=modest)
+    for name in names:
+        words = re.escape(in_words(name).lower())
+        match = re.search(rf"{words} ({_NUMBER})(?: times)?(?: \(([^)]*)\))?", text, re.IGNORECASE)
+        if match is None:
+            continue
+        said = _number(match[1])
+        yield _counted(
+            PAGE,
+            f"{text} [{in_words(name)}]",
+            (said, said),
+            minutes.count(name, None).labelled,
+            modest=modest,
+        )
+        if clocks := _CLOCK.findall(match[2] or ""):
+            yield _at_times(PAGE, f"{text} [{in_words(name)}]", name, clocks, truth, modest=modest)
+
+
+def _sureness(home: HomeDay, truth: TrueDay) -> Iterator[Statement]:
+    """Check how many of the sounds that are said to be sure are right."""
+    events = events_between(home.microphones, home.moment.midnight, home.moment.now + 1)
+    shown = ShownBouts(home.moment.now, home.zone, ENGLISH, lambda _: "", is_alone=True)
+    found: defaultdict[str, list[bool]] = defaultdict(list)
+    for bout in bouts(events):
+        words = re.sub(r" *\(.*", "", shown.describe(bout)["sure"])
+        spans = truth.everywhere.home.spans.get(bout.first.label, NONE)
+        found[words].append(any(cut(spans, e.start, e.end).length for e in bout.events))
+    for words, right in found.items():
+        text = f"{len(right)} sounds {words or 'without a word'}"
+        share = sum(right) / len(right)
+        holds = words != "sure" or share >= _SURE or sum(right) == len(right)
+        yield _judged(PAGE, text, f"{sum(right)} are of their class", right=holds, modest=False)
+
+
+def info_statements(
+    logs: Sequence[Path], sounds: Sequence[TrueSound], day: DayMetrics
+) -> Iterator[Statement]:
+    """Yield the statements of the first lines of `info` about the logs of a day."""
+    summary = summarise(logs)
+    true = true_day(sounds, day).everywhere
+    for line in Overview(summary, day.zone).lines(None):
+        for name in (n for n in _sounds_of(day) if _mentions(line, n)):
+            words = re.escape(in_words(name).lower())
+            match = re.search(rf"{words} ((?:\d+ h )?[\d.]+ (?:min|s|h)\b)", line, re.IGNORECASE)
+            if match is not None:
+                said = read_minutes(match[1])
+                assert said is not None
+                text = f"{in_words(name)} {match[1]}"
+                yield _lasted(INFO, text, said, _minutes(true, name), modest=is_modest(line))
+
+
+def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
+    """Yield the statements about each day of a composed home with logs, heard for the most part.
+
+    Raise `DataError` if the table of true sounds cannot be read, and as a report does.
+    """
+    logs = find_home_logs([home / "logs"])
+    entries = logs.between()
+    sounds = read_sounds(home, entries[0].start)
+    before: list[TrueDay] = []
+    for day in logs.days(UTC):
+        account, _ = read_account(logs, Period(day, 1, UTC))
+        labelled = account.days[0]
+        if labelled.share < 0.75:
+            continue
+        truth = true_day(sounds, labelled)
+        own = [
+            e.path for e in entries if labelled.span.starts[0] <= e.start < labelled.span.ends[0]
+        ]
+        past = PastDays(RecorderAddress(home / "logs", entries[0].node, UTC)).read(day, frozenset())
+        page = HomeDay(
+            [*past.state.microphones.values()], past.moment, UTC, past.listened, is_past=True
+        )
+        yield (
+            day,
+            [
+                *report_statements(account, truth, before[-2:]),
+                *page_statements(page, truth),
+                *info_statements(own, sounds, labelled),
+            ],
+        )
+        before.append(truth)
+
+
+def main(
+    homes: Annotated[list[Path], typer.Argument(help="Folders with logs and events.csv.")],
+    *,
+    only_false: Annotated[bool, typer.Option("--false", help="Print only what is false.")] = False,
+) -> None:
+    """Compare what people are told of the days of composed homes with what is true."""
+    total: Counter[tuple[str, str]] = Counter()
+    ranges: list[bool] = []
+    for home in homes:
+        for day, found in statements(home):
+            print(f"\n{home.name}, {day}")
+            for one_ in found:
+                if not only_false or one_.verdict == FALSE:
+                    print(f"  {one_.surface:7}{one_.verdict:12}{one_.text[:110]:112}{one_.truth}")
+            for surface in dict.fromkeys(one_.surface for one_ in found):
+                verdicts = Counter(one_.verdict for one_ in found if one_.surface == surface)
+                total.update({(surface, verdict): n for verdict, n in verdicts.items()})
+                parts = ", ".join(f"{verdicts[v]} {v}" for v in (HOLDS, LABELLED, FALSE))
+                print(f"  {surface}: {verdicts.total()} statements: {parts}")
+            ranges += [one_.verdict == HOLDS for one_ in found if one_.is_range]
+    print()
+    for surface in (REPORT, PAGE, INFO):
+        of = [total[surface, verdict] for verdict in (HOLDS, LABELLED, FALSE)]
+        print(
+            f"{surface:7} {sum(of):4} statements: {of[0]} hold, {of[1]} as labelled, {of[2]} false"
+        )
+    if ranges:
+        print(f"counts with a range: {sum(ranges)} of {len(ranges)} hold")
+
+
+if __name__ == "__main__":
+    run(main)
