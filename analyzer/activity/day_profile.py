@@ -30,6 +30,7 @@ from hearthlog.models.classes import (
     COUGHING,
     CRYING,
     FLUSHING_WATER,
+    OBJECTS_ACTIVITY,
     OTHER,
     SILENCE,
     TAP_WATER,
@@ -78,6 +79,8 @@ def stretches(sound: Spans, night: Spans) -> int:
 COUNT, LENGTH, CLOCK = "count", "minutes", "clock"
 STRETCHES, SOUND, FIRST, LAST, QUIET = "stretches", "sound", "first", "last", "quiet"
 BINS = 48  # of a day: half hours
+# Household sounds are a length here, and a length is as labelled, also beside a television.
+_APART = tuple(name for name in SET_APART if name != OBJECTS_ACTIVITY)
 _NAMELESS = {SILENCE, OTHER, UNKNOWN}
 _AT_NIGHT = (FLUSHING_WATER, TAP_WATER, COUGHING, CRYING, YELLING)
 _LEAST = 0.9  # recorded share of a span for its figures to be present
@@ -166,18 +169,18 @@ class Profiles:
         self._night_ends = _ONE if night_after else timedelta(0)
         names = [name for name in home.listened if name not in _NAMELESS]
         self.figures = list(_figures(names))
-        self.classes = [name for name in names if name not in SET_APART]
+        self.classes = [name for name in names if name not in _APART]
         self._listened = dict(home.listened)
         self._coverage = joined(labels.starts, labels.ends)
         loud = labels.labels != SILENCE
         self._sound = joined(labels.starts[loud], labels.ends[loud])
         self._starts = joined(*self._sound, EVENT_PAUSE).starts
-        beside = _television(labels) if set(names) & set(SET_APART) else NONE
+        beside = _television(labels) if set(names) & set(_APART) else NONE
         self._spans, self._events = dict[str, Spans](), dict[str, Spans]()
         for name in names:
             own = labels.labels == name
             spans, events = joined(labels.starts[own], labels.ends[own]), events_of(labels, name)
-            if name in SET_APART:
+            if name in _APART:
                 spans, events = without(spans, beside), _outside(events, beside)
             self._spans[name], self._events[name] = spans, events
 

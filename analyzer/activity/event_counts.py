@@ -8,16 +8,29 @@ import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined, lengths
-from hearthlog.models.classes import COUGHING, CRYING, LAUGHING, SILENCE, YELLING
+from hearthlog.models.classes import (
+    COUGHING,
+    CRYING,
+    LAUGHING,
+    MUSIC,
+    OBJECTS_ACTIVITY,
+    PHONE_RING,
+    SILENCE,
+    SPEECH,
+    YELLING,
+)
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
 MINUTE = 60 * NANOSECONDS
-SET_APART = (COUGHING, CRYING, LAUGHING, YELLING)  # which also occur on a television
+# Not counted beside a television: what also occurs on one, and what a model takes its sounds for.
+SET_APART = (COUGHING, CRYING, YELLING, PHONE_RING, LAUGHING, OBJECTS_ACTIVITY)
 AROUND = 10  # minutes before and after, in which a television would still be on
 _ALONE = (SILENCE, COUGHING, CRYING, YELLING)  # long crying is no television
 _SHARE = 0.1  # of the time
 _CHANGES = 2  # in a minute
+_VOICES = (SPEECH, MUSIC, LAUGHING)  # of a television, however sparse
+_VOICED = 0.4  # of the minutes
 
 
 def events_of(labels: Labelling, name: str) -> Spans:
@@ -45,9 +58,10 @@ def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:
 def television_minutes(labels: Labelling, edges: Int64) -> Bool:
     """Return which minutes resemble a television, a radio or company.
 
-    In the ten minutes before and after, two sounds a minute start, and sounds other than coughing,
-    crying and shouting fill a tenth of the time. Their classes do not matter, because a model may
-    take a television for anything.
+    In the ten minutes before and after, either talking, music or laughing sounds in more than two
+    of five minutes; or two sounds a minute start, and sounds other than coughing, crying and
+    shouting fill a tenth of the time. The classes of these do not matter, because a model may take
+    a television for anything.
 
     Parameters
     ----------
@@ -58,13 +72,16 @@ def television_minutes(labels: Labelling, edges: Int64) -> Bool:
     -------
     np.ndarray [shape=(n,)], bool
     """
-    others = ~np.isin(labels.labels, _ALONE)
-    filled = lengths(joined(labels.starts[others], labels.ends[others]), edges)
-    begun = np.diff(np.searchsorted(labels.starts[labels.labels != SILENCE], edges))
     minutes = 2 * AROUND + 1
-    much = _around(filled) > _SHARE * minutes * MINUTE
+
+    def sounding(which: Bool) -> Int64:
+        return lengths(joined(labels.starts[which], labels.ends[which]), edges)
+
+    voiced = (sounding(np.isin(labels.labels, _VOICES)) > 0).astype(np.int64)
+    begun = np.diff(np.searchsorted(labels.starts[labels.labels != SILENCE], edges))
+    much = _around(sounding(~np.isin(labels.labels, _ALONE))) > _SHARE * minutes * MINUTE
     television: Bool = much & (_around(begun) > _CHANGES * minutes)
-    return television
+    return television | (_around(voiced) > _VOICED * minutes)
 
 
 def _around(amounts: Int64) -> Int64:
