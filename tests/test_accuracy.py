@@ -26,6 +26,7 @@ from hearthlog.analyzer.activity.event_counts import (
     television_minutes,
 )
 from hearthlog.analyzer.activity.home_data import read_home
+from hearthlog.analyzer.activity.sureness import UNMEASURED, measured_sureness, read_sureness
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span
@@ -517,3 +518,36 @@ def test_what_is_missed_in_a_quiet_minute_stands_for_more_than_in_one_with_sound
     assert checked.miss_rate(accuracy.weight)[1] > 0.9
     whole = ClassCheck(40, 30, 50, 20, 2)
     assert whole.miss_rate(10)[0] > whole.miss_rate(1)[0]
+
+
+def confidences(*groups):
+    """Confidences, and whether they are right, of groups of (confidence, right, wrong)."""
+    pairs = [(c, r) for c, good, bad in groups for r in [True] * good + [False] * bad]
+    return np.array([c for c, _ in pairs]), np.array([r for _, r in pairs], bool)
+
+
+@pytest.mark.parametrize(
+    ("groups", "words"),
+    [
+        ([], ["", "", "not sure"]),
+        ([(0.95, 5, 0)], ["", "", "not sure"]),
+        ([(0.95, 20, 0), (0.8, 9, 6), (0.4, 3, 9)], ["sure", "fairly sure", "not sure"]),
+        ([(0.95, 12, 8), (0.8, 9, 6)], ["", "", "not sure"]),
+        ([(0.95, 16, 3), (0.8, 5, 7)], ["fairly sure", "not sure", "not sure"]),
+        ([(0.95, 10, 0), (0.5, 30, 0)], ["sure", "sure", "sure"]),
+    ],
+)
+def test_sure_is_a_word_for_what_was_right_nine_times_in_ten_in_the_home(groups, words):
+    home = measured_sureness(*confidences(*groups))
+    assert [home.word(confidence) for confidence in (0.95, 0.8, 0.5)] == words
+
+
+def test_a_home_without_checked_minutes_is_sure_of_nothing(tmp_path):
+    sounds = [(at(f"{h:02}:00:05"), 2, "coughing", 0.99) for h in range(8, 20)]
+    logs = write_day(tmp_path, DAY, sounds)
+    end = START + 86_400 * NANOSECONDS
+    assert read_sureness(find_home_logs([tmp_path]), 0, end) == UNMEASURED
+    for hour in range(8, 20):
+        check(logs, at(f"{hour:02}:00"))
+    home = read_sureness(find_home_logs([tmp_path]), 0, end)
+    assert (home.word(0.995), home.word(0.9)) == ("sure", "not sure")

@@ -93,20 +93,25 @@ NIGHT = [(2.17, 3, "coughing"), (6.22, 3, "coughing")]
 @pytest.mark.parametrize(
     ("hour", "hours", "sounds", "sentence"),
     [
-        (9, (-3, 9), NIGHT, "A quiet night: coughing twice (02:10 and 06:13)."),
-        (9, (-3, 9), [], "A quiet night."),
-        (3, (-3, 3), NIGHT[:1], "A quiet night so far: coughing once (02:10)."),
-        (9, (5, 9), NIGHT[1:], "Last night was not listened to throughout: coughing once (06:13)."),
+        (9, (-3, 9), NIGHT, "A quiet night: coughing twice (02:10 and 06:13), by the sound of it."),
+        (9, (-3, 9), [], "A quiet night, by the sound of it."),
+        (3, (-3, 3), NIGHT[:1], "A quiet night so far: coughing once (02:10), by the sound of it."),
+        (
+            9,
+            (5, 9),
+            NIGHT[1:],
+            "Last night was not listened to throughout: coughing once (06:13), by the sound of it.",
+        ),
         (9, (5, 9), [], "Last night was not listened to throughout."),
         (
             9,
             (-3, 9),
             [(1 + number / 10, 3, "coughing") for number in range(9)],
-            "Last night: coughing 9 times (01:00 to 01:48).",
+            "Last night: coughing 9 times (01:00 to 01:48), by the sound of it.",
         ),
-        (9, (-3, 9), [(1, 1800, "speech")], "Last night: talking once."),
-        (14, (-3, 14), [(10, 3, "coughing")], "Today: coughing once (10:00)."),
-        (14, (-3, 14), [], "Today: no coughing or crying."),
+        (9, (-3, 9), [(1, 1800, "speech")], "Last night: talking once, by the sound of it."),
+        (14, (-3, 14), [(10, 3, "coughing")], "Today: coughing once (10:00), by the sound of it."),
+        (14, (-3, 14), [], "Today: no coughing or crying, by the sound of it."),
         (14, (9, 14), [], "Today was not listened to throughout."),
     ],
 )
@@ -135,6 +140,18 @@ def test_a_night_is_quiet_if_it_is_so_in_each_room():
     coughs = [(1 + n / 2, 2, "coughing") for n in range(4)]
     rooms = {name: [tiled((-3, 9), *coughs)] for name in ("bath", "kitchen")}
     assert picture_of(home_of_rooms(9, rooms))["sentence"].startswith("A quiet night: ")
+
+
+def test_rings_and_coughs_beside_a_television_are_not_counted_and_the_lane_says_so():
+    talking = [(13 + n / 60, 3, "speech") for n in range(60)]
+    rings = [(hour, 4, "phone_ring") for hour in (9.26, 13.409, 13.609)]
+    picture = picture_of(home_at(15, tiled((-3, 15), *talking, *rings)))
+    lanes = {lane["label"]: lane for lane in picture["rooms"][0]["lanes"]}
+    ring = lanes["phone_ring"]
+    assert (ring["today"], len(ring["times"][0]["times"])) == (1, 1)
+    assert ring["told"].endswith("; twice beside something like a television, not counted")
+    assert picture["sentence"] == "Today: telephone ringing once (09:15), by the sound of it."
+    assert lanes["speech"]["today"] == 60, "talking of a television is talking"
 
 
 def test_the_counts_of_the_sentence_are_those_below_it():
@@ -443,7 +460,9 @@ def test_a_german_browser_gets_german_words_dates_and_errors(lived):
         answer = lived.ask("POST", "/mark", body, Origin=origin, **JSON, **GERMAN)
         assert (answer[0], json.loads(answer[2])["error"].startswith(text)) == (422, True)
     picture = picture_of(home_at(9, tiled((-3, 9), *NIGHT), language="de"))
-    assert picture["sentence"] == "Eine ruhige Nacht: zweimal Husten (02:10 und 06:13)."
+    assert picture["sentence"] == (
+        "Eine ruhige Nacht: zweimal Husten (02:10 und 06:13), dem Klang nach."
+    )
 
 
 def test_the_configured_language_holds_for_every_browser_and_a_missing_one_is_english(tmp_path):

@@ -11,14 +11,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.activity.event_counts import (
+    AROUND,
+    MINUTE,
+    SET_APART,
+    television_minutes,
+)
 from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, SoundEvent
 from hearthlog.analyzer.activity.segments import GrowingSpans
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.settings import RecorderAddress
+from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.never_tell import read_list
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
-from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN
+from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN, class_name
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
@@ -40,6 +47,7 @@ FIELDS = {
 _AWAY_SECONDS = 15.0  # without messages
 _DECIDED = EVENT_PAUSE + 5 * NANOSECONDS  # after the end of an event, no segment extends it
 _MOST_CLASSES = 256
+_MOST_MINUTES = 14 * 1440  # of which a television is looked for
 MOST = 0.75  # least coverage of a night for a count of 0, as in the report
 
 
@@ -94,6 +102,8 @@ class LiveMicrophone:
         self._unended: set[str] = set()  # classes with an event that may go on
         self._latest = 0  # end of the last segment, in nanoseconds of UTC
         self._coverage = GrowingSpans()  # segments tile the time that was listened to
+        self._sounds: list[tuple[int, int, str]] = []  # segments other than silence
+        self._television: tuple[int, set[int]] = (0, set())  # number of sounds; minutes with one
         self._replaced: list[SoundEvent] = []  # ended by the start of another event of the class
 
     @property
@@ -152,6 +162,8 @@ class LiveMicrophone:
         for start, duration, label, confidence in zip(*fields, strict=True):
             self._coverage.add(start, start + max(duration, 0), FRAME_NANOSECONDS)
             is_full = len(self._records) >= _MOST_CLASSES
+            if label != SILENCE:
+                self._sounds.append((start, start + max(duration, 0), label))
             if label in self._unnamed or (label not in self._records and is_full):
                 continue
             record = self._records.setdefault(label, EventRecord(self.name, label))
@@ -174,16 +186,41 @@ class LiveMicrophone:
     def counts(
         self, label: str, today: Today, known: ListeningThreshold
     ) -> tuple[int | None, int | None]:
-        """Count the events of a class that began since midnight, and those of the last night.
+        """Count the `counted` events of a class since midnight, and those of the last night.
 
         Returns
         -------
         int or None, int or None
             None in place of 0 if coverage is too low for a count of 0.
         """
-        day = len(self.events(label, today.midnight))
-        night = sum(event.start < today.morning for event in self.events(label, today.night))
+        day = len(self.counted(self.events(label, today.midnight)))
+        own = self.counted(self.events(label, today.night))
+        night = sum(event.start < today.morning for event in own)
         return day if day or known.day else None, night if night or known.night else None
+
+    def counted(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
+        """Return the events that count: `SET_APART` classes only without a television beside."""
+        apart = [event for event in events if event.label in SET_APART]
+        television = self._television_minutes() if apart else set()
+        return [
+            event
+            for event in events
+            if event.label not in SET_APART or event.start // MINUTE not in television
+        ]
+
+    def _television_minutes(self) -> set[int]:
+        """Return the minutes, since 1970, that resemble a television."""
+        number, minutes = self._television
+        if number != len(self._sounds):
+            rows = sorted(self._sounds)
+            starts, ends = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
+            labels = np.array([class_name(row[2]) for row in rows], object)
+            first, last = int(starts[0]) // MINUTE - AROUND, int(ends.max()) // MINUTE + AROUND
+            edges = np.arange(max(first, last - _MOST_MINUTES), last + 1) * MINUTE
+            found = television_minutes(Labelling(starts, ends, labels), edges)
+            minutes = set((edges[:-1][found] // MINUTE).tolist())
+            self._television = len(self._sounds), minutes
+        return minutes
 
     def known_of(self, today: Today) -> ListeningThreshold:
         """Return whether coverage of the day and the night is sufficient for a count of 0."""
@@ -226,6 +263,11 @@ class LiveMicrophone:
         for record in self._records.values():
             record.forget(before, after)
         self._coverage.forget_before(before)
+        around = AROUND * MINUTE
+        self._sounds = [
+            row for row in self._sounds if before - around <= row[1] and row[0] <= after + around
+        ]
+        self._television = 0, set()
         if self.gaps and self.gaps[0][1] < before:
             self.gaps = [gap for gap in self.gaps if gap[1] >= before]
 

@@ -7,13 +7,13 @@ from datetime import date, timedelta, tzinfo
 from functools import cache
 from importlib.resources import files
 
+from hearthlog.analyzer.activity.sureness import UNMEASURED, Sureness
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import class_name, in_words
 from hearthlog.schemas.errors import listed, printable, shortened
 
 _LONGEST = 200  # characters of a text from a log
 _LONGEST_NAME = 60
-_SURE, _FAIRLY_SURE = 0.9, 0.7
 _HEARD = {"listening", "reading"}  # diagnostic texts of a working microphone
 _FILES = "hearthlog.analyzer.bridge.page"
 _LANGUAGE = re.compile(r"([a-z]{2,3})\.json")
@@ -109,12 +109,10 @@ class Words:
         hours, rest = divmod(minutes, 60)
         return self.count("hour", hours) + (f" {self.count('minute', rest)}" if rest else "")
 
-    def sureness(self, confidence: float) -> str:
-        """Format the confidence of a model: `sure (95 %)`."""
-        key = "not sure"
-        if confidence >= _FAIRLY_SURE:
-            key = "sure" if confidence >= _SURE else "fairly sure"
-        return self.text(key, share=f"{100 * confidence:.0f}")
+    def sureness(self, confidence: float, home: Sureness = UNMEASURED) -> str:
+        """Return a word for the confidence of a model, as far as a home bears it out."""
+        word = home.word(confidence)
+        return self.text(word) if word else ""
 
     def times(self, count: int) -> str:
         """Format a count: `never`, `once`, `4 times`."""

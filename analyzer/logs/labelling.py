@@ -363,7 +363,9 @@ class Labellings:
         whole = labelling_of(join(parts))
         span = one(-NEVER if start is None else start, NEVER if end is None else end)
         spans, rows, _ = pieces(whole, span)
-        return Labelling(*spans, whole.labels[rows]) if len(rows) else None
+        if not len(rows):
+            return None
+        return Labelling(*spans, whole.labels[rows], whole.confidences[rows])
 
     def _segments(
         self, topic: str, start: int | None, end: int | None, progress: Progress
@@ -372,7 +374,8 @@ class Labellings:
         for i, log in enumerate(logs):
             progress(i / len(logs))
             try:
-                columns = read_columns([log.path], {topic}, start, fields=SEGMENT_FIELDS).get(topic)
+                fields = {*SEGMENT_FIELDS, "confidence"}
+                columns = read_columns([log.path], {topic}, start, fields=fields).get(topic)
             except LogError as error:
                 self.lose(error)
                 continue

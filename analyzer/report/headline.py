@@ -36,7 +36,7 @@ def day_headline(day: DayMetrics) -> str:
     A day is quiet if three quarters of it, and of the time from 07:00 to 22:00, were recorded,
     and if at most six of its hours have five minutes of sound or more.
     """
-    return " ".join([_day(day), *_sounds(day)])
+    return " ".join([_day(day), *_by_sound(list(_sounds(day)))])
 
 
 def week_headline(days: Sequence[DayMetrics]) -> str:
@@ -55,6 +55,7 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
         parts = [f"One of {of} days could be judged, and was {'' if quiet else 'not '}quiet."]
     else:
         parts = [f"Too little was recorded to judge any of the {of} days."]
+    sounds: list[tuple[str, bool]] = []
     for name in _WORRYING:
         counts = [(count, day) for day in known if (count := day.count(name)) and count.labelled]
         if counts:
@@ -64,8 +65,21 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
             most, day = max(counts, key=lambda pair: pair[0].labelled)
             if len(counts) > 1 and most.labelled > total.labelled / len(days):
                 text += f", most on {short_day(day.day)} ({most.labelled})"
-            parts.append(f"{_capital(text)}.")
-    return " ".join(parts)
+            sounds.append((text, total.range is not None))
+    return " ".join([*parts, *_by_sound(sounds)])
+
+
+def _by_sound(sounds: Sequence[tuple[str, bool]]) -> Iterator[str]:
+    """Yield sentences of counts: what is known, and what is only labelled so.
+
+    Parameters
+    ----------
+    sounds : sequence of (str, bool)
+        Counts of a class in words, and whether all of them have a range.
+    """
+    yield from (f"{_capital(text)}." for text, is_known in sounds if is_known)
+    if labelled := [text for text, is_known in sounds if not is_known]:
+        yield f"By the sound of it, {'; '.join(labelled)}."
 
 
 def is_quiet(day: DayMetrics) -> bool:
@@ -142,19 +156,21 @@ def _runs(day: DayMetrics, lively: Bool) -> list[str]:
     return [f"{a} to {b}" for a, b in zip(texts[::2], texts[1::2], strict=True)]
 
 
-def _sounds(day: DayMetrics) -> Iterator[str]:
-    """Yield sentences on coughing, crying and shouting, as far as they count."""
+def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
+    """Yield the counts of coughing, crying and shouting, and whether they have a range."""
     after = one(int(day.night.ends[0]), int(day.span.ends[0]))
     for name in _WORRYING:
         parts: list[str] = []
+        is_known = True
         for span, when in ((day.night, "in the night"), (after, "after 07:00")):
             starts = counted_events(day, name, span)
             if len(starts):
                 count = day.home.minutes.between(span).count(name, day.home.rates.get(name))
                 times = f" ({times_in_words(starts, day.zone)})" if len(starts) <= _TIMES else ""
                 parts.append(f"{amount(name, count, named=not parts)} {when}{times}")
+                is_known &= count.range is not None
         if parts:
-            yield f"{_capital(' and '.join(parts))}."
+            yield " and ".join(parts), is_known
 
 
 def _were(number: int) -> str:

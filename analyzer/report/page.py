@@ -268,7 +268,7 @@ def _scenario_text(minutes: float, day: DayMetrics) -> str:
 def _sounds(account: Account, day: DayMetrics) -> PageTable:
     """Return how often, when and how long each class was heard."""
     often = "How often" if account.checked else "How often, as labelled"
-    heads = ["Sound", often, "When", "How long, as labelled"]
+    heads = ["Sound", often, "When, as labelled", "How long, as labelled"]
     rows = []
     for name in account.classes:
         figure, lasting = event_figure(name), minutes_figure(name)
@@ -323,14 +323,25 @@ def _is_known(account: Account, name: str) -> bool:
     return any(day.count(name) is not None or day.beside_television(name) for day in account.days)
 
 
-def _cell(account: Account, figure: ReportFigure, day: DayMetrics) -> Cell:
-    """Return a figure, how it differs, and its usual range if there is a baseline."""
+def _cell(
+    account: Account, figure: ReportFigure, day: DayMetrics, *, is_alone: bool = False
+) -> Cell:
+    """Return a figure, how it differs, and its usual range if there is a baseline.
+
+    Parameters
+    ----------
+    is_alone : bool, optional
+        Whether the head of the column cannot say which figures are as labelled.
+    """
     value = figure.value(day)
+    text = _text(value)
+    if is_alone and account.checked and not _is_checked(value):
+        text += ", as labelled"
     if not account.comparable:
-        return Cell(_text(value), whole=True)
+        return Cell(text, whole=True)
     usual = account.usually(figure)
     note = f"usually {usual}" if usual else ""
-    return Cell(_text(value), account.change(figure, day), whole=True, note=note)
+    return Cell(text, account.change(figure, day), whole=True, note=note)
 
 
 def _text(value: Value | None) -> str:
@@ -339,12 +350,13 @@ def _text(value: Value | None) -> str:
 
 def _part(account: Account, section: FigureSection, day: DayMetrics) -> PageSection:
     known = [figure for figure in section.figures if figure.value(day) is not None]
-    rows = [[Cell(figure.title), _cell(account, figure, day)] for figure in known]
+    rows = [[Cell(figure.title), _cell(account, figure, day, is_alone=True)] for figure in known]
     remarks = [*_remarks(section, day)]
     if len(known) < len(section.figures):
         more = "more" if known else "anything"
         remarks.append(f"Too little was recorded to tell {more}.")
-    return PageSection(section, PageTable(["", "This day"], rows), remarks)
+    head = "This day" if account.checked else "This day, as labelled"
+    return PageSection(section, PageTable(["", head], rows), remarks)
 
 
 def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
@@ -355,7 +367,8 @@ def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
         for name in (FLUSHING_WATER, SHOWER):
             starts = day.events(name)
             if len(starts):
-                yield f"{several_in_words(name)} at {times_in_words(starts, day.zone)}."
+                at = times_in_words(starts, day.zone)
+                yield f"{several_in_words(name)}, as labelled, at {at}."
     elif section.title == "Night":
         yield _coughing(day)
     else:
@@ -454,6 +467,6 @@ def _interrai(account: Account, days: Sequence[DayMetrics]) -> PageTable:
     return PageTable(heads, rows, "stack")
 
 
-def _is_checked(value: Count | Duration) -> bool:
+def _is_checked(value: Value | None) -> bool:
     """Return whether checked minutes give a range for the correct number."""
     return isinstance(value, Count) and value.rates is not None

@@ -116,7 +116,7 @@ def longest_quiet(day: DayMetrics) -> str:
     if day.quiet is None or day.quiet.minutes < 1:
         return ""
     start, end = (clock_text(int(edge[0]), day.zone) for edge in quiet)
-    return f"The longest quiet stretch by day lasted from {start} to {end}."
+    return f"The longest quiet stretch by day, as labelled, lasted from {start} to {end}."
 
 
 def percent(share: float) -> str:
@@ -155,7 +155,7 @@ def _television(day: DayMetrics) -> str:
     ]
     more = "at other times and " if len(spans.starts) > _TIMES else ""
     when = more + f"from {listed(times, 'and')}"
-    return f"Something like a television, a radio or company sounded {when}."
+    return f"As labelled, something like a television, a radio or company sounded {when}."
 
 
 def _still(day: DayMetrics) -> str:

@@ -15,6 +15,7 @@ from hearthlog.tools.lab.sentences import (
     LABELLED,
     PAGE,
     REPORT,
+    _counted,
     read_count,
     read_minutes,
     statements,
@@ -54,16 +55,26 @@ def test_statements_of_a_day_that_is_labelled_rightly_hold_on_every_surface(tmp_
 def test_a_count_of_what_was_not_there_is_false_or_as_labelled(tmp_path):
     rings = [(at("10:00") + 600 * n, 8, "phone_ring", 0.95) for n in range(9)]
     own = found(tmp_path, [*LABELS, *rings], true(LABELS))
-    assert {each.verdict for each in own if each.surface == PAGE} == {HOLDS, FALSE}
+    assert {each.verdict for each in own if each.surface == PAGE} == {HOLDS, LABELLED}
     (row,) = [each for each in own if each.text == "Telephone ringing: 10"]
     assert (row.truth, row.verdict) == ("1", LABELLED)
 
 
-def test_a_quiet_stretch_with_a_sound_in_it_is_false(tmp_path):
+def test_a_quiet_stretch_with_a_sound_in_it_is_only_as_labelled(tmp_path):
     own = found(tmp_path, LABELS, [*true(LABELS), (at("17:00"), 20, "crying")])
     (quiet,) = [each for each in own if "longest quiet stretch" in each.text]
-    assert quiet.verdict == FALSE
+    assert quiet.verdict == LABELLED
     assert quiet.truth.startswith("1 sound")
+
+
+def test_what_is_told_without_a_word_of_doubt_is_false_if_it_is_not_so():
+    day = [
+        ("coughing", (1, 1), 3, False),
+        ("coughing", (1, 1), 3, True),
+        ("coughing", (1, 4), 3, False),
+    ]
+    verdicts = [_counted(PAGE, *row[:3], modest=row[3]).verdict for row in day]
+    assert verdicts == [FALSE, LABELLED, HOLDS]
 
 
 def test_a_wrong_time_of_a_rare_sound_does_not_hold(tmp_path):

@@ -57,7 +57,7 @@ _COMPANY = 15 * MINUTE  # a television is known by the ten minutes around
 _SURE = 0.9
 _NO_SOUNDS = {SILENCE, UNKNOWN}
 _SHORTEST = MINUTE // 60  # of a sound that breaks a quiet stretch
-_MODEST = re.compile(r"labelled|up to|perhaps|may be")
+_MODEST = re.compile(r"labelled|up to|perhaps|by the sound of it", re.IGNORECASE)
 _CLOCK = re.compile(r"\b([0-2]\d:[0-5]\d)\b")
 _RUN = re.compile(r"\b([0-2]\d:[0-5]\d) to ([0-2]\d:[0-5]\d)\b")
 _WORDS = (
@@ -232,7 +232,7 @@ def report_statements(
         if title == "What was heard":
             yield from _heard(heads, cells, day, truth)
         elif (title, cells[0]) in figures:
-            yield from _figure(figures[title, cells[0]].value(truth.metrics), title, cells)
+            yield from _figure(figures[title, cells[0]].value(truth.metrics), title, heads, cells)
         elif title.startswith("For the interRAI"):
             yield from _assessed(heads, cells, [*before, truth])
 
@@ -306,29 +306,28 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
     """Check counts of classes in a sentence: of the night, after 07:00, or of the day."""
     day = truth.metrics
     after = one(int(day.night.ends[0]), int(day.span.ends[0]))
-    names = [name for name in _sounds_of(day) if _mentions(sentence, name)]
-    for name in names:
-        words = "|".join({re.escape(w.lower()) for w in (in_words(name), several_in_words(name))})
-        for part in re.split(r" and (?=\w+ after 07:00)", sentence):
-            bare = re.sub(r"\([^)]*\)", "", part)
-            match = re.search(
-                rf"(?:{words}) ({_NUMBER})(?: times)?", bare, re.IGNORECASE
-            ) or re.search(
-                rf"({_NUMBER})(?: to ({_NUMBER}))?"
-                rf"(?= (?:bouts? of |times of )?(?:{words})| after| in the)",
-                bare,
-                re.IGNORECASE,
+    modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
+    for said in sentence.split("; "):
+        for name in (name for name in _sounds_of(day) if _mentions(said, name)):
+            words = "|".join(
+                {re.escape(w.lower()) for w in (in_words(name), several_in_words(name))}
             )
-            if match is None:
-                continue
-            low = _number(match[1])
-            high = _number(match[2]) if match.lastindex == 2 else low
-            span = day.night if "night" in part else after if "07:00" in part else day.span
-            true = day.home.minutes.between(span).count(name, None).labelled
-            modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
-            yield _counted(surface, part, (low, high), true, modest=modest)
-            if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
-                yield _at_times(surface, part, name, clocks, truth, modest=modest)
+            for part in re.split(r" and (?=\w+ after 07:00)", said):
+                bare = re.sub(r"\([^)]*\)", "", part)
+                match = re.search(rf"(?:{words}) ({_NUMBER})", bare, re.IGNORECASE) or re.search(
+                    rf"({_NUMBER})(?: to ({_NUMBER}))? (?=(?:bouts? of |times of )?(?:{words})|after)",
+                    bare,
+                    re.IGNORECASE,
+                )
+                if match is None:
+                    continue
+                low = _number(match[1])
+                high = _number(match[2]) if match.lastindex == 2 else low
+                span = day.night if "night" in part else after if "07:00" in part else day.span
+                true = day.home.minutes.between(span).count(name, None).labelled
+                yield _counted(surface, part, (low, high), true, modest=modest)
+                if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
+                    yield _at_times(surface, part, name, clocks, truth, modest=modest)
 
 
 def _gist(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
@@ -440,9 +439,11 @@ def _heard(
         yield _lasted(REPORT, where + lasting, minutes, true, modest=is_modest(heads[3] + lasting))
 
 
-def _figure(value: object, title: str, cells: Sequence[str]) -> Iterator[Statement]:
+def _figure(
+    value: object, title: str, heads: Sequence[str], cells: Sequence[str]
+) -> Iterator[Statement]:
     text, shown = f"{title}, {cells[0]}: {cells[1]}", cells[1].partition(" | ")[0]
-    modest = is_modest(cells[0] + re.sub(r"\(\d+ labelled\)", "", cells[1]))
+    modest = is_modest(heads[1] + cells[0] + re.sub(r"\(\d+ labelled\)", "", cells[1]))
     middle = getattr(value, "middle", 0)
     if _CLOCK.fullmatch(shown):
         hours, minutes = map(int, shown.split(":"))

@@ -110,8 +110,10 @@ def _lane(
 ) -> Any:
     today, words = home.moment, home.words
     events = [e for e in microphone.events(label, day.start - 24 * _HOUR) if e.start < day.end]
-    of_night = [e for e in events if today.night <= e.start < today.morning]
-    of_day = [e for e in events if e.start >= today.midnight]
+    counted = microphone.counted(events)
+    of_night = [e for e in counted if today.night <= e.start < today.morning]
+    of_day = [e for e in counted if e.start >= today.midnight]
+    beside = sum(e.start >= today.midnight for e in events) - len(of_day)
     count: int | None = len(of_day) if of_day or known.day else None
     night: int | None = len(of_night) if of_night or known.night else None
     last = events[-1] if home.is_past and events else microphone.last_event(label)
@@ -119,12 +121,15 @@ def _lane(
     name = words.class_words(label)
     often = words.text("count.not known") if count is None else words.times(count)
     key = "lane of a day" if home.is_past else "lane and last" if count else "lane"
+    told = words.text(key, **{"class": name, "times": often, "last": at})
+    if beside:
+        told = words.text("lane beside", told=told, times=words.times(beside))
     return {
         "label": label,
         "words": name,
         "colour": colour_on_paper(label),
         "bars": bars((event for event in events if event.end > day.start), day),
-        "told": words.text(key, **{"class": name, "times": often, "last": at}),
+        "told": told,
         "today": count,
         "night": night,
         "last": at,
@@ -162,6 +167,7 @@ def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
 
 _QUIET_SHARE = 0.01  # most of a quiet night with any sound
 _QUIET_EVENTS = 5  # most events of important classes in a quiet night
+_PARTLY = ("night.partly", "day.partly", "day.past partly")
 _NOON = 12
 _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 3  # of a class
@@ -207,7 +213,8 @@ def _sentence_of_day(home: HomeDay) -> str:
     if not names:
         return _sentence(when, found, home) if found else ""
     key = "day.past none" if home.is_past else "day.none"
-    return words.text(key, when=when, classes=words.listed(names, "or")) + "."
+    none = words.text(key, when=when, classes=words.listed(names, "or"))
+    return words.text("by its sound", sentence=none) + "."
 
 
 def _events_of(home: HomeDay, start: int, end: int) -> SoundsOfRooms:
@@ -215,7 +222,7 @@ def _events_of(home: HomeDay, start: int, end: int) -> SoundsOfRooms:
     found: SoundsOfRooms = {}
     for microphone in home.microphones:
         for label in microphone.labels():
-            own = [event for event in microphone.events(label, start) if event.start < end]
+            own = [e for e in microphone.counted(microphone.events(label, start)) if e.start < end]
             if own and label != SILENCE:
                 found.setdefault(label, {})[microphone.name] = own
     return {name: found[name] for name in ordered(found)}
@@ -241,9 +248,10 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     names = [name for name in found if name in IMPORTANT] or [*found]
     parts = [_class_and_times(name, found[name], home) for name in names[:_MOST_CLASSES]]
     what = words.listed(parts)
-    if not parts or not when:
-        return f"{when or what[:1].upper() + what[1:]}."
-    return words.text("sentence", when=when, what=what) + "."
+    if not parts and when in map(words.text, _PARTLY):
+        return f"{when}."
+    said = words.text("sentence", when=when, what=what) if parts and when else when or what
+    return words.text("by its sound", sentence=said[:1].upper() + said[1:]) + "."
 
 
 def _class_and_times(name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:

@@ -4,12 +4,15 @@ import json
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import date
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
 from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity.sureness import UNMEASURED, read_sureness
+from hearthlog.analyzer.activity.values import BASELINE_DAYS
 from hearthlog.analyzer.bridge.commands import EventCorrections, class_of, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
@@ -29,6 +32,7 @@ from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, pag
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import Words, clock, preferred_language, room, words_of
+from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.never_tell import read_list, write_list
 from hearthlog.analyzer.marks.marks import Mark
@@ -88,6 +92,8 @@ class HomePage:
         self._past = PastDays(home)
         self._sounds = KeptSounds(home.folder, home.node)
         self._is_read_back = False
+        self._sureness = UNMEASURED
+        self._measured: date | None = None  # day of the last measurement of it
         self._views: dict[str, PageView] = {}
         self._lock = threading.Lock()
         self.view(self.words("").language)
@@ -145,6 +151,10 @@ class HomePage:
         if not self._is_read_back:
             self._is_read_back = True
             threading.Thread(target=self._read_back, daemon=True).start()
+        day = local_time(news.today.now, news.zone).date()
+        if self._measured != day:
+            self._measured = day
+            threading.Thread(target=self._measure, args=(news.today.now,), daemon=True).start()
         first = min(news.today.midnight, news.today.night)
         key = _events_key(news)
         if key != self._events_key:
@@ -169,7 +179,7 @@ class HomePage:
         problem = self._recurring.problem
         view.put("health", health_list(news, self._home.node, started, problem, words))
         day = local_time(moment.now, news.zone).date()
-        key = self._events_key, self._corrections.number, day, _classes_key(news)
+        key = self._events_key, self._corrections.number, day, self._sureness, _classes_key(news)
         view.put_changed("events", key, lambda: self._last_bouts(news, words))
         home = HomeDay([*news.state.microphones.values()], news.today, news.zone, words)
         view.put_changed("day", _day_key(news), lambda: picture_of(home))
@@ -217,7 +227,7 @@ class HomePage:
             name = words.text("mark.nothing") if is_nothing else words.class_words(found.label)
             return words.text("mark.own" if found.is_own else "mark.other", **{"class": name})
 
-        return ShownBouts(now, self._home.zone, words, correction, is_alone)
+        return ShownBouts(now, self._home.zone, words, correction, is_alone, self._sureness)
 
     def act(self, path: str, subject: str, label: str, words: Words) -> str:
         """Carry out what a person asked for; return what was done, in words."""
@@ -313,6 +323,12 @@ class HomePage:
             raise explained(error) from error
         key = "shown again" if _SHOW[choice] else "shown nowhere"
         return words.text(key, **{"class": words.class_words(name)})
+
+    def _measure(self, now: int) -> None:
+        """Measure how sure the home can be of labels, in the checked minutes of four weeks."""
+        with suppress(HearthlogError, OSError):  # not measured
+            logs = find_home_logs([self._home.folder])
+            self._sureness = read_sureness(logs, now - BASELINE_DAYS * _DAY, now)
 
     def _read_back(self) -> None:
         try:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.sources import source_microphone
+from hearthlog.analyzer.activity.sureness import UNMEASURED, Sureness
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.bridge.page.day import IMPORTANT
 from hearthlog.analyzer.bridge.state import BridgeError
@@ -94,6 +95,7 @@ class ShownBouts(NamedTuple):
     words: Words
     correction: Callable[[SoundEvent], str]
     is_alone: bool
+    sureness: Sureness = UNMEASURED
 
     def describe(self, bout: Bout) -> Any:
         """Return a bout for JSON."""
@@ -113,7 +115,7 @@ class ShownBouts(NamedTuple):
             "times": words.times(count) if count > 1 else "",
             "time": time,
             "length": length,
-            "sure": words.sureness(max(event.confidence for event in bout.events)),
+            "sure": words.sureness(max(each.confidence for each in bout.events), self.sureness),
             "room": "" if self.is_alone else room(first.microphone),
             "said": corrections[-1] if corrections else "",
             "look": bout.is_important,
