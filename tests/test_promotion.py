@@ -21,7 +21,10 @@ from hearthlog.analyzer.logs.spans import Spans, common
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion.comparison import (
     HomeComparison,
+    NamedSounds,
     PairedAccuracy,
+    _named,
+    _Outcome,
     _outcomes,
     _right,
     _taught,
@@ -502,6 +505,23 @@ def test_a_model_that_changes_much_has_to_be_right_about_more():
     assert damages(evidence(much), "one") == []  # nothing was drawn at random
     little = [[1300, 0, 0], [0, 80, 20], [0, 0, 40]]
     assert damages(evidence(little, PairedAccuracy(40, 30, 30, 3, 3)), "one") == []
+
+
+def test_marks_that_agree_with_the_champion_less_than_by_chance_are_said_to_be_wrong():
+    better = evidence([[1300, 0, 0], [0, 20, 80], [0, 0, 40]], PairedAccuracy(55, 3, 50, 48, 1))
+    (said,) = damages(replace(better, named=NamedSounds(55, 3, 5)), "one")
+    assert said.startswith("of 55 sounds of the minutes that were drawn at random, one gives 3 the")
+    assert "the marks are wrong" in said
+    for few in (NamedSounds(19, 0, 5), NamedSounds(55, 3, 2), NamedSounds(55, 6, 5), NamedSounds()):
+        assert damages(replace(better, named=few), "one") == []
+
+
+def test_a_sound_is_named_if_a_person_and_the_champion_give_it_classes_that_the_champion_has():
+    classes = ["silence", "speech", "music", "unknown"]
+    pairs = [("speech", "speech"), ("speech", "music"), ("music", "unknown"), ("dog", "speech")]
+    pairs += [("silence", "speech"), ("music", "silence"), ("music", ""), ("unknown", "music")]
+    found = _named((_Outcome(True, label, before, "music") for label, before in pairs), classes)
+    assert found == NamedSounds(sounds=2, right=1, classes=1)
 
 
 def test_a_day_of_which_hours_were_recorded_is_said_to_be_one(capsys):

@@ -36,6 +36,7 @@ from hearthlog.analyzer.promotion.recent_time import (
     spans_of,
 )
 from hearthlog.models.classes import (
+    OTHER,
     OTHER_NEGATIVE,
     SILENCE,
     UNDECIDED,
@@ -84,6 +85,25 @@ class PairedAccuracy(NamedTuple):
 NOTHING_KNOWN = PairedAccuracy()
 
 
+class NamedSounds(NamedTuple):
+    """Sounds to which a person and the first model each give a class of that model.
+
+    Attributes
+    ----------
+    right : int
+        With the same class.
+    classes : int
+        Classes that the person gives.
+    """
+
+    sounds: int = 0
+    right: int = 0
+    classes: int = 0
+
+
+NOTHING_NAMED = NamedSounds()
+
+
 @dataclass(frozen=True, eq=False)
 class HomeComparison:
     """Two models on the same recent time of a home.
@@ -106,6 +126,8 @@ class HomeComparison:
     known : mapping of (str, str, str) to int
         Sounds of known label, including training sounds, by reviewed class, class of the first
         model and class of the second; empty if the second was not trained here.
+    named : NamedSounds
+        Of the minutes drawn at random.
     """
 
     minutes: float
@@ -118,6 +140,7 @@ class HomeComparison:
     quiet: PairedAccuracy = NOTHING_KNOWN
     taught: frozenset[str] = frozenset()
     known: Mapping[tuple[str, str, str], int] = field(default_factory=dict)
+    named: NamedSounds = NOTHING_NAMED
 
 
 def gather_evidence(
@@ -173,6 +196,7 @@ def gather_evidence(
         marks=_right(one for one in right if not one.random and one.label != SILENCE),
         losses=losses,
         quiet=_right(one for one in right if one.random and one.label == SILENCE),
+        named=_named((one for one in right if one.random), models.classes[: models.before]),
         taught=taught,
         known=Counter(one[1:] for each in outcomes for one in each) if of_home else {},
     )
@@ -261,6 +285,14 @@ def _outcomes(
             )
             most = (classes[c.argmax()] if c.max() > _MOST else "" for c in counts)
             yield _Outcome(sound.random, name, *most)
+
+
+def _named(outcomes: Iterable[_Outcome], classes: Sequence[str]) -> NamedSounds:
+    """Count the sounds with a class by a person and by the first model, of the model's classes."""
+    known = set(classes) - {SILENCE, UNKNOWN, OTHER}
+    pairs = [(one.label, one.before) for one in outcomes if {one.label, one.before} <= known]
+    right = sum(label == before for label, before in pairs)
+    return NamedSounds(len(pairs), right, len({label for label, _ in pairs}))
 
 
 def _right(outcomes: Iterable[_Outcome]) -> PairedAccuracy:

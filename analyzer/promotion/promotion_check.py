@@ -13,6 +13,7 @@ import numpy as np
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.promotion.comparison import (
     HomeComparison,
+    NamedSounds,
     PairedAccuracy,
     gather_evidence,
     right_at_random,
@@ -46,6 +47,8 @@ _CHANGED = 0.20  # of the time that is not silence
 _CHANGED_MINUTES = 10.0
 _SILENCE_OF_NEW = 0.5  # of the time of a new class
 _ROOM = 0.5  # of the time: a larger new class is the room itself
+_MANY_NAMED, _SEVERAL = 20, 3  # sounds and classes that show that marks are wrong
+_BY_CHANCE = 0.1  # of the sounds: a model of eight classes that knows nothing is right about more
 _MARKS_ALONE = 3  # marks that show a wrong class, if no sound of that class is known
 
 
@@ -67,6 +70,14 @@ def damages(evidence: HomeComparison, champion: str) -> list[str]:
             f"{missing} more minute{'s' * (missing > 1)}, then promote it"
         )
         return [text]
+    if _are_marks_wrong(evidence.named):
+        named = evidence.named
+        text = (
+            f"of {named.sounds} sounds of the minutes that were drawn at random, {champion} gives "
+            f"{named.right} the class that a person gave, fewer than by chance: the marks are "
+            "wrong, perhaps all by one class; correct them in `hearthlog review`, then train again"
+        )
+        return [text]
     reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]
     right = evidence.random
     better = clearly_better(right.plus(evidence.quiet))
@@ -74,6 +85,12 @@ def damages(evidence: HomeComparison, champion: str) -> list[str]:
         reasons += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
         reasons += _swallowed(evidence, champion)
     return reasons
+
+
+def _are_marks_wrong(named: NamedSounds) -> bool:
+    """Return whether a person and a model agree on fewer sounds than by chance."""
+    is_enough = named.sounds >= _MANY_NAMED and named.classes >= _SEVERAL
+    return is_enough and named.right <= _BY_CHANCE * named.sounds
 
 
 def clearly_better(right: PairedAccuracy) -> bool:

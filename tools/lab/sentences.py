@@ -309,15 +309,13 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
     modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
     for said in sentence.split("; "):
         for name in (name for name in _sounds_of(day) if _mentions(said, name)):
-            words = "|".join(
-                {re.escape(w.lower()) for w in (in_words(name), several_in_words(name))}
-            )
+            known = {in_words(name).lower(), several_in_words(name).lower()}
+            words = f"(?:{'|'.join(map(re.escape, sorted(known)))})"
+            after_number = rf"(?:bouts? of |times of )?{words}|after"
             for part in re.split(r" and (?=\w+ after 07:00)", said):
-                bare = re.sub(r"\([^)]*\)", "", part)
-                match = re.search(rf"(?:{words}) ({_NUMBER})", bare, re.IGNORECASE) or re.search(
-                    rf"({_NUMBER})(?: to ({_NUMBER}))? (?=(?:bouts? of |times of )?(?:{words})|after)",
-                    bare,
-                    re.IGNORECASE,
+                bare = re.sub(r"\([^)]*\)", "", part).lower()
+                match = re.search(rf"{words} ({_NUMBER})", bare) or re.search(
+                    rf"({_NUMBER})(?: to ({_NUMBER}))? (?={after_number})", bare
                 )
                 if match is None:
                     continue
