@@ -22,6 +22,7 @@ from hearthlog.analyzer.activity.event_counts import (
     television_minutes,
 )
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.confused_classes import common_names_of, renamed
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overlaid, unified
 from hearthlog.analyzer.logs.recorder_info import model_of
@@ -153,7 +154,10 @@ def _reviewed_labels(
             around = span.start - AROUND * MINUTE, span.end + AROUND * MINUTE
             labels = unified(sources.read(span.microphone, name, *around).labelling)
             own = [mark for mark in marks if mark.microphone == span.microphone]
+            names = common_names_of(log, [*labels.labels, *(class_name(m.label) for m in own)])
+            labels = renamed(labels, names)
             decided = labelling_of_marks(one for one in own if class_name(one.label) != UNKNOWN)
+            decided = renamed(decided, names)
             rest = labelling_of_marks(one for one in own if class_name(one.label) == UNKNOWN)
             yield ReviewedLabels(
                 span,

@@ -8,6 +8,7 @@ import numpy as np
 
 from hearthlog.analyzer.activity.checked_minutes import labelling_of_marks
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.confused_classes import common_names_of, renamed_array
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.labelling import (
     MOST_CLASSES,
@@ -202,7 +203,12 @@ def _segments(
                 "" if schema is None else schema.name for _, schema in selection.channels[topic]
             }
             home.lose(f"{entry.path}: {topic} is of type {', '.join(sorted(kinds))}")
-        yield from read_columns([entry.path], segments, *limits, fields=_SEGMENT_FIELDS).values()
+        for columns in read_columns(
+            [entry.path], segments, *limits, fields=_SEGMENT_FIELDS
+        ).values():
+            names = common_names_of(entry.path, columns["label"])
+            own = renamed_array(columns["label"], names)
+            yield replace(columns, fields=columns.fields | {"label": own}) if names else columns
     except LogError as error:
         home.lose(str(error))
 
@@ -279,7 +285,8 @@ def _name_classes(home: HomeData, entries: Iterable[HomeLog], labelling: str) ->
             topic = labelling_topic(microphone, labelling, "label")
             for channel, _ in selection.channels.get(topic, ()) if node == entry.node else ():
                 own = array_names(channel.metadata, "probabilities")
-                names[node, microphone] |= dict.fromkeys(own)
+                common = common_names_of(entry.path, own)
+                names[node, microphone] |= dict.fromkeys(common.get(n, n) for n in own)
     for source, segments in home.segments.items():
         said = set(home.labelled[source].labels.tolist()) or set(segments.labels.tolist())
         names[source] |= dict.fromkeys(sorted(said))

@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Event as Flag
@@ -21,6 +21,7 @@ from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, Sound
 from hearthlog.analyzer.activity.segments import GrowingSpans
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.settings import RecorderAddress
+from hearthlog.analyzer.logs.confused_classes import WATER, common_names_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.never_tell import read_list
@@ -91,6 +92,7 @@ class LiveMicrophone:
         self.name = name
         self._unnamed = unnamed
         self.never_tell: frozenset[str] = frozenset()  # classes that no output shows
+        self.common_names: Mapping[str, str] = {}  # of classes that the model takes for one another
         self.names: list[str] = []
         self.heard = ActiveClasses([])
         self.label, self.confidence = "", 0.0
@@ -129,6 +131,21 @@ class LiveMicrophone:
     def labels(self) -> list[str]:
         """Return the classes with recorded events that outputs show."""
         return [label for label in self._records if label not in self.never_tell]
+
+    def shown_names(self, labels: Iterable[str]) -> list[str]:
+        """Return the names that people are shown for some labels, each once."""
+        return list(dict.fromkeys(self.common_names.get(label, label) for label in labels))
+
+    def shown_events(self, name: str, since: int) -> list[SoundEvent]:
+        """Return the events of a class that people are shown, as `events` does of a label."""
+        labels = [each for each in self.labels() if self.common_names.get(each, each) == name]
+        every = sorted((e for each in labels for e in self.events(each, since)), key=_start_of)
+        if len(labels) == 1 and labels[0] == name:
+            return every
+        record = EventRecord(self.name, name)
+        for event in every:
+            record.push(event.start, event.end, event.confidence)
+        return record.events
 
     def all_labels(self) -> list[str]:
         """Return the classes with recorded events, shown or not."""
@@ -281,6 +298,8 @@ class HomeState:
         States by scenario models; the key `<microphone>-<scenario>` is no valid microphone name.
     caught_up : bool
         Whether all earlier messages have been read, so that further ones are live.
+    common_names : mapping of str to str
+        Names that people are shown for classes that a model takes for one another.
     sources : collection of str or None
         Labelling sources of the newest log; None while unknown.
     """
@@ -292,6 +311,7 @@ class HomeState:
         self.caught_up = False
         self.sources: Collection[str] | None = None
         self._never_tell: frozenset[str] = frozenset()
+        self.common_names: Mapping[str, str] = {}
         self._seen = -math.inf  # time of the last message, by CLOCK_MONOTONIC
         self._said: set[str] = set()  # subjects with diagnostics in the current log
 
@@ -322,6 +342,12 @@ class HomeState:
     def is_left_out(self, name: str) -> bool:
         """Whether the recorder no longer has a microphone or scenario."""
         return self.sources is not None and name not in self.sources
+
+    def name_in_common(self, names: Mapping[str, str]) -> None:
+        """Show classes that a model takes for one another under their common names."""
+        self.common_names = names
+        for microphone in self.every():
+            microphone.common_names = names
 
     def begin_log(self) -> None:
         """Begin a new log: drop the health of subjects without diagnostics in the last log."""
@@ -369,6 +395,7 @@ class HomeState:
         if name not in own:
             own[name] = LiveMicrophone(name, unnamed)
             own[name].never_tell = self._never_tell
+            own[name].common_names = self.common_names
         return own[name]
 
     def _time_seen(self, columns: Columns) -> float:
@@ -391,6 +418,10 @@ class HomeState:
             microphone = self.microphones.get(subject)
             if microphone is not None:
                 microphone.level_dbfs = next(_levels(status), math.nan)
+
+
+def _start_of(event: SoundEvent) -> int:
+    return event.start
 
 
 def _levels(status: Any) -> Iterator[float]:
@@ -464,6 +495,7 @@ def follow_home(
                 current = path
                 state.begin_log()
                 _check_version(path, say)
+                state.name_in_common(common_names_of(path, WATER))
             yielded = time.monotonic()
             yield state, *_push(state, path, batch, say)
         if stop.is_set():

@@ -212,6 +212,7 @@ def _page(account: Account, picture: PagePicture, **parts: Any) -> str:
         absent=_listed(absent),
         uncertain=_listed(uncertain),
         unknown=_listed(account.unknown),
+        confused=_listed(account.confused),
         uncounted=_listed(uncounted),
         television=_television(account),
         scenarios=[(plain(name), _scenario(account, name)) for name in account.scenarios],

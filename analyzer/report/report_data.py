@@ -30,6 +30,7 @@ from hearthlog.models.classes import (
     CRYING,
     FLUSHING_WATER,
     PHONE_RING,
+    RUNNING_WATER,
     SHOWER,
     SILENCE,
     SPEECH,
@@ -113,8 +114,9 @@ def _bathroom(classes: Sequence[str]) -> Iterator[ReportFigure]:
     if SHOWER in classes:
         yield event_figure(SHOWER, several_in_words(SHOWER))
         yield minutes_figure(SHOWER)._replace(title="Time in the shower", short="Shower time")
-    if TAP_WATER in classes:
-        yield from _day_and_night(TAP_WATER)
+    for name in (TAP_WATER, RUNNING_WATER):
+        if name in classes:
+            yield from _day_and_night(name)
 
 
 def _night(classes: Sequence[str]) -> Iterator[ReportFigure]:
@@ -192,8 +194,15 @@ class Account:
     @property
     def unknown(self) -> list[str]:
         """Classes that a report is asked about, and the model of the home does not know."""
-        wanted = [*BATHROOM, *(item.needs for item in ASSESSED_ITEMS if item.needs)]
-        return ordered(set(wanted) - {*self.classes, *self.hidden})
+        wanted = {*BATHROOM, *(item.needs for item in ASSESSED_ITEMS if item.needs)}
+        if RUNNING_WATER in self.classes:
+            wanted -= {*BATHROOM}
+        return ordered(wanted - {*self.classes, *self.hidden})
+
+    @property
+    def confused(self) -> list[str]:
+        """Classes that a report is asked about, and the model does not tell apart."""
+        return ordered(set(BATHROOM) - self.hidden) if RUNNING_WATER in self.classes else []
 
     @property
     def checked(self) -> bool:

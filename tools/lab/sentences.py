@@ -507,7 +507,8 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
     if "television" in text:
         day = truth.metrics
     minutes = day.home.minutes.between(span)
-    names = [n for n in home.microphones[0].names if n not in _NO_SOUNDS and _mentions(text, n)]
+    known = home.microphones[0].shown_names(home.microphones[0].names)
+    names = [n for n in known if n not in _NO_SOUNDS and _mentions(text, n)]
     if match := re.search(r"[Nn]o ([^.:(]*)\.$", text):
         for name in (n for n in names if _mentions(match[1], n)):
             true = minutes.count(name, None).labelled
@@ -541,7 +542,8 @@ def _sureness(home: HomeDay, truth: TrueDay) -> Iterator[Statement]:
     found: defaultdict[str, list[bool]] = defaultdict(list)
     for bout in bouts(events):
         words = re.sub(r" *\(.*", "", shown.describe(bout)["sure"])
-        spans = truth.everywhere.home.spans.get(bout.first.label, NONE)
+        (name,) = home.microphones[0].shown_names([bout.first.label])
+        spans = truth.everywhere.home.spans.get(name, NONE)
         found[words].append(any(cut(spans, e.start, e.end).length for e in bout.events))
     for words, right in found.items():
         text = f"{len(right)} sounds {words or 'without a word'}"

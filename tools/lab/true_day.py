@@ -14,13 +14,25 @@ from hearthlog.analyzer.activity.home_data import HomeData
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, without
-from hearthlog.models.classes import MUSIC, OTHER, SILENCE, SPEECH, TELEVISION, class_name
+from hearthlog.models.classes import (
+    FLUSHING_WATER,
+    MUSIC,
+    OTHER,
+    RUNNING_WATER,
+    SHOWER,
+    SILENCE,
+    SPEECH,
+    TAP_WATER,
+    TELEVISION,
+    class_name,
+)
 from hearthlog.schemas.arrays import Bool
 from hearthlog.schemas.frames import NANOSECONDS
 
 NEAR = MINUTE  # of a time that is told
 _DEVICES = {"television", "radio"}
 _OF_THE_HOME = {"", "resident", "phone", "outside"}
+_WATER = {FLUSHING_WATER, SHOWER, TAP_WATER}
 _HEARD_SO = {SPEECH, MUSIC}  # talking from a television is talking all the same
 _PAUSE = 20 * MINUTE  # of a television, as in a report
 
@@ -94,6 +106,8 @@ def true_day(sounds: Sequence[TrueSound], day: DayMetrics) -> TrueDay:
     def called(sound: TrueSound) -> str:
         if sound.origin in _DEVICES and sound.label not in _HEARD_SO:
             return TELEVISION
+        if RUNNING_WATER in known and sound.label in _WATER:
+            return RUNNING_WATER
         return sound.label if sound.label in known or OTHER not in known else OTHER
 
     rows = sorted((sound.start, sound.end, called(sound)) for sound in sounds)

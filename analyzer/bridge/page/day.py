@@ -91,7 +91,9 @@ def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
         "gaps": [(day.place(a), day.place(b)) for a, b in _gaps(microphone, day, home)],
         "lanes": [
             _lane(microphone, label, day, home, known)
-            for label in ordered([*microphone.classes, *microphone.labels()])
+            for label in ordered(
+                microphone.shown_names([*microphone.classes, *microphone.labels()])
+            )
             if label != SILENCE
         ],
     }
@@ -109,14 +111,15 @@ def _lane(
     microphone: LiveMicrophone, label: str, day: DaySpan, home: HomeDay, known: ListeningThreshold
 ) -> Any:
     today, words = home.moment, home.words
-    events = [e for e in microphone.events(label, day.start - 24 * _HOUR) if e.start < day.end]
+    every = microphone.shown_events(label, day.start - 24 * _HOUR)
+    events = [event for event in every if event.start < day.end]
     counted = microphone.counted(events)
     of_night = [e for e in counted if today.night <= e.start < today.morning]
     of_day = [e for e in counted if e.start >= today.midnight]
     beside = sum(e.start >= today.midnight for e in events) - len(of_day)
     count: int | None = len(of_day) if of_day or known.day else None
     night: int | None = len(of_night) if of_night or known.night else None
-    last = events[-1] if home.is_past and events else microphone.last_event(label)
+    last = (events if home.is_past and events else [None, *microphone.shown_events(label, 0)])[-1]
     at = "" if last is None else words.when(last.end, today.now, day.zone)
     name = words.class_words(label)
     often = words.text("count.not known") if count is None else words.times(count)
@@ -221,8 +224,9 @@ def _events_of(home: HomeDay, start: int, end: int) -> SoundsOfRooms:
     """Return the events that begin in a time span, the most important class first."""
     found: SoundsOfRooms = {}
     for microphone in home.microphones:
-        for label in microphone.labels():
-            own = [e for e in microphone.counted(microphone.events(label, start)) if e.start < end]
+        for label in microphone.shown_names(microphone.labels()):
+            every = microphone.counted(microphone.shown_events(label, start))
+            own = [event for event in every if event.start < end]
             if own and label != SILENCE:
                 found.setdefault(label, {})[microphone.name] = own
     return {name: found[name] for name in ordered(found)}

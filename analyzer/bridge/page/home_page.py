@@ -198,6 +198,7 @@ class HomePage:
         microphones = news.state.microphones.values()
         names = ordered(label for each in microphones for label in [*each.classes, *each.labels()])
         shown = self._shown(words, news.today.now, is_alone=len(microphones) == 1)
+        shown = shown._replace(common_names=news.state.common_names)
         every = [shown.describe(bout) for bout in self._latest()]
         hidden = ordered(news.state.never_tell)
         return {
@@ -287,6 +288,7 @@ class HomePage:
         home = HomeDay(microphones, moment, zone, words, is_past=True)
         every = bouts(events_between(microphones, moment.midnight, moment.now + 1))
         shown = self._shown(words, moment.now, is_alone=len(microphones) == 1, marks=day.marks)
+        shown = shown._replace(common_names=day.state.common_names)
         return picture_of(home) | {"events": [shown.describe(b) for b in every[:_MOST_OF_DAY]]}
 
     def _mark(self, identifier: str, text: str, words: Words) -> str:

@@ -13,6 +13,7 @@ from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, 
 from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.logs.confused_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, Today, at_hour, day_span
 from hearthlog.analyzer.logs.selection import array_names, select
@@ -142,4 +143,5 @@ def _name_classes(log: Path, state: HomeState) -> None:
             continue
         for channel, _ in channels:
             own = array_names(channel.metadata, "probabilities")
+            state.name_in_common(common_names_of(log, own))
             state.microphones[source].names = own or state.microphones[source].names

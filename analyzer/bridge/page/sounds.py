@@ -1,10 +1,11 @@
 """List of sounds on the page: events of one class folded, what needs a look, and their sound."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from threading import Lock
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity.events import SoundEvent
@@ -96,6 +97,7 @@ class ShownBouts(NamedTuple):
     correction: Callable[[SoundEvent], str]
     is_alone: bool
     sureness: Sureness = UNMEASURED
+    common_names: Mapping[str, str] = MappingProxyType({})
 
     def describe(self, bout: Bout) -> Any:
         """Return a bout for JSON."""
@@ -110,7 +112,7 @@ class ShownBouts(NamedTuple):
         return {
             "id": first.id,
             "label": first.label,
-            "words": words.class_words(first.label),
+            "words": words.class_words(self.common_names.get(first.label, first.label)),
             "colour": colour_on_paper(first.label),
             "times": words.times(count) if count > 1 else "",
             "time": time,
