@@ -531,9 +531,9 @@ def confidences(*groups):
     [
         ([], ["", "", "not sure"]),
         ([(0.95, 5, 0)], ["", "", "not sure"]),
-        ([(0.95, 20, 0), (0.8, 9, 6), (0.4, 3, 9)], ["sure", "fairly sure", "not sure"]),
+        ([(0.95, 20, 0), (0.8, 9, 6), (0.4, 3, 9)], ["sure", "", "not sure"]),
         ([(0.95, 12, 8), (0.8, 9, 6)], ["", "", "not sure"]),
-        ([(0.95, 16, 3), (0.8, 5, 7)], ["fairly sure", "not sure", "not sure"]),
+        ([(0.95, 16, 3), (0.8, 5, 7)], ["", "", "not sure"]),
         ([(0.95, 10, 0), (0.5, 30, 0)], ["sure", "sure", "sure"]),
     ],
 )
@@ -550,4 +550,4 @@ def test_a_home_without_checked_minutes_is_sure_of_nothing(tmp_path):
     for hour in range(8, 20):
         check(logs, at(f"{hour:02}:00"))
     home = read_sureness(find_home_logs([tmp_path]), 0, end)
-    assert (home.word(0.995), home.word(0.9)) == ("sure", "not sure")
+    assert (home.word(0.995), home.word(0.9)) == ("sure", "")

@@ -30,7 +30,7 @@ from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import languages, preferred_language, words_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time, today
-from hearthlog.models.classes import CLASSES
+from hearthlog.models.classes import CLASSES, RUNNING_WATER
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.files import audio_path, find_logs
@@ -419,7 +419,8 @@ def test_each_language_has_the_texts_of_english_with_their_placeholders(language
         key: placeholders(text) for key, text in english.items()
     }
     assert {key for key in other if key.startswith("class.")} == {
-        f"class.{c.name}" for c in CLASSES
+        *(f"class.{c.name}" for c in CLASSES),
+        f"class.{RUNNING_WATER}",
     }
     assert len(other["months"].split()) == 12
     assert len(other["weekdays"].split()) == 7

@@ -21,6 +21,7 @@ import typer
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
+from hearthlog.analyzer.activity.sureness import UNMEASURED, Sureness, read_sureness
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import ShownBouts, bouts, events_between
@@ -469,7 +470,9 @@ def _assessed(
         yield _counted(REPORT, text, said, true, modest=modest)
 
 
-def page_statements(home: HomeDay, truth: TrueDay) -> Iterator[Statement]:
+def page_statements(
+    home: HomeDay, truth: TrueDay, sureness: Sureness = UNMEASURED
+) -> Iterator[Statement]:
     """Yield the statements of the page of the home about a past day, and of its morning."""
     picture = picture_of(home)
     yield from _page_sentence(picture["sentence"], home, truth, truth.everywhere.span)
@@ -493,7 +496,7 @@ def page_statements(home: HomeDay, truth: TrueDay) -> Iterator[Statement]:
         if times and len(times) <= 5:
             text = f"{lane['words']} at {', '.join(times)}"
             yield _at_times(PAGE, text, name, times, truth, modest=modest)
-    yield from _sureness(home, truth)
+    yield from _sureness(home, truth, sureness)
 
 
 def _of_page(truth: TrueDay, lane: object, name: str, span: Spans) -> int:
@@ -535,10 +538,10 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
             yield _at_times(PAGE, f"{text} [{in_words(name)}]", name, clocks, truth, modest=modest)
 
 
-def _sureness(home: HomeDay, truth: TrueDay) -> Iterator[Statement]:
+def _sureness(home: HomeDay, truth: TrueDay, measured: Sureness) -> Iterator[Statement]:
     """Check how many of the sounds that are said to be sure are right."""
     events = events_between(home.microphones, home.moment.midnight, home.moment.now + 1)
-    shown = ShownBouts(home.moment.now, home.zone, ENGLISH, lambda _: "", is_alone=True)
+    shown = ShownBouts(home.moment.now, home.zone, ENGLISH, lambda _: "", True, measured)
     found: defaultdict[str, list[bool]] = defaultdict(list)
     for bout in bouts(events):
         words = re.sub(r" *\(.*", "", shown.describe(bout)["sure"])
@@ -578,6 +581,7 @@ def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
     entries = logs.between()
     sounds = read_sounds(home, entries[0].start)
     before: list[TrueDay] = []
+    sureness = read_sureness(logs, 0, entries[-1].start + 24 * HOUR)
     for day in logs.days(UTC):
         account, _ = read_account(logs, Period(day, 1, UTC))
         labelled = account.days[0]
@@ -595,7 +599,7 @@ def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
             day,
             [
                 *report_statements(account, truth, before[-2:]),
-                *page_statements(page, truth),
+                *page_statements(page, truth, sureness),
                 *info_statements(own, sounds, labelled),
             ],
         )
