@@ -203,16 +203,15 @@ class LiveMicrophone:
     def counts(
         self, label: str, today: Today, known: ListeningThreshold
     ) -> tuple[int | None, int | None]:
-        """Count the `counted` events of a class since midnight, and those of the last night.
+        """Count the events of a class that began since midnight, and those of the last night.
 
         Returns
         -------
         int or None, int or None
             None in place of 0 if coverage is too low for a count of 0.
         """
-        day = len(self.counted(self.events(label, today.midnight)))
-        own = self.counted(self.events(label, today.night))
-        night = sum(event.start < today.morning for event in own)
+        day = len(self.events(label, today.midnight))
+        night = sum(event.start < today.morning for event in self.events(label, today.night))
         return day if day or known.day else None, night if night or known.night else None
 
     def counted(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
