@@ -82,9 +82,7 @@ def test_logs_keep_their_labels_and_reports_show_running_water(logs, tmp_path):
 
 def test_the_page_has_one_lane_of_running_water_and_counts_what_the_report_counts(logs):
     past = PastDays(RecorderAddress(logs, "home", UTC)).read(DAY, frozenset())
-    home = HomeDay(
-        [*past.state.microphones.values()], past.moment, UTC, past.listened, is_past=True
-    )
+    home = HomeDay([*past.state.microphones.values()], past.moment, UTC, is_past=True)
     (room,) = picture_of(home)["rooms"]
     lanes = {lane["label"]: lane for lane in room["lanes"]}
     assert lanes["running_water"]["words"] == "Running water"

@@ -592,9 +592,7 @@ def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
             e.path for e in entries if labelled.span.starts[0] <= e.start < labelled.span.ends[0]
         ]
         past = PastDays(RecorderAddress(home / "logs", entries[0].node, UTC)).read(day, frozenset())
-        page = HomeDay(
-            [*past.state.microphones.values()], past.moment, UTC, past.listened, is_past=True
-        )
+        page = HomeDay([*past.state.microphones.values()], past.moment, UTC, is_past=True)
         yield (
             day,
             [
