@@ -84,7 +84,9 @@ def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(
     assert rest[len(rows)] == f"hall is unsure of {60 * doubt['minutes']:.0f} s of these"
     counts = figures["day"]["counts"]
     parts = [f"{in_words(name).lower()} {counts[name]['counted']}" for name in ordered(counts)]
-    assert rest[len(rows) + 1].startswith("On Sunday, 2026-03-01, as the report counts sounds: ")
+    assert rest[len(rows) + 1].startswith(
+        "Labelled on Sunday, 2026-03-01, counted as in the report: "
+    )
     assert all(part in rest[len(rows) + 1] for part in parts)
     assert len(re.findall(r"minutes|frame", "".join(rest))) == 0, "one set of amounts"
     assert figures["streams"][0]["starter"] is False

@@ -18,6 +18,7 @@ from hearthlog.analyzer.activity.checked_minutes import (
 from hearthlog.analyzer.activity.event_counts import FEWEST, SET_APART
 from hearthlog.analyzer.activity.home_events import EventTotal
 from hearthlog.analyzer.activity.values import Duration
+from hearthlog.analyzer.logs.confused_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.summary import LogSummary
@@ -54,6 +55,9 @@ class Overview:
 
     def __init__(self, summary: LogSummary, zone: tzinfo, hidden: Collection[str] = ()) -> None:
         self._summary, self._zone, self._hidden = summary, zone, hidden
+        labels = {name for seconds in summary.segment_seconds.values() for name in seconds}
+        logs = [path for path in summary.files if path not in summary.layers]
+        self._common = common_names_of(logs[-1], labels) if logs else {}
 
     def lines(self, following: str | None) -> Iterator[str]:
         """Yield three lines: what this is; what was heard; whether all is well, the next step."""
@@ -66,7 +70,9 @@ class Overview:
     def bars(self) -> Iterator[tuple[str, list[ClassAmount]]]:
         """Yield the amounts of each class by microphone; silence has no bar."""
         of_scenarios = {
-            name: each for name, each in self._summary.segment_seconds.items() if _scenario(name)
+            name: self._in_common(each)
+            for name, each in self._summary.segment_seconds.items()
+            if _scenario(name)
         }
         for microphone, seconds in (self._segments() | of_scenarios).items():
             sounds = [name for name in seconds if class_name(name) != SILENCE]
@@ -153,7 +159,14 @@ class Overview:
     def _segments(self) -> dict[str, Counter[str]]:
         """Return the seconds in segments of the recorder's labels, by microphone and label."""
         seconds = self._summary.segment_seconds
-        return {name: each for name, each in seconds.items() if "/" not in name}
+        return {name: self._in_common(each) for name, each in seconds.items() if "/" not in name}
+
+    def _in_common(self, seconds: "Counter[str]") -> "Counter[str]":
+        """Add up classes that the model takes for one another."""
+        sums: Counter[str] = Counter()
+        for name in seconds:
+            sums[self._common.get(name, name)] += seconds[name]
+        return sums
 
     def _listened(self) -> dict[str, float]:
         lengths = {one["microphone"]: one["frame_seconds"] for one in self._summary.streams}
@@ -199,7 +212,7 @@ def day_line(day: date, totals: Mapping[str, EventTotal]) -> str:
     for name, (counted, television) in totals.items():
         text = f"{in_words(name).lower()} {counted or 'none'}"
         parts.append(f"{text} (and {television} beside a television)" if television else text)
-    return f"On {day:%A, %Y-%m-%d}, as the report counts sounds: {listed(parts, 'and')}"
+    return f"Labelled on {day:%A, %Y-%m-%d}, counted as in the report: {listed(parts, 'and')}"
 
 
 def next_step(summary: LogSummary, path: Path) -> str | None:

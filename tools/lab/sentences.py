@@ -21,6 +21,7 @@ import typer
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
+from hearthlog.analyzer.activity.home_events import event_totals
 from hearthlog.analyzer.activity.sureness import UNMEASURED, Sureness, read_sureness
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
@@ -47,7 +48,7 @@ from hearthlog.models.classes import (
     UNKNOWN,
     in_words,
 )
-from hearthlog.tools.cli.info_summary import Overview
+from hearthlog.tools.cli.info_summary import Overview, day_line
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.true_day import NEAR, TrueDay, TrueSound, read_sounds, true_day
 
@@ -560,7 +561,15 @@ def info_statements(
 ) -> Iterator[Statement]:
     """Yield the statements of the first lines of `info` about the logs of a day."""
     summary = summarise(logs)
-    true = true_day(sounds, day).everywhere
+    truth = true_day(sounds, day)
+    true = truth.everywhere
+    totals = event_totals(day.home, int(day.span.starts[0]), int(day.span.ends[0]))
+    line = day_line(day.day, totals)
+    for name, (counted, _) in totals.items():
+        if name in _sounds_of(day):
+            said = (counted, counted)
+            text = f"{in_words(name)} {counted}"
+            yield _counted(INFO, text, said, _count(truth, name), modest=is_modest(line))
     for line in Overview(summary, day.zone).lines(None):
         for name in (n for n in _sounds_of(day) if _mentions(line, n)):
             words = re.escape(in_words(name).lower())
