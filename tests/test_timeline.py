@@ -402,7 +402,7 @@ def test_names_of_classes_that_are_markup_or_paths_are_only_names(tmp_path):
     timeline = read_timeline([path])
     save_timeline(timeline, tmp_path / "a.rrd")
     strip = "/mic/lanes/live/00/1/000000"
-    assert fixed(tmp_path / "a.rrd", strip, "SeriesLines:names") == [in_words(hostile[0])]
+    assert {*fixed(tmp_path / "a.rrd", strip, "SeriesLines:names")} == {in_words(hostile[0])}
     assert "/mic/live/shares" in entities(tmp_path / "a.rrd")
 
 
@@ -833,7 +833,7 @@ def test_texts_of_one_length_are_drawn_in_the_same_order_in_every_process(tmp_pa
     canvas = Canvas(stream, home_clock(UTC, 0, HOUR))
     names = ["yelling", "speech", "music", "coughing", "crying", "laughing"]
     marks = [(10 * n, 10 * n + 5, name) for n, name in enumerate(names)]
-    drawn = DrawnLane("mic/lanes/all/00", 0.5, 10 * SECOND)
+    drawn = DrawnLane("mic/lanes/all/00", 0.5)
     drawn.show(reviewed_lane("mic", "", spans_at(*marks), no_spans()), canvas)
     path = tmp_path / "a.rrd"
     path.write_bytes(sink.read())

@@ -263,7 +263,7 @@ def check_seen(png, timeline):
             assert np.ptp(columns) >= 2
             lanes.setdefault(name, set()).update(rows.tolist())
             everywhere[:, picture.place(begin) - _CAP : picture.place(begin) + _CAP + 1] = False
-        assert 15 < max(lanes[name]) - min(lanes[name]) < 36, "one lane"
+        assert 15 < max(lanes[name]) - min(lanes[name]) < 45, "one lane"
         lane = everywhere[min(lanes[name]) : max(lanes[name]) + 1]
         assert lane.sum() <= 12, f"{name} where there was none"
     tops = sorted((min(rows), max(rows)) for rows in lanes.values())

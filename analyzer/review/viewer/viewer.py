@@ -488,6 +488,7 @@ def _span(selection: Any) -> tuple[int, int] | None:
 
 _LIGHT = 140  # of 255: brightness of the time cursor
 _SHORTEST = 40  # pixels of the time cursor
+_SCALE_STEP, _SCALE_ERROR = 0.25, 0.03  # of the scales of screens
 _MEMORY = "800MB"  # of a viewer with days of incoming data; then it drops the oldest
 
 
@@ -524,7 +525,7 @@ class WindowViewer(Viewer):
     def _size(self) -> ViewerSize | None:
         with Image.open(io.BytesIO(self._client.take_screenshot())) as image:
             if self._is_at_start():
-                self._scale = _scale_of(image)
+                self._scale = _scale_of(image) or self._scale
             return ViewerSize(image.width / self._scale, image.height / self._scale)
 
     def _is_at_start(self) -> bool:
@@ -546,13 +547,20 @@ class WindowViewer(Viewer):
         )
 
 
-def _scale_of(image: Image.Image) -> float:
-    """Return the pixels of a point, from a picture with the time cursor at the start."""
+def _scale_of(image: Image.Image) -> float | None:
+    """Return the pixels of a point, from a picture with the time cursor at the start.
+
+    None if the cursor is not where a screen would have it: the picture is not all drawn.
+    """
     light = np.asarray(image.convert("L"))[:-6, : image.width // 2] > _LIGHT
     # The cursor is a line from the ruler's left end down to the lower edge.
     lengths = np.argmin(light[::-1], axis=0)
     left = int(np.argmax(lengths))
-    return left / _RULER_LEFT if lengths[left] > _SHORTEST else 1.0
+    if lengths[left] <= _SHORTEST:
+        return None
+    scale = left / _RULER_LEFT
+    nearest = max(round(scale / _SCALE_STEP), 1 / _SCALE_STEP) * _SCALE_STEP
+    return scale if abs(scale - nearest) < _SCALE_ERROR * nearest else None
 
 
 def open_window(port: int | None = None, data: str | None = None) -> WindowViewer:
