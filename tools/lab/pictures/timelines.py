@@ -15,7 +15,8 @@ from hearthlog.analyzer.review.lanes import class_precision
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.ranking import USEFUL
 from hearthlog.analyzer.review.review_list import corrected_name
-from hearthlog.analyzer.review.session import ReviewItem, ReviewSession, queue_spans, review_items
+from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
+from hearthlog.analyzer.review.session import ReviewSession
 from hearthlog.analyzer.review.timeline_reader import MOST_FRAMES, read_frames, read_timeline
 from hearthlog.analyzer.review.viewer.viewer import WindowViewer, open_hidden
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
