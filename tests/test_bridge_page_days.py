@@ -6,6 +6,7 @@ import re
 import time
 import wave
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from http.client import HTTPConnection
 from types import SimpleNamespace
 from urllib.parse import quote
@@ -19,7 +20,7 @@ from servedhome import JSON, PALE_TEXTS, Phone, proxying, serving
 from viewers import browsing, patiently
 
 from hearthlog.analyzer.activity.events import SoundEvent
-from hearthlog.analyzer.bridge.commands import explained
+from hearthlog.analyzer.bridge.commands import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
@@ -30,6 +31,7 @@ from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import languages, preferred_language, words_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time, today
+from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.models.classes import CLASSES, RUNNING_WATER
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -162,6 +164,27 @@ def test_the_counts_of_the_sentence_are_those_below_it():
     assert (lane["today"], lane["night"]) == (2, 2)
     assert [time for time, _ in lane["times"][0]["times"]] == ["06:13", "02:10"]
     assert lane["times"][0]["times"][0][1].startswith("mic-coughing-")
+
+
+def test_what_people_say_of_a_sound_is_what_the_page_counts(tmp_path):
+    talking = [(13 + n / 60, 3, "speech") for n in range(60)]
+    coughs = [(hour, 4, "coughing") for hour in (9.26, 10.5, 11.5, 13.409, 13.609)]
+    home = home_at(15, tiled((-3, 15), *talking, *coughs))
+    corrections = EventCorrections(tmp_path, "home")
+    (microphone,) = home.microphones
+    events = microphone.events("coughing", 0)
+    said = ["television", "crying", "", "coughing", ""]  # the last two beside a television
+    marks = [
+        Mark("mic", event.start + 1, event.end, label)
+        for event, label in zip(events, said, strict=True)
+        if label
+    ]
+    home = home._replace(corrections=partial(corrections.labels, marks=marks))
+    picture = picture_of(home)
+    lanes = {lane["label"]: lane for lane in picture["rooms"][0]["lanes"]}
+    assert [time for time, _ in lanes["coughing"]["times"][0]["times"]] == ["13:24", "11:30"]
+    assert [time for time, _ in lanes["crying"]["times"][0]["times"]] == ["10:30"]
+    assert picture["sentence"].startswith("Today: coughing twice (11:30 and 13:24) and crying once")
 
 
 def test_hours_that_no_log_has_are_hatched_and_no_0_is_said_of_them():
@@ -600,7 +623,8 @@ def test_at_1366_the_sounds_stand_beside_the_picture(phone, lived):
 _SHIFTS = """
 window.moved = [];
 new PerformanceObserver((list) => moved.push(...list.getEntries().map(({ value, sources }) =>
-  [value, sources.map(({ node }) => node?.id || node?.nodeName).join()])))
+  [value, sources.map(({ node, previousRect, currentRect }) =>
+    [node?.id || node?.className || node?.nodeName, previousRect, currentRect])])))
   .observe({ type: "layout-shift", buffered: true });
 """
 

@@ -149,7 +149,7 @@ def test_a_sound_that_two_rooms_hear_is_one_and_names_both(home, hearthlog):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--label", "cugh"], "no class 'cugh' here; there are "),
+        (["--label", "cugh"], "the model of these logs knows no 'cugh'; it knows "),
         (["--day", "2026-04-01"], "no logs of 2026-04-01"),
         (["--day", "soon"], "--day soon: not a day such as 2026-03-01"),
         (["--labels", "none"], "no labelling 'none' beside these logs"),

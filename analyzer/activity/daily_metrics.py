@@ -51,6 +51,8 @@ class HomeMinutes:
     sounding, television, gone_through : np.ndarray [shape=(n,)], bool
         Whether the labels have any sound, or a television-like sound; whether a person reviewed
         the complete minute.
+    reviewed : Spans
+        Reviewed by a person, at all microphones.
     labelled, corrected, certain : dict of str to np.ndarray [shape=(n,)], int64
         By class except silence, the number of events that begin in each minute: labelled events
         outside reviewed spans; all events after corrections; corrected events that begin in
@@ -61,6 +63,7 @@ class HomeMinutes:
     sounding: Bool
     television: Bool
     gone_through: Bool
+    reviewed: Spans
     labelled: dict[str, Int64]
     corrected: dict[str, Int64]
     certain: dict[str, Int64]
@@ -71,14 +74,18 @@ class HomeMinutes:
         return self.rows((of >= 0) & (self.starts < spans.ends[of]))
 
     def count(self, name: str, rates: CheckedRates | None) -> Count:
-        """Count the events of a class; `SET_APART` classes only in minutes without a television."""
+        """Count the events of a class.
+
+        `SET_APART` classes count in minutes without a television, and where a person reviewed.
+        """
         own = self.rows(~self.television) if name in SET_APART else self
         if name not in own.labelled:
             return Count(rates=rates)
         rest = ~own.gone_through
+        beside = int(self.certain[name].sum() - own.certain[name].sum())
         return Count(
-            int(own.corrected[name].sum()),
-            int(own.certain[name].sum()),
+            int(own.corrected[name].sum()) + beside,
+            int(own.certain[name].sum()) + beside,
             strata_of(own.labelled[name][rest], own.sounding[rest]),
             rates,
         )
@@ -93,14 +100,14 @@ class HomeMinutes:
         """
         if name not in SET_APART:
             return starts
-        television = self.starts[self.television]
-        return starts[~np.isin(starts // MINUTE * MINUTE, television)]
+        beside = np.isin(starts // MINUTE * MINUTE, self.starts[self.television])
+        return starts[~beside | (rows_at(self.reviewed, starts) >= 0)]
 
     def beside_television(self, name: str) -> int:
-        """Count labelled events of a class in minutes with a television; 0 outside `SET_APART`."""
+        """Count the events of a `SET_APART` class that `count` leaves out; 0 for other classes."""
         if name not in SET_APART or name not in self.labelled:
             return 0
-        return int(self.corrected[name][self.television].sum())
+        return int((self.corrected[name] - self.certain[name])[self.television].sum())
 
     def rows(self, rows: Bool) -> "HomeMinutes":
         """Select rows."""
@@ -109,6 +116,7 @@ class HomeMinutes:
             self.sounding[rows],
             self.television[rows],
             self.gone_through[rows],
+            self.reviewed,
             {name: counts[rows] for name, counts in self.labelled.items()},
             {name: counts[rows] for name, counts in self.corrected.items()},
             {name: counts[rows] for name, counts in self.certain.items()},
@@ -143,6 +151,7 @@ def home_minutes(
         sounding_minutes(labels, edges),
         television_minutes(labels, edges),
         lengths(known, edges) == MINUTE,
+        known,
         {name: begun(unknown(name)) for name in events},
         {name: begun(starts) for name, starts in events.items()},
         {name: begun(starts[rows_at(known, starts) >= 0]) for name, starts in events.items()},

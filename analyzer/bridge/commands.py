@@ -3,6 +3,7 @@
 import errno
 import queue
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import timedelta
@@ -151,6 +152,33 @@ class EventCorrections:
             return None
         mark = own[common.index(max(common))]
         return Correction(mark.label, mark.reviewer == REVIEWER)
+
+    def labels(
+        self, events: Sequence[SoundEvent], marks: Sequence[Mark] | None = None
+    ) -> dict[str, str]:
+        """Return the classes that people gave to events of one class and microphone, by id.
+
+        Parameters
+        ----------
+        events : sequence of SoundEvent
+            Sorted by start; they do not overlap.
+        marks : sequence of Mark, optional
+            As for `of`.
+        """
+        found: dict[str, str] = {}
+        longest: dict[str, int] = {}
+        ends = [event.end for event in events]
+        for mark in self._marks if marks is None else marks:
+            if not events or mark.microphone != events[0].microphone:
+                continue
+            for event in events[bisect_right(ends, mark.start) :]:
+                if event.start >= mark.end:
+                    break
+                common = min(mark.end, event.end) - max(mark.start, event.start)
+                if common > longest.get(event.id, 0):
+                    longest[event.id], found[event.id] = common, class_name(mark.label)
+        own = self._own
+        return found | {event.id: own[event.id] for event in events if event.id in own}
 
     def add(self, event: SoundEvent, label: str) -> None:
         """Correct the class of an event; raise `BridgeError` if it cannot be marked."""

@@ -65,7 +65,7 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
             most, day = max(counts, key=lambda pair: pair[0].labelled)
             if len(counts) > 1 and most.labelled > total.labelled / len(days):
                 text += f", most on {short_day(day.day)} ({most.labelled})"
-            sounds.append((text, total.range is not None))
+            sounds.append((text, total.certain == total.labelled))
     return " ".join([*parts, *_by_sound(sounds)])
 
 
@@ -75,7 +75,7 @@ def _by_sound(sounds: Sequence[tuple[str, bool]]) -> Iterator[str]:
     Parameters
     ----------
     sounds : sequence of (str, bool)
-        Counts of a class in words, and whether all of them have a range.
+        Counts of a class in words, and whether a person reviewed all of it.
     """
     yield from (f"{_capital(text)}." for text, is_known in sounds if is_known)
     if labelled := [text for text, is_known in sounds if not is_known]:
@@ -88,7 +88,7 @@ def is_quiet(day: DayMetrics) -> bool:
 
 
 def amount(name: str, count: Count, *, named: bool = True) -> str:
-    """Return a number of events in words: `two bouts of coughing`, `crying once`.
+    """Return a number of events in words, as labelled: `two bouts of coughing`, `crying once`.
 
     Parameters
     ----------
@@ -96,10 +96,6 @@ def amount(name: str, count: Count, *, named: bool = True) -> str:
         Whether to name the class; else `two`, `once`.
     """
     several, number = several_in_words(name).lower(), number_in_words(count.labelled)
-    if count.range is not None and count.range != (count.labelled, count.labelled):
-        low, high = count.range
-        noun = f" {several}" if named else ""
-        return f"{low} to {high}{noun} ({count.labelled} labelled)"
     if several.startswith("times of "):
         often = _REPEATED.get(count.labelled, f"{number} times")
         return f"{in_words(name).lower()} {often}" if named else often
@@ -157,7 +153,7 @@ def _runs(day: DayMetrics, lively: Bool) -> list[str]:
 
 
 def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
-    """Yield the counts of coughing, crying and shouting, and whether they have a range."""
+    """Yield the counts of coughing, crying and shouting, and whether a person reviewed them."""
     after = one(int(day.night.ends[0]), int(day.span.ends[0]))
     for name in _WORRYING:
         parts: list[str] = []
@@ -168,7 +164,7 @@ def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
                 count = day.home.minutes.between(span).count(name, day.home.rates.get(name))
                 times = f" ({times_in_words(starts, day.zone)})" if len(starts) <= _TIMES else ""
                 parts.append(f"{amount(name, count, named=not parts)} {when}{times}")
-                is_known &= count.range is not None
+                is_known &= count.certain == count.labelled
         if parts:
             yield " and ".join(parts), is_known
 

@@ -291,7 +291,8 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
             continue
         right = [Cell(account.rightness(name))] * account.checked
         rows.append([Cell(in_words(name), colour=colour_on_paper(name)), *cells, *right])
-    return PageTable([*heads, *["Right here"] * account.checked], rows, "sounds")
+    kind = "sounds stack" if account.checked else "sounds"  # five columns are too many for a phone
+    return PageTable([*heads, *["Right here"] * account.checked], rows, kind)
 
 
 def _with_television(cell: Cell, name: str, day: DayMetrics) -> Cell:

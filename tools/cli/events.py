@@ -189,7 +189,11 @@ def _chosen_classes(
         meant = [name for name in sounds if in_words(name).lower() == label.lower()]
         meant = meant or meant_by(label, sounds)
         if len(meant) != 1:
-            raise DataError(f"no class {label[:64]!r} here; there are {', '.join(sounds)}")
+            there = ", ".join(in_words(name).lower() for name in sounds)
+            raise DataError(
+                f"the model of these logs knows no {label[:64]!r}; it knows {there}. Another model "
+                "may: `hearthlog models list`, then `hearthlog relabel`"
+            )
         chosen += meant
     return list(dict.fromkeys(chosen))
 

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from hearthlog.models.classes import in_words, ordered
 from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.terminal import NAME_WIDTH, moment, print_confusion, print_table
@@ -21,6 +20,8 @@ _EVENTS = ("1-s F1", "event F1")
 
 def print_scores(scores: "Scores", detections: "Detections | None" = None, hours: int = 24) -> None:
     """Print scores by class and confusions; false alarms are per number of hours."""
+    from hearthlog.models.classes import ordered
+
     rows = [
         (
             _words(name),
@@ -60,12 +61,16 @@ def print_counts(classes: Sequence[str], confusion: Sequence[Sequence[int]]) -> 
 
 
 def _print_confusion(classes: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
+    from hearthlog.models.classes import ordered
+
     places = [classes.index(name) for name in ordered(classes)]
     cells = [[rows[row][column] for column in places] for row in places]
     print_confusion([_words(classes[place]) for place in places], cells, title)
 
 
 def _words(name: str, width: int = NAME_WIDTH) -> str:
+    from hearthlog.models.classes import in_words
+
     return shortened(in_words(name), width)
 
 
@@ -125,6 +130,8 @@ _AMOUNTS = "minutes a", "minutes b", "both", "segments a", "segments b", "agreem
 
 def print_difference(difference: "LabellingDifference", spans: int) -> None:
     """Print agreement, amounts, confusion, and the longest disagreements."""
+    from hearthlog.models.classes import ordered
+
     a, b, days = difference.a, difference.b, list(difference.days)
     span = days[0] if len(days) == 1 else f"{days[0]} to {days[-1]}"
     print(f"a: {a}, {difference.minutes_a:.1f} minutes")
@@ -132,7 +139,7 @@ def print_difference(difference: "LabellingDifference", spans: int) -> None:
     print(f"compared where both have a label; days are those of UTC, {span}")
     for name, only in ((a, difference.only_a), (b, difference.only_b)):
         if only:
-            print(f"only {name} has: {', '.join(map(in_words, ordered(only)))}")
+            print(f"only {name} has: {', '.join(map(_words, ordered(only)))}")
     rows = list(_amounts("all", difference.total))
     if len(days) > 1:
         for day, amounts in difference.days.items():
@@ -148,6 +155,8 @@ def print_difference(difference: "LabellingDifference", spans: int) -> None:
 
 
 def _amounts(title: str, amounts: "Amounts") -> Iterator[tuple[str, ...]]:
+    from hearthlog.models.classes import ordered
+
     classes = amounts.per_class.values()
     yield (
         title,

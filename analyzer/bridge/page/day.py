@@ -1,6 +1,6 @@
 """A day on the page: its picture, counts, times, and one sentence about it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import tzinfo
 from typing import Any, NamedTuple
 
@@ -42,6 +42,21 @@ class DaySpan(NamedTuple):
         return round((inside - self.start) / (self.end - self.start), _DIGITS)
 
 
+class ClassSounds(NamedTuple):
+    """Events of a class on a page, and those of them that count."""
+
+    events: list[SoundEvent]
+    counted: list[SoundEvent]
+
+
+def _start_of(event: SoundEvent) -> int:
+    return event.start
+
+
+def _no_corrections(_: Sequence[SoundEvent]) -> Mapping[str, str]:
+    return {}
+
+
 class HomeDay(NamedTuple):
     """The microphones of a home on a day.
 
@@ -49,6 +64,8 @@ class HomeDay(NamedTuple):
     ----------
     moment : Today
         The current day; for a past day, its last moment.
+    corrections : callable
+        Returns the classes that people gave to events of one class, by id.
     """
 
     microphones: Sequence[LiveMicrophone]
@@ -56,6 +73,27 @@ class HomeDay(NamedTuple):
     zone: tzinfo
     words: Words = ENGLISH
     is_past: bool = False
+    corrections: Callable[[Sequence[SoundEvent]], Mapping[str, str]] = _no_corrections
+
+    def sounds(self, microphone: LiveMicrophone, since: int) -> dict[str, ClassSounds]:
+        """Return the events of each shown class since a time, corrected by people."""
+        names = microphone.shown_names([*microphone.classes, *microphone.labels()])
+        found = {name: ClassSounds([], []) for name in names if name != SILENCE}
+        for label in [*found]:
+            events = microphone.shown_events(label, since)
+            given = self.corrections(events)
+            counted = {event.id for event in microphone.counted(events)}
+            for event in events:
+                name = given.get(event.id, label)
+                own = found.get(microphone.common_names.get(name, name))
+                if own is not None:
+                    own.events.append(event)
+                    if event.id in counted or event.id in given:
+                        own.counted.append(event)
+        for own in found.values():
+            own.events.sort(key=_start_of)
+            own.counted.sort(key=_start_of)
+        return {name: found[name] for name in ordered(found)}
 
     def span(self) -> DaySpan:
         """Return the day from midnight to midnight."""
@@ -90,11 +128,8 @@ def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
         "room": room(microphone.name),
         "gaps": [(day.place(a), day.place(b)) for a, b in _gaps(microphone, day, home)],
         "lanes": [
-            _lane(microphone, label, day, home, known)
-            for label in ordered(
-                microphone.shown_names([*microphone.classes, *microphone.labels()])
-            )
-            if label != SILENCE
+            _lane(label, sounds, day, home, known)
+            for label, sounds in home.sounds(microphone, 0).items()
         ],
     }
 
@@ -108,18 +143,17 @@ def _gaps(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> list[tuple
 
 
 def _lane(
-    microphone: LiveMicrophone, label: str, day: DaySpan, home: HomeDay, known: ListeningThreshold
+    label: str, sounds: ClassSounds, day: DaySpan, home: HomeDay, known: ListeningThreshold
 ) -> Any:
     today, words = home.moment, home.words
-    every = microphone.shown_events(label, day.start - 24 * _HOUR)
-    events = [event for event in every if event.start < day.end]
-    counted = microphone.counted(events)
+    events = [e for e in sounds.events if day.start - 24 * _HOUR <= e.start < day.end]
+    counted = [e for e in sounds.counted if e.start < day.end]
     of_night = [e for e in counted if today.night <= e.start < today.morning]
     of_day = [e for e in counted if e.start >= today.midnight]
     beside = sum(e.start >= today.midnight for e in events) - len(of_day)
     count: int | None = len(of_day) if of_day or known.day else None
     night: int | None = len(of_night) if of_night or known.night else None
-    last = (events if home.is_past and events else [None, *microphone.shown_events(label, 0)])[-1]
+    last = (events if home.is_past and events else [None, *sounds.events])[-1]
     at = "" if last is None else words.when(last.end, today.now, day.zone)
     name = words.class_words(label)
     often = words.text("count.not known") if count is None else words.times(count)
@@ -224,10 +258,9 @@ def _events_of(home: HomeDay, start: int, end: int) -> SoundsOfRooms:
     """Return the events that begin in a time span, the most important class first."""
     found: SoundsOfRooms = {}
     for microphone in home.microphones:
-        for label in microphone.shown_names(microphone.labels()):
-            every = microphone.counted(microphone.shown_events(label, start))
-            own = [event for event in every if event.start < end]
-            if own and label != SILENCE:
+        for label, sounds in home.sounds(microphone, start).items():
+            own = [event for event in sounds.counted if event.start < end]
+            if own:
                 found.setdefault(label, {})[microphone.name] = own
     return {name: found[name] for name in ordered(found)}
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import date
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -181,8 +182,10 @@ class HomePage:
         day = local_time(moment.now, news.zone).date()
         key = self._events_key, self._corrections.number, day, self._sureness, _classes_key(news)
         view.put_changed("events", key, lambda: self._last_bouts(news, words))
-        home = HomeDay([*news.state.microphones.values()], news.today, news.zone, words)
-        view.put_changed("day", _day_key(news), lambda: picture_of(home))
+        every, corrections = [*news.state.microphones.values()], self._corrections
+        home = HomeDay(every, news.today, news.zone, words, corrections=corrections.labels)
+        key_of_day = _day_key(news), corrections.number
+        view.put_changed("day", key_of_day, lambda: picture_of(home))
 
     def close(self) -> None:
         """Stop the server and its streams."""
@@ -285,7 +288,8 @@ class HomePage:
         day = self._past.read(requested, self._state.never_tell)
         moment, zone = day.moment, self._home.zone
         microphones = [*day.state.microphones.values()]
-        home = HomeDay(microphones, moment, zone, words, is_past=True)
+        given = partial(self._corrections.labels, marks=day.marks)
+        home = HomeDay(microphones, moment, zone, words, is_past=True, corrections=given)
         every = bouts(events_between(microphones, moment.midnight, moment.now + 1))
         shown = self._shown(words, moment.now, is_alone=len(microphones) == 1, marks=day.marks)
         shown = shown._replace(common_names=day.state.common_names)
