@@ -643,10 +643,7 @@ def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, widt
             home.log.heard(label, minutes, 30)
         home.log.hears("silence")
         with home.stream() as part:
-            part(
-                "day",
-                lambda day: any(each["bars"] for room in day["rooms"] for each in room["lanes"]),
-            )
+            part("day", lambda day: len(drawn_lanes(day)) == 3)
         added = phone._browser.call("Page.addScriptToEvaluateOnNewDocument", source=_SHIFTS)
         # Scroll bars of a phone lie above the page.
         phone._browser.call("Emulation.setScrollbarsHidden", hidden=width < 640)
