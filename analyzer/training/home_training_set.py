@@ -31,6 +31,7 @@ from hearthlog.models.classes import (
     OTHER,
     OTHER_NEGATIVE,
     SILENCE,
+    TELEVISION,
     UNKNOWN,
     class_name,
     meant_by,
@@ -90,9 +91,11 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
     marked: list[Recording] = []
     candidates: list[Candidates] = []
     counts, window = _Counts(), features.window_frames
+    marked_as: set[str] = set()
     for folder in folders:
         space = model.description.embedding_space
         sounds = list(read_reviewed_sound(folder, features, scenario, space))
+        marked_as |= {class_name(mark.label) for sound in sounds for mark in sound.marks}
         taught = [counts.add(sound, features, model.classes) for sound in sounds]
         marked += marked_recordings(taught, folder, features, model.description.gate)
         candidates += [confirmed_segments(sound, model.classes, window) for sound in sounds]
@@ -117,6 +120,8 @@ def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> H
     if CONFIRMED in segments.collection_names and HOME not in segments.collection_names:
         segments = cut_recordings([], learned, features)
     nothing = "none of the marks can be learned from" if counts.marks else "nothing is marked"
+    if marked_as == {TELEVISION}:
+        nothing = "only a television is marked so far, and nothing is learned from that"
     return HomeTrainingSet(segments, notes, "" if len(segments) else nothing)
 
 

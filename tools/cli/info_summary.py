@@ -33,6 +33,7 @@ from hearthlog.tools.cli.terminal import JUDGED_BY, number
 
 _DAY = 86_400  # seconds
 _NO_SOUNDS = {SILENCE, UNKNOWN}
+_HOUR = 60  # minutes
 _MOST_NAMED = 3  # classes in the line of what was labelled most
 
 
@@ -198,7 +199,7 @@ def _hours(seconds: float) -> str:
 def _minutes(minutes: float) -> str:
     if minutes < 1:
         return f"{60 * minutes:.0f} s"
-    return f"{minutes:.1f} min" if minutes < 100 else Duration.show(minutes)
+    return f"{minutes:.1f} min" if minutes < _HOUR else Duration.show(minutes)
 
 
 def amount_text(one: ClassAmount) -> str:
