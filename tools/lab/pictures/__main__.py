@@ -147,6 +147,7 @@ def _save(image: Image.Image, path: Path) -> None:
     others = image.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE).getpalette()
     palette = Image.new("P", (1, 1))
     palette.putpalette(often + others[: 3 * _COLOURS])
+    path.parent.mkdir(parents=True, exist_ok=True)
     image.quantize(palette=palette, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
