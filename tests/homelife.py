@@ -1,9 +1,10 @@
 """Days of a home as logs, written without sound: only what a report reads of them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, date, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -57,17 +58,25 @@ def write_day(  # noqa: PLR0913
     health: Iterable[tuple[float, int, str]] = (),
     timezone: str | None = None,
     file_hours: int = 1,
+    others: Mapping[str, Iterable[Event]] = MappingProxyType({}),
 ) -> list[Path]:
-    """Write the logs of a day: events, and silence where there is no gap, both in UTC."""
+    """Write the logs of a day: events, and silence where there is no gap, both in UTC.
+
+    The recorder may have other microphones, with events of their own and no gap.
+    """
     begin, gaps, hours, step = midnight(day), list(gaps), list(hours), file_hours
-    rows = list(_tiled(sorted(events), gaps, hours))
+    rooms = {microphone: list(_tiled(sorted(events), gaps, hours))}
+    rooms |= {name: list(_tiled(sorted(own), [], hours)) for name, own in others.items()}
     return [
         _write_hour(
             log_path(root, node, begin + hour * HOUR * NANOSECONDS),
             microphone,
             list(classes),
             begin,
-            [row for row in rows if hour * HOUR < row[0] + row[1] <= (hour + step) * HOUR],
+            {
+                name: [row for row in rows if hour * HOUR < sum(row[:2]) <= (hour + step) * HOUR]
+                for name, rows in rooms.items()
+            },
             [gap for gap in gaps if hour * HOUR < gap[0] + gap[1] <= (hour + step) * HOUR],
             [said for said in health if hour * HOUR <= said[0] < (hour + step) * HOUR],
             {"version": "0", "node": node} | ({"timezone": timezone} if timezone else {}),
@@ -144,22 +153,26 @@ def _tiled(events: list[Event], gaps: list[tuple[float, float, str]], hours: lis
 
 
 def _write_hour(  # noqa: PLR0913, PLR0917
-    path, microphone, classes, begin, rows, gaps, health, about
+    path, microphone, classes, begin, rooms, gaps, health, about
 ) -> Path:
-    topics = topics_of(microphone, FEATURE_NAMES, classes)
-    writer = LogWriter(path, topics, about)
+    topics = [each for name in rooms for each in topics_of(name, FEATURE_NAMES, classes)]
+    writer = LogWriter(path, [*{each.name: each for each in topics}.values()], about)
     written = []
-    starts = begin + np.array([round(row[0] * 1000) for row in rows], np.int64) * 1_000_000
-    ends = begin + np.array([round((r[0] + r[1]) * 1000) for r in rows], np.int64) * 1_000_000
-    if rows:
-        fields = {
-            "header.stamp": starts,
-            "header.frame_id": microphone,
-            "duration": ends - starts,
-            "label": [row[2] for row in rows],
-            "confidence": np.array([row[3] for row in rows], np.float32),
-        }
-        writer.write_columns([TopicBatch(f"/{microphone}/segment", ends, fields)])
+    batches = []
+    for name, rows in rooms.items():
+        starts = begin + np.array([round(row[0] * 1000) for row in rows], np.int64) * 1_000_000
+        ends = begin + np.array([round((r[0] + r[1]) * 1000) for r in rows], np.int64) * 1_000_000
+        if rows:
+            fields = {
+                "header.stamp": starts,
+                "header.frame_id": name,
+                "duration": ends - starts,
+                "label": [row[2] for row in rows],
+                "confidence": np.array([row[3] for row in rows], np.float32),
+            }
+            batches.append(TopicBatch(f"/{name}/segment", ends, fields))
+    if batches:
+        writer.write_columns(batches)
     for start, seconds, reason in gaps:
         stamp = begin + round(start * NANOSECONDS)
         length = round(seconds * NANOSECONDS)

@@ -144,6 +144,38 @@ def test_the_routine_counts_and_measures_what_the_report_does(logs):
     assert {figure.kind for figure in values} >= {COUNT, LENGTH}
 
 
+def test_two_microphones_are_counted_apart_by_the_bridge_and_joined_by_the_report(tmp_path, capfd):
+    near = [(at(f"{hour:02}:10:00"), 2.0, "coughing", 0.9) for hour in range(3, 20)]
+    far = [(at(f"{hour:02}:10:05"), 2.0, "coughing", 0.9) for hour in range(3, 9)]
+    far += [(at(f"{hour:02}:40:00"), 2.0, "coughing", 0.9) for hour in range(10, 14)]
+    own = {"microphone": "bath", "timezone": "Europe/Vienna", "others": {"kitchen": far}}
+    write_day(tmp_path, DAY, near, **own)
+    start, end = day_span(DAY, ZONE)
+    states = follow_home(
+        RecorderAddress(tmp_path, "home", ZONE), start, stop := Event(), pytest.fail
+    )
+    state = next(state for state, _, _ in states if state.caught_up)
+    stop.set()
+    totals = Totals(BridgeState(tmp_path / "state", "home", pytest.fail), start, pytest.fail)
+    counted = {(one.microphone, one.label): one.events for one in totals.count(state, end)}
+    assert counted == {("bath", "coughing"): 17, ("kitchen", "coughing"): 10}
+    moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
+    rooms = picture_of(HomeDay([*state.microphones.values()], moment, ZONE))["rooms"]
+    shown = {
+        room["room"]: lane["today"]
+        for room in rooms
+        for lane in room["lanes"]
+        if lane["label"] == "coughing"
+    }
+    assert shown == {"Bath": 17, "Kitchen": 10}
+    together = {"coughing": {"counted": 21, "television": 0}}  # six were heard by both
+    _, day = day_metrics(tmp_path)
+    assert day.count("coughing").labelled == 21
+    listed = json.loads(run(capfd, "events", tmp_path, "--day", DAY, "--json").stdout)
+    assert listed["counts"] == together
+    assert json.loads(run(capfd, "info", tmp_path, "--json").stdout)["day"]["counts"] == together
+
+
 def test_the_contents_of_logs_name_the_counts_of_the_report(logs, capfd):
     found = json.loads(run(capfd, "info", logs, "--json").stdout)["day"]
     _, day = day_metrics(logs)

@@ -173,10 +173,10 @@ def test_what_people_say_of_a_sound_is_what_the_page_counts(tmp_path):
     corrections = EventCorrections(tmp_path, "home")
     (microphone,) = home.microphones
     events = microphone.events("coughing", 0)
-    said = ["television", "crying", "", "coughing", ""]  # the last two beside a television
+    answers = ["television", "crying", "", "coughing", ""]  # the last two beside a television
     marks = [
         Mark("mic", event.start + 1, event.end, label)
-        for event, label in zip(events, said, strict=True)
+        for event, label in zip(events, answers, strict=True)
         if label
     ]
     home = home._replace(corrections=partial(corrections.labels, marks=marks))

@@ -434,5 +434,5 @@ def test_the_pictures_show_the_program_of_today():
 def test_a_picture_is_older_than_what_it_shows_once_that_is_drawn_otherwise(monkeypatch):
     monkeypatch.setattr(drawing, "_THICKNESS", 99.0)
     reviews = "review-day", "first-evening-review", "first-evening-queue"
-    told = "shows an earlier program: run `make pictures`"
-    assert outdated(ROOT) == [f"docs/images/{name}.png {told}" for name in reviews]
+    text = "shows an earlier program: run `make pictures`"
+    assert outdated(ROOT) == [f"docs/images/{name}.png {text}" for name in reviews]

@@ -1,4 +1,4 @@
-"""What people are told of a composed day is compared with what is true of it."""
+"""The statements about a composed day are compared with the truth."""
 
 from datetime import date
 

@@ -1,4 +1,4 @@
-"""`python -m hearthlog.tools.lab.sentences HOME …`: whether what people are told of a day is so.
+"""`python -m hearthlog.tools.lab.sentences HOME …`: whether statements about a day are true.
 
 Each statement of the report of a day, of the page of the home and of `info` is compared with the
 table of the true sounds of a composed home, `events.csv`: start, end, label, and from whom.
@@ -73,7 +73,7 @@ _LENGTH = re.compile(r"(?:(\d+) h )?([\d.]+) (min|s|h)\b")
 
 
 class Statement(NamedTuple):
-    """What people are told, and what is true.
+    """A statement on a surface, and the truth.
 
     Attributes
     ----------
@@ -180,25 +180,25 @@ def _judged(surface: str, text: str, truth: str, *, right: bool, modest: bool) -
 
 
 def _counted(
-    surface: str, text: str, said: tuple[int, int], true: float, *, modest: bool
+    surface: str, text: str, stated: tuple[int, int], true: float, *, modest: bool
 ) -> Statement:
-    low, high = said
+    low, high = stated
     if low == high:
         return _judged(surface, text, f"{true:g}", right=is_close(low, true), modest=modest)
     right = low <= true <= high
     return Statement(surface, text, f"{true:g}", HOLDS if right else FALSE, is_range=True)
 
 
-def _lasted(surface: str, text: str, said: float, true: float, *, modest: bool) -> Statement:
-    return _judged(surface, text, f"{true:.1f} min", right=is_close(said, true), modest=modest)
+def _lasted(surface: str, text: str, stated: float, true: float, *, modest: bool) -> Statement:
+    return _judged(surface, text, f"{true:.1f} min", right=is_close(stated, true), modest=modest)
 
 
 def _at_times(
     surface: str, text: str, name: str, clocks: Sequence[str], truth: TrueDay, *, modest: bool
 ) -> Statement:
     wrong = [each for each in clocks if not _is_true_time(truth, name, each)]
-    said = f"none at {', '.join(wrong)}" if wrong else "so it is"
-    return _judged(surface, text, said, right=not wrong, modest=modest)
+    stated = f"none at {', '.join(wrong)}" if wrong else "so it is"
+    return _judged(surface, text, stated, right=not wrong, modest=modest)
 
 
 def _is_true_time(truth: TrueDay, name: str, clock: str) -> bool:
@@ -279,12 +279,12 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
     hours, modest = day.sound_by_hour, is_modest(first)
     lively = hours >= LIVELY_MINUTES
     if runs := _RUN.findall(first):
-        told = np.zeros(len(hours), bool)
+        has_sound = np.zeros(len(hours), bool)
         for start, end in runs:
-            told[int(start[:2]) : int(end[:2])] = True
+            has_sound[int(start[:2]) : int(end[:2])] = True
         slack = 1 + _TOLERANCE
-        wrong = (told & (hours * slack < LIVELY_MINUTES)) | (
-            ~told & (hours > LIVELY_MINUTES * slack)
+        wrong = (has_sound & (hours * slack < LIVELY_MINUTES)) | (
+            ~has_sound & (hours > LIVELY_MINUTES * slack)
         )
         yield _judged(
             REPORT,
@@ -294,8 +294,8 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
             modest=modest,
         )
     elif match := re.search(r"sound in (\d+) of|for (\w+) hours", first):
-        said = _number(match[1] or match[2])
-        yield _counted(REPORT, first, (said, said), int(lively.sum()), modest=modest)
+        stated = _number(match[1] or match[2])
+        yield _counted(REPORT, first, (stated, stated), int(lively.sum()), modest=modest)
     elif "quiet" in first:
         yield _judged(
             REPORT, first, f"{lively.sum()} hours with sound", right=not lively.any(), modest=modest
@@ -309,12 +309,12 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
     day = truth.metrics
     after = one(int(day.night.ends[0]), int(day.span.ends[0]))
     modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
-    for said in sentence.split("; "):
-        for name in (name for name in _sounds_of(day) if _mentions(said, name)):
+    for stated in sentence.split("; "):
+        for name in (name for name in _sounds_of(day) if _mentions(stated, name)):
             known = {in_words(name).lower(), several_in_words(name).lower()}
             words = f"(?:{'|'.join(map(re.escape, sorted(known)))})"
             after_number = rf"(?:bouts? of |times of )?{words}|after"
-            for part in re.split(r" and (?=\w+ after 07:00)", said):
+            for part in re.split(r" and (?=\w+ after 07:00)", stated):
                 bare = re.sub(r"\([^)]*\)", "", part).lower()
                 match = re.search(rf"{words} ({_NUMBER})", bare) or re.search(
                     rf"({_NUMBER})(?: to ({_NUMBER}))? (?={after_number})", bare
@@ -335,9 +335,11 @@ def _gist(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
     if match := re.search(r"Most of the sound[^:]*: (.*)\.", text):
         names = [name for name in day.home.classes if name != SILENCE]
         lasting = sorted(names, key=lambda name: -_minutes(true, name))
-        said = [name for name in names if _mentions(match[1], name)]
-        shown = ", ".join(f"{in_words(n)} {_minutes(true, n):.0f}" for n in lasting[: len(said)])
-        yield _judged(REPORT, text, shown, right={*said} == {*lasting[: len(said)]}, modest=modest)
+        stated = [name for name in names if _mentions(match[1], name)]
+        shown = ", ".join(f"{in_words(n)} {_minutes(true, n):.0f}" for n in lasting[: len(stated)])
+        yield _judged(
+            REPORT, text, shown, right={*stated} == {*lasting[: len(stated)]}, modest=modest
+        )
     elif "It was quiet." in text:
         yield _judged(
             REPORT, text, f"{_sound(true):.1f} min", right=_sound(true) <= 2, modest=modest
@@ -348,14 +350,18 @@ def _gist(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
             end += 24 * HOUR * (end < start)
             wide = joined(truth.television.starts - _COMPANY, truth.television.ends + _COMPANY)
             inside = cut(wide, start, end).length / max(end - start, 1)
-            told = f"{' to '.join(run_)}: {text}"
+            statement = f"{' to '.join(run_)}: {text}"
             yield _judged(
-                REPORT, told, f"{inside:.0%} of it", right=inside >= 1 - _TOLERANCE, modest=modest
+                REPORT,
+                statement,
+                f"{inside:.0%} of it",
+                right=inside >= 1 - _TOLERANCE,
+                modest=modest,
             )
     elif text.startswith("In the night"):
         yield from _counts_in(REPORT, text, truth)
-        if (said := read_minutes(text)) is not None and true.night_sound is not None:
-            yield _lasted(REPORT, text, said, true.night_sound.minutes, modest=modest)
+        if (stated := read_minutes(text)) is not None and true.night_sound is not None:
+            yield _lasted(REPORT, text, stated, true.night_sound.minutes, modest=modest)
     elif match := re.search(r"only short sounds", text):
         before = re.search(r"until (\d\d:\d\d)", text)
         after = re.search(r"after (\d\d:\d\d)", text)
@@ -426,9 +432,9 @@ def _heard(
         return
     often, when, lasting = cells[1:4]
     where = f"{cells[0]}: "
-    if (said := read_count(often.partition(" | ")[0])) is not None:
+    if (stated := read_count(often.partition(" | ")[0])) is not None:
         modest = is_modest(heads[1] + cells[0] + re.sub(r"\(\d+ labelled\)", "", often))
-        yield _counted(REPORT, where + often, said, _count(truth, name), modest=modest)
+        yield _counted(REPORT, where + often, stated, _count(truth, name), modest=modest)
     if clocks := _CLOCK.findall(when):
         yield _at_times(
             REPORT, where + when, name, clocks, truth, modest=is_modest(heads[2] + when)
@@ -451,8 +457,8 @@ def _figure(
         yield _judged(REPORT, text, getattr(value, "text", "never"), right=right, modest=modest)
     elif (lasting := read_minutes(shown)) is not None:
         yield _lasted(REPORT, text, lasting, middle, modest=modest)
-    elif (said := read_count(shown)) is not None:
-        yield _counted(REPORT, text, said, middle, modest=modest)
+    elif (stated := read_count(shown)) is not None:
+        yield _counted(REPORT, text, stated, middle, modest=modest)
 
 
 def _assessed(
@@ -467,8 +473,8 @@ def _assessed(
     modest = is_modest(heads[2] + re.sub(r"\(\d+ labelled\)", "", cells[2]))
     if (lasting := read_minutes(cells[2])) is not None:
         yield _lasted(REPORT, text, lasting, true, modest=modest)
-    elif (said := read_count(cells[2])) is not None:
-        yield _counted(REPORT, text, said, true, modest=modest)
+    elif (stated := read_count(cells[2])) is not None:
+        yield _counted(REPORT, text, stated, true, modest=modest)
 
 
 def page_statements(
@@ -527,11 +533,11 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
         match = re.search(rf"{words} ({_NUMBER})(?: times)?(?: \(([^)]*)\))?", text, re.IGNORECASE)
         if match is None:
             continue
-        said = _number(match[1])
+        stated = _number(match[1])
         yield _counted(
             PAGE,
             f"{text} [{in_words(name)}]",
-            (said, said),
+            (stated, stated),
             minutes.count(name, None).labelled,
             modest=modest,
         )
@@ -567,18 +573,18 @@ def info_statements(
     line = day_line(day.day, totals)
     for name, (counted, _) in totals.items():
         if name in _sounds_of(day):
-            said = (counted, counted)
+            stated = (counted, counted)
             text = f"{in_words(name)} {counted}"
-            yield _counted(INFO, text, said, _count(truth, name), modest=is_modest(line))
+            yield _counted(INFO, text, stated, _count(truth, name), modest=is_modest(line))
     for line in Overview(summary, day.zone).lines(None):
         for name in (n for n in _sounds_of(day) if _mentions(line, n)):
             words = re.escape(in_words(name).lower())
             match = re.search(rf"{words} ((?:\d+ h )?[\d.]+ (?:min|s|h)\b)", line, re.IGNORECASE)
             if match is not None:
-                said = read_minutes(match[1])
-                assert said is not None
+                stated = read_minutes(match[1])
+                assert stated is not None
                 text = f"{in_words(name)} {match[1]}"
-                yield _lasted(INFO, text, said, _minutes(true, name), modest=is_modest(line))
+                yield _lasted(INFO, text, stated, _minutes(true, name), modest=is_modest(line))
 
 
 def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:

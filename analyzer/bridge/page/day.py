@@ -158,15 +158,16 @@ def _lane(
     name = words.class_words(label)
     often = words.text("count.not known") if count is None else words.times(count)
     key = "lane of a day" if home.is_past else "lane and last" if count else "lane"
-    told = words.text(key, **{"class": name, "times": often, "last": at})
+    description = words.text(key, **{"class": name, "times": often, "last": at})
     if beside:
-        told = words.text("lane beside", told=told, times=words.times(beside))
+        times = words.times(beside)
+        description = words.text("lane beside", told=description, times=times)
     return {
         "label": label,
         "words": name,
         "colour": colour_on_paper(label),
         "bars": bars((event for event in events if event.end > day.start), day),
-        "told": told,
+        "told": description,
         "today": count,
         "night": night,
         "last": at,
@@ -287,8 +288,8 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     what = words.listed(parts)
     if not parts and when in map(words.text, _PARTLY):
         return f"{when}."
-    said = words.text("sentence", when=when, what=what) if parts and when else when or what
-    return words.text("by its sound", sentence=said[:1].upper() + said[1:]) + "."
+    text = words.text("sentence", when=when, what=what) if parts and when else when or what
+    return words.text("by its sound", sentence=text[:1].upper() + text[1:]) + "."
 
 
 def _class_and_times(name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:
