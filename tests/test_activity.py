@@ -249,3 +249,19 @@ def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(logs,
         assert after["laughing"]["counted"] == before["laughing"]["counted"] + 1
     finally:
         layer.unlink()
+
+
+def test_a_sound_that_a_person_marked_counts_beside_a_television_too(logs, capfd):
+    words = "events", logs, "--day", DAY, "--json"
+    before = json.loads(run(capfd, *words).stdout)["counts"]["crying"]
+    start = midnight(DAY) + int(at("17:30")) * NANOSECONDS
+    (log,) = [path for path in find_logs(logs) if not is_layer(path) and "20260329T17" in path.name]
+    layer = write_marks(log, [Mark("mic", start, start + 2 * NANOSECONDS, "crying")])
+    try:
+        after = json.loads(run(capfd, *words).stdout)["counts"]["crying"]
+        assert after["counted"] == before["counted"] + 1
+        _, day = day_metrics(logs)
+        beside = day.beside_television("crying")
+        assert after == {"counted": day.count("crying").labelled, "television": beside}
+    finally:
+        layer.unlink()
