@@ -27,6 +27,7 @@ from hearthlog.tools.cli.terminal import (
 if TYPE_CHECKING:
     from hearthlog.analyzer.activity.home_events import EventTotal
     from hearthlog.analyzer.logs.catalog import Catalog, HomeTotals, LabelAmount
+    from hearthlog.analyzer.logs.home_logs import HomeLogs
     from hearthlog.analyzer.logs.summary import LogSummary
     from hearthlog.schemas.logs.contents import Status
     from hearthlog.schemas.logs.metadata import RecordedScenario
@@ -65,10 +66,11 @@ def info(
         raise typer.Exit(1)
     for stream in summary.streams:
         stream["starter"] = is_starter(stream["model"], stream["model_sha256"])
-    following, accuracy = next_step(summary, path), _accuracy(summary, path)
-    scenarios = _scenarios(summary, path)
-    zone, hidden = _zone_and_hidden(path)
-    day = _last_day(summary, path, zone)
+    logs = _home_logs(path)
+    following, accuracy = next_step(summary, path), _accuracy(summary, logs)
+    scenarios = _scenarios(summary, logs)
+    zone, hidden = _zone_and_hidden(logs)
+    day = _last_day(summary, logs, zone)
     if as_json:
         checked = None if accuracy is None else accuracy.as_json()
         said = {
@@ -90,7 +92,7 @@ def info(
         if day is not None:
             print_lines([day_line(*day)])
         print_lines(_stream_lines(summary))
-        print_lines(_model_lines(summary, path, scenarios))
+        print_lines(_model_lines(summary, path, logs, scenarios))
         print_lines(() if accuracy is None else accuracy.lines())
         print_lines(_gap_lines(summary, overview))
         if verbose or not summary.streams:
@@ -102,24 +104,26 @@ def info(
 
 
 def _model_lines(
-    summary: "LogSummary", path: Path, scenarios: "Sequence[RecordedScenario]"
+    summary: "LogSummary",
+    path: Path,
+    logs: "HomeLogs",
+    scenarios: "Sequence[RecordedScenario]",
 ) -> Iterator[str]:
     """Yield the names of the models that label in addition to the recorder's."""
-    if (candidate := _candidate(summary, path)) is not None:
+    if (candidate := _candidate(summary, path, logs)) is not None:
         yield candidate
     for one in scenarios:
         yield f"scenario {one.name}, {one.microphone}: model {one.model} ({one.sha256[:12]})"
 
 
-def _candidate(summary: "LogSummary", path: Path) -> str | None:
+def _candidate(summary: "LogSummary", path: Path, logs: "HomeLogs") -> str | None:
     """Return a line on the candidate model; None without one."""
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.schemas.messages.topics import CANDIDATE
 
     if not any(name.endswith(f"/{CANDIDATE}/label") for name in summary.topics):
         return None
     later: set[str] = set()  # recorders without a candidate since
-    for record in find_home_logs([path]).records():
+    for record in logs.records():
         node = record.get("node", "")
         if name := record.get("candidate"):
             sha256, was = record.get("candidate_sha256", "")[:12], "was " * (node in later)
@@ -129,33 +133,30 @@ def _candidate(summary: "LogSummary", path: Path) -> str | None:
     return None
 
 
-def _scenarios(summary: "LogSummary", path: Path) -> "list[RecordedScenario]":
+def _scenarios(summary: "LogSummary", logs: "HomeLogs") -> "list[RecordedScenario]":
     """Return the scenarios with labels, each with its last model."""
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.schemas.logs.metadata import recorded_scenarios
     from hearthlog.schemas.messages.topics import SCENARIO
 
     if not any(f"/{SCENARIO}/" in name for name in summary.topics):
         return []
     last: dict[tuple[str, str, str], RecordedScenario] = {}
-    for record in find_home_logs([path]).records():
+    for record in logs.records():
         for one in recorded_scenarios(record):
             last.setdefault((record.get("node", ""), one.microphone, one.name), one)
     return [last[key] for key in sorted(last)]
 
 
 def _last_day(
-    summary: "LogSummary", path: Path, zone: tzinfo
+    summary: "LogSummary", logs: "HomeLogs", zone: tzinfo
 ) -> "tuple[date, dict[str, EventTotal]] | None":
     """Return the last complete day and its events; None without any."""
     from hearthlog.analyzer.activity.home_events import read_day_totals
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
 
     if not summary.segments:
         return None
     try:
-        logs = find_home_logs([path])
         day = logs.last_complete_day(zone)
         totals = read_day_totals(logs, day, zone)
     except (DataError, LogError):  # of no home, or without labels
@@ -163,16 +164,16 @@ def _last_day(
     return (day, totals) if totals else None
 
 
-def _accuracy(summary: "LogSummary", path: Path) -> "Accuracy | None":
+def _accuracy(summary: "LogSummary", logs: "HomeLogs") -> "Accuracy | None":
     """Read the accuracy of a recorder's labels; None without labels."""
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.tools.cli.info_summary import Accuracy
 
-    if not any(stream["model"] for stream in summary.streams):
+    if not (logs.entries and any(stream["model"] for stream in summary.streams)):
         return None
     try:
-        accuracy = Accuracy(find_home_logs([path]))
-    except LogError:  # the log belongs to no home
+        accuracy = Accuracy(logs)
+    except LogError as error:
+        print_notice(str(error))
         return None
     for loss in accuracy.losses:
         print_notice(loss)
@@ -249,18 +250,26 @@ def _health(health: "Status | None") -> dict[str, str] | None:
     }
 
 
-def _zone_and_hidden(path: Path) -> "tuple[tzinfo, frozenset[str]]":
-    """Return the time zone of the home, and the classes that no output shows."""
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.logs.local_time import home_zone
-    from hearthlog.schemas.logs.metadata import NEVER_TELL
+def _home_logs(path: Path) -> "HomeLogs":
+    """Find the logs of a home; none if the file belongs to no home."""
+    from hearthlog.analyzer.logs.home_logs import HomeLogs, find_home_logs
 
     try:
-        logs = find_home_logs([path])
+        return find_home_logs([path])
+    except LogError:
+        return HomeLogs([], [])
+
+
+def _zone_and_hidden(logs: "HomeLogs") -> "tuple[tzinfo, frozenset[str]]":
+    """Return the time zone of the home, and the classes that no output shows."""
+    from hearthlog.analyzer.logs.local_time import home_zone
+
+    if not logs.entries:
+        return UTC, frozenset()
+    try:
         hidden = logs.never_tell()
-    except LogError as error:  # of no home
-        if NEVER_TELL in str(error):
-            print_notice(str(error))
+    except LogError as error:
+        print_notice(str(error))
         return UTC, frozenset()
     try:
         return home_zone(None, logs.records()), hidden
