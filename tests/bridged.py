@@ -6,7 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.activity.event_counts import events_of
+from hearthlog.analyzer.activity.event_counts import (
+    AROUND,
+    MINUTE,
+    SET_APART,
+    events_of,
+    television_minutes,
+)
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -83,6 +89,9 @@ def _labelling(segments) -> Labelling:
 
 def _counts(segments, zone, root: str) -> dict[str, str]:
     labelling = _labelling(segments)
+    first, last = labelling.starts[0] // MINUTE, labelling.ends.max() // MINUTE
+    edges = np.arange(first - AROUND, last + AROUND + 2) * MINUTE
+    television = edges[:-1][television_minutes(labelling, edges)] // MINUTE
     now = datetime.now(zone)
     midnight = now.replace(hour=0, minute=0, second=0, microsecond=0)
     evening = midnight.replace(hour=22)
@@ -93,7 +102,11 @@ def _counts(segments, zone, root: str) -> dict[str, str]:
         if label == "silence":
             continue
         events = events_of(labelling, label)
-        begun = [datetime.fromtimestamp(start / NANOSECONDS, zone) for start in events.starts]
+        counted = events.starts[~np.isin(events.starts // MINUTE, television)]
+        begun = [
+            datetime.fromtimestamp(start / NANOSECONDS, zone)
+            for start in (counted if label in SET_APART else events.starts)
+        ]
         topic = f"{root}/class/{label}"
         values[f"{topic}/count_today"] = str(sum(start >= midnight for start in begun))
         # The homes here were heard for seconds: that there was nothing in a night is not known.

@@ -18,8 +18,9 @@ from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.activity.segments import read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.home_state import follow_home
-from hearthlog.analyzer.bridge.output import Totals
+from hearthlog.analyzer.bridge.output import News, Totals
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
+from hearthlog.analyzer.bridge.prometheus import Metrics
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -64,13 +65,13 @@ def day_metrics(logs, labelling="live"):
 
 
 def reported(logs):
-    """Of each sound: counts of the day and its night, those beside a television included."""
+    """Of each sound: counts of the day and its night, and of the day those beside a television."""
     _, day = day_metrics(logs)
     counts = {}
     for name in SOUNDS:
-        night = len(day.home.events_in(name, day.night))
-        counts[name] = day.count(name).labelled + day.beside_television(name), night
-    assert sum(beside for beside, _ in counts.values()) > 100
+        night = day.home.minutes.counted(name, day.home.events_in(name, day.night))
+        counts[name] = day.count(name).labelled, len(night), day.beside_television(name)
+    assert sum(beside for *_, beside in counts.values()) > 100
     return counts
 
 
@@ -85,15 +86,23 @@ def followed(logs):
     return state
 
 
-def test_the_bridge_counts_what_the_report_counts(logs, followed):
+def test_the_broker_and_the_figures_get_the_counts_of_the_report(logs, followed):
     (own,) = followed.microphones.values()
-    start, end = day_span(DAY, ZONE)
     # In the evening before 22:00 the last night is the one that ended in the morning.
     moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
-    known = own.known_of(moment)
-    for name, (of_day, of_night) in reported(logs).items():
-        events = [event for event in own.events(name, start) if event.start < end]
-        assert (len(events), own.counts(name, moment, known)[1] or 0) == (of_day, of_night), name
+    counts = own.counts(moment)
+    news = News(followed, [], [], moment, ZONE)
+    metrics = {
+        metric.name: {sample.labels["label"]: sample.value for sample in metric.samples}
+        for metric in Metrics(news, RecorderAddress(logs, "home", ZONE), []).collect()
+        if metric.name.startswith("hearthlog_events_")
+    }
+    assert {name: (day or 0, night or 0) for name, (day, night) in counts.items()} == {
+        name: (of_day, of_night) for name, (of_day, of_night, _) in reported(logs).items()
+    }
+    for part, name in enumerate(("hearthlog_events_today", "hearthlog_events_night")):
+        known = {label: own[part] for label, own in counts.items() if own[part] is not None}
+        assert metrics[name] == known
 
 
 def test_the_page_shows_the_counts_of_the_report(logs, followed):
@@ -103,19 +112,18 @@ def test_the_page_shows_the_counts_of_the_report(logs, followed):
     for lane in room["lanes"]:
         name = lane["label"]
         later = [e for e in own.events(name, moment.now) if e.start < day_span(DAY, ZONE)[1]]
-        of_day, of_night = reported(logs)[name]
-        beside = day_metrics(logs)[1].beside_television(name)
-        counts = (lane["today"] or 0), lane["night"] or 0
-        assert counts == (of_day - beside, of_night), (name, later)
+        of_day, of_night, _ = reported(logs)[name]
+        assert ((lane["today"] or 0), lane["night"] or 0) == (of_day, of_night), (name, later)
 
 
-def test_totals_and_alerts_count_what_the_report_counts(logs, followed, tmp_path):
+def test_totals_and_alerts_at_once_count_also_beside_a_television(logs, followed, tmp_path):
     start, end = day_span(DAY, ZONE)
     totals = Totals(BridgeState(tmp_path, "home", pytest.fail), start, pytest.fail)
     counted = {total.label: total.events for total in totals.count(followed, end)}
     hour = 3600 * NANOSECONDS
     heard = read_activity(find_home_logs([logs]), "home", start - hour, end, pytest.fail)
-    for name, (of_day, _) in reported(logs).items():
+    for name, (alone, _, beside) in reported(logs).items():
+        of_day = alone + beside
         assert counted.get(name, 0) == of_day, name
         if of_day:
             hours = (end - start) // hour
@@ -237,14 +245,37 @@ def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(logs,
             for name in SOUNDS
         }
 
+    def at_the_broker():
+        address = RecorderAddress(logs, "home", ZONE)
+        midnight_before = day_span(DAY - timedelta(days=1), ZONE)[0]
+        states = follow_home(address, midnight_before, stop := Event(), pytest.fail)
+        state = next(state for state, _, _ in states if state.caught_up)
+        stop.set()
+        state.corrections.read_back()
+        moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
+        (own,) = state.microphones.values()
+        counts = own.counts(moment, state.corrections)
+        return {name: day or 0 for name, (day, _) in counts.items()}
+
+    def counted(found):
+        return {name: each["counted"] for name, each in found.items()}
+
     before = listed()
     assert before == expected()
+    assert at_the_broker() == counted(before)
     start = midnight(DAY) + int(at("05:10")) * NANOSECONDS
     (log,) = [path for path in find_logs(logs) if not is_layer(path) and "20260329T05" in path.name]
-    layer = write_marks(log, [Mark("mic", start, start + 5 * NANOSECONDS, "laughing")])
+    quiet = start + 1200 * NANOSECONDS
+    marks = [
+        Mark("mic", start, start + 5 * NANOSECONDS, "laughing"),
+        Mark("mic", quiet, quiet + NANOSECONDS, "crying"),  # which no label names
+    ]
+    layer = write_marks(log, marks)
     try:
         after = listed()
         assert after == expected()
+        assert at_the_broker() == counted(after)
+        assert after["crying"]["counted"] == before["crying"]["counted"] + 1
         assert after["coughing"]["counted"] == before["coughing"]["counted"] - 1
         assert after["laughing"]["counted"] == before["laughing"]["counted"] + 1
     finally:

@@ -263,6 +263,27 @@ def test_a_night_unlike_those_of_the_four_weeks_before_rings_in_the_morning():
     ]
 
 
+def test_a_day_is_compared_by_the_counts_of_the_report_without_coughs_beside_a_television():
+    def texts(*, is_television):
+        gathered = SegmentCollector()
+        for number, day in enumerate(days_of(11)):
+            begin, is_last = midnight(day), number == 10
+            gathered.add_segment("mic", begin, begin + DAY, "silence", 1.0)
+            for minute in range(0, 400 if is_last else 50, 10):
+                start = begin + (600 + minute) * MINUTE
+                gathered.add_segment("mic", start, start + SECOND, "coughing", 1.0)
+            for minute in range(600, 1020) if is_last and is_television else ():
+                start = begin + minute * MINUTE + 20 * SECOND
+                gathered.add_segment("mic", start, start + 20 * SECOND, "speech", 1.0)
+        one = rule("unlike_usual", **{"class": "cough"})
+        start = midnight(days_of(1)[0])
+        found, _ = notifications(one, gathered.heard(), start, start + 12 * DAY, UTC)
+        return [ring.text for ring in found]
+
+    assert texts(is_television=False) == ["Coughing on 2026-02-11: 40 times, usually 5"]
+    assert texts(is_television=True) == ["Coughing on 2026-02-11: 0 times, usually 5"]
+
+
 def test_a_day_rings_only_with_a_week_to_compare_it_with_of_which_enough_was_heard():
     def with_days(before, share=1.0):
         gathered = SegmentCollector()

@@ -23,7 +23,8 @@ from hearthlog.analyzer import http
 from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.bridge import open_outputs
-from hearthlog.analyzer.bridge.commands import REVIEWER, EventCorrections, class_of
+from hearthlog.analyzer.bridge.commands import class_of
+from hearthlog.analyzer.bridge.corrections import REVIEWER, EventCorrections
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page import server
@@ -637,7 +638,7 @@ def test_a_bridge_that_may_only_read_says_so(served, monkeypatch):
     def refuse(log, _):
         raise LogError(f"{log}: cannot be written") from PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("hearthlog.analyzer.bridge.commands.write_marks", refuse)
+    monkeypatch.setattr("hearthlog.analyzer.bridge.corrections.write_marks", refuse)
     start = served.log.heard("music", 30)
     with served.stream() as part:
         part("events", lambda it: event_id(start, "music") in {e["id"] for e in it["events"]})

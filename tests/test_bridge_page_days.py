@@ -6,7 +6,6 @@ import re
 import time
 import wave
 from datetime import UTC, datetime, timedelta
-from functools import partial
 from http.client import HTTPConnection
 from types import SimpleNamespace
 from urllib.parse import quote
@@ -20,7 +19,7 @@ from servedhome import JSON, PALE_TEXTS, Phone, proxying, serving
 from viewers import browsing, patiently
 
 from hearthlog.analyzer.activity.events import SoundEvent
-from hearthlog.analyzer.bridge.commands import EventCorrections, explained
+from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
@@ -179,7 +178,7 @@ def test_what_people_say_of_a_sound_is_what_the_page_counts(tmp_path):
         for event, label in zip(events, answers, strict=True)
         if label
     ]
-    home = home._replace(corrections=partial(corrections.labels, marks=marks))
+    home = home._replace(corrections=corrections.of_day(marks))
     picture = picture_of(home)
     lanes = {lane["label"]: lane for lane in picture["rooms"][0]["lanes"]}
     assert [time for time, _ in lanes["coughing"]["times"][0]["times"]] == ["13:24", "11:30"]
@@ -194,7 +193,7 @@ def test_hours_that_no_log_has_are_hatched_and_no_0_is_said_of_them():
     assert {lane["night"] for lane in room["lanes"]} == {None}
     assert {lane["today"] for lane in room["lanes"]} == {0}
     (microphone,) = home.microphones  # what MQTT publishes
-    assert microphone.counts("coughing", home.moment, microphone.known_of(home.moment)) == (0, None)
+    assert microphone.counts(home.moment)["coughing"] == (0, None)
 
 
 # Sounds that are folded

@@ -341,7 +341,7 @@ def test_no_event_ends_before_it_begins(home, broker):
 
 
 @pytest.mark.fast
-def test_a_correction_that_comes_in_is_a_mark_in_the_name_of_who_says_so(home, broker):
+def test_a_correction_that_comes_in_is_a_mark_in_the_name_of_its_sender_and_counts(home, broker):
     start = home.heard("coughing", 20, seconds=3)
     home.hears("silence")
     with Listener(broker.port) as listener, Bridged(home.folder, broker, commands=True):
@@ -349,6 +349,9 @@ def test_a_correction_that_comes_in_is_a_mark_in_the_name_of_who_says_so(home, b
         command = {"correct": f"mic-coughing-{start}", "label": "Kettle", "by": "Anna"}
         listener.publish(f"{ROOT}/command", json.dumps(command))
         answer = json.loads(listener.wait_for(f"{ROOT}/command/answer"))
+        listener.wait_for(f"{COUGHING}/count_today", "0")
+        counts = json.loads(listener.wait_for(f"{COUGHING}/counts"))
+        assert (counts["today"], counts["night"]) == (0, None)
     assert answer == {"done": True, "text": f"mic-coughing-{start} was kettle, says Anna"}
     (mark,) = read_marks(next(log for log in find_logs(home.folder) if "review" not in log.name))
     assert mark[:5] == ("mic", start, start + 3 * NANOSECONDS, "kettle", "Anna")

@@ -24,6 +24,7 @@ from hearthlog.analyzer.logs.spans import (
     joined,
     lengths,
     one,
+    rows_at,
     without,
 )
 from hearthlog.models.classes import (
@@ -80,7 +81,7 @@ COUNT, LENGTH, CLOCK = "count", "minutes", "clock"
 STRETCHES, SOUND, FIRST, LAST, QUIET = "stretches", "sound", "first", "last", "quiet"
 BINS = 48  # of a day: half hours
 # Household sounds are a length here, and a length is as labelled, also beside a television.
-_APART = tuple(name for name in SET_APART if name != OBJECTS_ACTIVITY)
+APART_IN_LENGTH = tuple(name for name in SET_APART if name != OBJECTS_ACTIVITY)
 _NAMELESS = {SILENCE, OTHER, UNKNOWN}
 _AT_NIGHT = (FLUSHING_WATER, TAP_WATER, COUGHING, CRYING, YELLING)
 _LEAST = 0.9  # recorded share of a span for its figures to be present
@@ -169,18 +170,18 @@ class Profiles:
         self._night_ends = _ONE if night_after else timedelta(0)
         names = [name for name in home.listened if name not in _NAMELESS]
         self.figures = list(_figures(names))
-        self.classes = [name for name in names if name not in _APART]
+        self.classes = [name for name in names if name not in APART_IN_LENGTH]
         self._listened = dict(home.listened)
         self._coverage = joined(labels.starts, labels.ends)
         loud = labels.labels != SILENCE
         self._sound = joined(labels.starts[loud], labels.ends[loud])
         self._starts = joined(*self._sound, EVENT_PAUSE).starts
-        beside = _television(labels) if set(names) & set(_APART) else NONE
+        beside = television_spans(labels) if set(names) & set(APART_IN_LENGTH) else NONE
         self._spans, self._events = dict[str, Spans](), dict[str, Spans]()
         for name in names:
             own = labels.labels == name
             spans, events = joined(labels.starts[own], labels.ends[own]), events_of(labels, name)
-            if name in _APART:
+            if name in APART_IN_LENGTH:
                 spans, events = without(spans, beside), _outside(events, beside)
             self._spans[name], self._events[name] = spans, events
 
@@ -260,7 +261,7 @@ def _figures(names: list[str]) -> Iterator[DayFigure]:
         yield DayFigure(name, COUNT if row is not None and row.several else LENGTH)
 
 
-def _television(labels: Labelling) -> Spans:
+def television_spans(labels: Labelling) -> Spans:
     """Return the minutes that resemble a television."""
     if not len(labels):
         return NONE
@@ -272,9 +273,7 @@ def _television(labels: Labelling) -> Spans:
 
 def _outside(events: Spans, spans: Spans) -> Spans:
     """Return the events that do not start in some spans."""
-    rows = np.searchsorted(spans.starts, events.starts, side="right") - 1
-    ends = np.append(spans.ends, 0)[rows]
-    apart = (rows < 0) | (ends <= events.starts)
+    apart = rows_at(spans, events.starts) < 0
     return Spans(events.starts[apart], events.ends[apart])
 
 

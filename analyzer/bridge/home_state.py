@@ -20,13 +20,14 @@ from hearthlog.analyzer.activity.event_counts import (
 from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, SoundEvent
 from hearthlog.analyzer.activity.segments import GrowingSpans
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
+from hearthlog.analyzer.bridge.corrections import EventCorrections
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.logs.confused_classes import WATER, common_names_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.never_tell import read_list
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
-from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN, class_name
+from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN, class_name, ordered
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
@@ -64,6 +65,16 @@ class ListeningThreshold(NamedTuple):
 
     day: bool
     night: bool
+
+
+class ClassSounds(NamedTuple):
+    """Events of a class, corrected by people, and those of them that count."""
+
+    events: list[SoundEvent]
+    counted: list[SoundEvent]
+
+
+NO_CORRECTIONS = EventCorrections(Path(), "")
 
 
 class LiveMicrophone:
@@ -105,7 +116,9 @@ class LiveMicrophone:
         self._latest = 0  # end of the last segment, in nanoseconds of UTC
         self._coverage = GrowingSpans()  # segments tile the time that was listened to
         self._sounds: list[tuple[int, int, str]] = []  # segments other than silence
-        self._television: tuple[int, set[int]] = (0, set())  # number of sounds; minutes with one
+        self._changes = 0  # of the sounds
+        self._television: tuple[int, set[int]] = (0, set())  # number of changes; minutes with one
+        self._counts: tuple[Any, dict[str, tuple[int, int]]] = (None, {})  # and their key
         self._replaced: list[SoundEvent] = []  # ended by the start of another event of the class
 
     @property
@@ -136,9 +149,9 @@ class LiveMicrophone:
         """Return the names that people are shown for some labels, each once."""
         return list(dict.fromkeys(self.common_names.get(label, label) for label in labels))
 
-    def shown_events(self, name: str, since: int) -> list[SoundEvent]:
-        """Return the events of a class that people are shown, as `events` does of a label."""
-        labels = [each for each in self.labels() if self.common_names.get(each, each) == name]
+    def _named_events(self, name: str, since: int, names: Mapping[str, str]) -> list[SoundEvent]:
+        """Return the events of the classes that share a name."""
+        labels = [each for each in self.labels() if names.get(each, each) == name]
         every = sorted((e for each in labels for e in self.events(each, since)), key=_start_of)
         if len(labels) == 1 and labels[0] == name:
             return every
@@ -181,6 +194,7 @@ class LiveMicrophone:
             is_full = len(self._records) >= _MOST_CLASSES
             if label != SILENCE:
                 self._sounds.append((start, start + max(duration, 0), label))
+                self._changes += 1
             if label in self._unnamed or (label not in self._records and is_full):
                 continue
             record = self._records.setdefault(label, EventRecord(self.name, label))
@@ -200,21 +214,71 @@ class LiveMicrophone:
         spans = zip(starts, durations, strict=True)
         self.gaps += [(start, start + length) for start, length in spans if length > 0]
 
+    def sounds(
+        self, since: int, corrections: EventCorrections, names: Mapping[str, str]
+    ) -> dict[str, ClassSounds]:
+        """Return the events of each shown class since a time, as the report counts them.
+
+        `SET_APART` classes do not count beside a television, but where a person confirmed them.
+
+        Parameters
+        ----------
+        names : mapping of str to str
+            Common names of classes, such as `common_names`; empty for the classes of the model.
+        """
+        shown = [names.get(label, label) for label in [*self.classes, *self.labels()]]
+        found = {name: ClassSounds([], []) for name in ordered(shown) if name != SILENCE}
+        every: list[SoundEvent] = []
+        for label in [*found]:
+            events = self._named_events(label, since, names)
+            every += events
+            given = corrections.labels(events)
+            counted = {event.id for event in self._counted(events)}
+            for event in events:
+                name = given.get(event.id, label)
+                own = found.get(names.get(name, name))
+                if own is not None:
+                    own.events.append(event)
+                    if event.id in counted or event.id in given:
+                        own.counted.append(event)
+        for event in corrections.added(self.name, every, since):
+            own = found.get(names.get(event.label, event.label))
+            if own is not None:
+                own.events.append(event)
+                own.counted.append(event)
+        for own in found.values():
+            own.events.sort(key=_start_of)
+            own.counted.sort(key=_start_of)
+        return found
+
     def counts(
-        self, label: str, today: Today, known: ListeningThreshold
-    ) -> tuple[int | None, int | None]:
-        """Count the events of a class that began since midnight, and those of the last night.
+        self, today: Today, corrections: EventCorrections = NO_CORRECTIONS
+    ) -> dict[str, tuple[int | None, int | None]]:
+        """Count the events that began since midnight, and those of the last night, by class.
 
         Returns
         -------
-        int or None, int or None
+        dict of str to (int or None, int or None)
             None in place of 0 if coverage is too low for a count of 0.
         """
-        day = len(self.events(label, today.midnight))
-        night = sum(event.start < today.morning for event in self.events(label, today.night))
-        return day if day or known.day else None, night if night or known.night else None
+        key = self._changes, corrections.number, today[1:], self.never_tell, *self.classes
+        if key != self._counts[0]:
+            found = self.sounds(min(today.midnight, today.night), corrections, {})
+            counts = {
+                name: (
+                    sum(event.start >= today.midnight for event in own.counted),
+                    sum(today.night <= event.start < today.morning for event in own.counted),
+                )
+                for name, own in found.items()
+            }
+            self._counts = key, counts
+        known = self.known_of(today)
+        return {
+            name: (day if day or known.day else None, night if night or known.night else None)
+            for name, (day, night) in self._counts[1].items()
+        }
 
-    def counted(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
+    def _counted(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
         """Return the events that count: `SET_APART` classes only without a television beside."""
         apart = [event for event in events if event.label in SET_APART]
         television = self._television_minutes() if apart else set()
@@ -227,7 +291,7 @@ class LiveMicrophone:
     def _television_minutes(self) -> set[int]:
         """Return the minutes, since 1970, that resemble a television."""
         number, minutes = self._television
-        if number != len(self._sounds):
+        if number != self._changes:
             rows = sorted(self._sounds)
             starts, ends = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
             labels = np.array([class_name(row[2]) for row in rows], object)
@@ -235,7 +299,7 @@ class LiveMicrophone:
             edges = np.arange(max(first, last - _MOST_MINUTES), last + 1) * MINUTE
             found = television_minutes(Labelling(starts, ends, labels), edges)
             minutes = set((edges[:-1][found] // MINUTE).tolist())
-            self._television = len(self._sounds), minutes
+            self._television = self._changes, minutes
         return minutes
 
     def known_of(self, today: Today) -> ListeningThreshold:
@@ -280,10 +344,12 @@ class LiveMicrophone:
             record.forget(before, after)
         self._coverage.forget_before(before)
         around = AROUND * MINUTE
-        self._sounds = [
+        kept = [
             row for row in self._sounds if before - around <= row[1] and row[0] <= after + around
         ]
-        self._television = 0, set()
+        if len(kept) < len(self._sounds):
+            self._sounds = kept
+            self._changes += 1
         if self.gaps and self.gaps[0][1] < before:
             self.gaps = [gap for gap in self.gaps if gap[1] >= before]
 
@@ -301,6 +367,8 @@ class HomeState:
         Names that people are shown for classes that a model takes for one another.
     sources : collection of str or None
         Labelling sources of the newest log; None while unknown.
+    corrections : EventCorrections
+        What people said of recent events.
     """
 
     def __init__(self) -> None:
@@ -309,6 +377,7 @@ class HomeState:
         self.health: dict[str, Health] = {}
         self.caught_up = False
         self.sources: Collection[str] | None = None
+        self.corrections = NO_CORRECTIONS
         self._never_tell: frozenset[str] = frozenset()
         self.common_names: Mapping[str, str] = {}
         self._seen = -math.inf  # time of the last message, by CLOCK_MONOTONIC
@@ -467,6 +536,7 @@ def follow_home(
         Messages of the batch, with the fields of `FIELDS`.
     """
     state, folder = HomeState(), home.folder
+    state.corrections = EventCorrections(folder, home.node)
     state.never_tell = home.never_tell
     _hide(state, home, say)
     while not folder.is_dir():
@@ -485,6 +555,7 @@ def follow_home(
             if current != described and (names := _labelling_sources(current)) is not None:
                 state.sources, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
+                state.corrections.refresh(say)
                 _hide(state, home, say)
                 state.caught_up = True
                 yielded = time.monotonic()

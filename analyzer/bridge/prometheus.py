@@ -82,7 +82,7 @@ class PrometheusOutput:
         registry = CollectorRegistry()
         totals = self.totals.count(news.state)
         shown = [total for total in totals if total.label not in news.state.never_tell]
-        registry.register(_Figures(news, self._home, shown))
+        registry.register(Metrics(news, self._home, shown))
         text = generate_latest(registry)
         self._made = text, time.monotonic()
         if self._settings.text_file is not None:
@@ -166,7 +166,7 @@ class _Handler(HttpHandler):
                 self.send(HTTPStatus.OK, text, _TEXT)
 
 
-class _Figures(Collector):
+class Metrics(Collector):
     """Metrics at one moment."""
 
     def __init__(self, news: News, home: RecorderAddress, totals: Sequence[Total]) -> None:
@@ -189,6 +189,10 @@ class _Figures(Collector):
                 yield counter(f"{of}events", "Events of a class, from the log.", events)
                 seconds = {names: one.seconds for names, one in own.items()}
                 yield counter(f"{of}event_seconds", "Seconds of a class, from the log.", seconds)
+                gauge = partial(_metric, GaugeMetricFamily, labels=("node", *labels, "label"))
+                for part, name in enumerate(("today", "night")):
+                    counts = self._counts(labels, part, is_scenario=bool(of))
+                    yield gauge(f"{of}events_{name}", "Events, counted as in the report.", counts)
         of_home = partial(_metric, GaugeMetricFamily, labels=("node",))
         of_microphone = partial(_metric, GaugeMetricFamily, labels=("node", "microphone"))
         present = {(node, each.name): each for each in state.present()}
@@ -210,6 +214,19 @@ class _Figures(Collector):
         with suppress(OSError):  # the disk is missing
             free = shutil.disk_usage(self._home.folder).free
             yield of_home("free_bytes", "Free bytes on the disk of the logs.", {(node,): free})
+
+    def _counts(
+        self, labels: tuple[str, ...], part: int, *, is_scenario: bool
+    ) -> dict[tuple[str, ...], int]:
+        """Return the counts of the day (part 0) or night (part 1) that are known."""
+        news = self._news
+        return {
+            (self._home.node, *source_parts(each.name)[: len(labels)], label): count
+            for each in news.state.every()
+            if is_of_scenario(each.name) == is_scenario
+            for label, counts in each.counts(news.today, news.state.corrections).items()
+            if (count := counts[part]) is not None
+        }
 
 
 def _metric(

@@ -8,7 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.activity.day_anomaly import Routines
-from hearthlog.analyzer.activity.day_profile import HomeSegments, Profiles
+from hearthlog.analyzer.activity.day_profile import (
+    APART_IN_LENGTH,
+    HomeSegments,
+    Profiles,
+    television_spans,
+)
+from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.events import ANY_SOUND
 from hearthlog.analyzer.activity.segments import HomeActivity, Sounds
 from hearthlog.analyzer.activity.sources import is_of_scenario
@@ -46,6 +52,7 @@ from hearthlog.analyzer.logs.spans import (
     joined,
     lengths,
     rows_at,
+    without,
 )
 from hearthlog.analyzer.report.wording import differences_text, rarity_text, short_day
 from hearthlog.models.classes import SILENCE
@@ -345,7 +352,13 @@ def unlike_conditions(
     if not days:
         return []
     events = events_of_rule(rule, heard)
-    spans, listened = events.heard_counted(), heard.listened(rule.label, rule.microphone)
+    spans, starts = events.heard_counted(), events.counted
+    if rule.label in SET_APART:  # counted as in the report
+        television = television_spans(home_sound(heard).labels)
+        starts = starts[rows_at(television, events.starts) < 0]
+        if rule.label in APART_IN_LENGTH:
+            spans = without(spans, television)
+    listened = heard.listened(rule.label, rule.microphone)
 
     @cache
     def figure(day: date) -> Count | Duration | None:
@@ -353,7 +366,7 @@ def unlike_conditions(
         start, end = _part(rule, day, zone)
         if cut(listened, start, end).length < rule.least_share * (end - start):
             return None
-        edges = np.searchsorted(events.counted, [start, end])
+        edges = np.searchsorted(starts, [start, end])
         number = int(edges[1] - edges[0])
         if rule.of == "count":
             return Count(number)

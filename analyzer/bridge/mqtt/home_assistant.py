@@ -125,6 +125,12 @@ def described(topics: Topics, payload: bytes) -> list[Place]:
         return []
     more = [Place("last_event", microphone)] if microphone else []
     found = [each for each in places if each is not None and each.microphone == microphone]
+    counted = dict.fromkeys(each.label for each in found if each.kind == "counts")
+    more += [
+        Place(kind, microphone, label)
+        for label in counted
+        for kind in ("count_today", "count_night")
+    ]
     return [Place(CONFIG, microphone), *found, *more]
 
 
@@ -216,15 +222,23 @@ def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[st
     def at(kind: str) -> str:
         return topics.at(kind, microphone, name)
 
-    def count(kind: str, what: str) -> Component:
-        fields = {"state_class": "total_increasing", "state_topic": at(kind), "icon": "mdi:counter"}
-        return _entity("sensor", f"{words} {what}", **fields)
+    def count(kind: str, start: str, what: str) -> Component:
+        # Not `total_increasing`: a correction, or a television that becomes known, lowers a count.
+        return _entity(
+            "sensor",
+            f"{words} {what}",
+            state_class="total",
+            state_topic=at("counts"),
+            value_template=f"{{{{ value_json.{kind} }}}}",
+            last_reset_value_template=f"{{{{ value_json.{start} }}}}",
+            icon="mdi:counter",
+        )
 
     last = {"device_class": "timestamp", "state_topic": at("last_heard")}
     components = {
         "on": _entity("binary_sensor", words, device_class="sound", state_topic=at("on")),
-        "count_today": count("count_today", "today"),
-        "count_night": count("count_night", "last night"),
+        "count_today": count("today", "day_start", "today"),
+        "count_night": count("night", "night_start", "last night"),
         "last_heard": _entity("sensor", f"{words} last heard", **last),
         "trigger": {
             "p": "device_automation",

@@ -172,12 +172,12 @@ class MqttPublisher:
         from hearthlog.analyzer.bridge.commands import Commands  # noqa: PLC0415
 
         home = self._home
-        return Commands(home.folder, home.node, self._announced.switch, self._answers.append)
+        return Commands(home.folder, self._announced.switch, self._answers.append)
 
     def _obey(self, state: HomeState) -> None:
         """Queue received commands, and publish the results of finished ones."""
         while self._commands is not None and self._asked:
-            self._commands.add(self._asked.popleft(), state.find_event)
+            self._commands.add(self._asked.popleft(), state)
         while self._answers:
             answer = self._answers.popleft()
             self._connection.send(self._topics.at("command/answer"), json.dumps(answer._asdict()))
@@ -306,16 +306,21 @@ class MqttPublisher:
         say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
             say("level", f"{microphone.level_dbfs:.1f}")
-        known = microphone.known_of(news.today)
+        counts = microphone.counts(news.today, news.state.corrections)
+        began = {
+            "day_start": iso_time(news.today.midnight, news.zone),
+            "night_start": iso_time(news.today.night, news.zone),
+        }
         for label in (each for each in microphone.classes if each != SILENCE):
             is_told = self._announced.is_told(label)
             if self._settings.commands:
                 self._keep(Place(TOLD, label=label), _ON[is_told])
-            counts = microphone.counts(label, news.today, known)
+            of_day, of_night = counts[label]
             values = {
                 "on": _ON[microphone.heard.is_heard(label) and is_told],
-                "count_today": str(counts[0]),  # Home Assistant reads `None` as unknown
-                "count_night": str(counts[1]),
+                "counts": json.dumps({"today": of_day, "night": of_night, **began}),
+                "count_today": str(of_day),
+                "count_night": str(of_night),
             }
             last = microphone.last_event(label)
             if last is not None:  # otherwise the retained value of an earlier bridge is right

@@ -1,11 +1,18 @@
 """A day on the page: its picture, counts, times, and one sentence about it."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import tzinfo
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity.events import SoundEvent
-from hearthlog.analyzer.bridge.home_state import MOST, ListeningThreshold, LiveMicrophone
+from hearthlog.analyzer.bridge.corrections import EventCorrections
+from hearthlog.analyzer.bridge.home_state import (
+    MOST,
+    NO_CORRECTIONS,
+    ClassSounds,
+    ListeningThreshold,
+    LiveMicrophone,
+)
 from hearthlog.analyzer.bridge.wording import ENGLISH, Words, clock, room
 from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import (
@@ -17,7 +24,7 @@ from hearthlog.analyzer.logs.local_time import (
     local_time,
 )
 from hearthlog.analyzer.logs.spans import joined
-from hearthlog.models.classes import COUGHING, CRYING, PHONE_RING, SILENCE, YELLING, ordered
+from hearthlog.models.classes import COUGHING, CRYING, PHONE_RING, YELLING, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 
 BIN = 120 * NANOSECONDS  # as in the picture of the report
@@ -42,21 +49,6 @@ class DaySpan(NamedTuple):
         return round((inside - self.start) / (self.end - self.start), _DIGITS)
 
 
-class ClassSounds(NamedTuple):
-    """Events of a class on a page, and those of them that count."""
-
-    events: list[SoundEvent]
-    counted: list[SoundEvent]
-
-
-def _start_of(event: SoundEvent) -> int:
-    return event.start
-
-
-def _no_corrections(_: Sequence[SoundEvent]) -> Mapping[str, str]:
-    return {}
-
-
 class HomeDay(NamedTuple):
     """The microphones of a home on a day.
 
@@ -64,8 +56,6 @@ class HomeDay(NamedTuple):
     ----------
     moment : Today
         The current day; for a past day, its last moment.
-    corrections : callable
-        Returns the classes that people gave to events of one class, by id.
     """
 
     microphones: Sequence[LiveMicrophone]
@@ -73,27 +63,11 @@ class HomeDay(NamedTuple):
     zone: tzinfo
     words: Words = ENGLISH
     is_past: bool = False
-    corrections: Callable[[Sequence[SoundEvent]], Mapping[str, str]] = _no_corrections
+    corrections: EventCorrections = NO_CORRECTIONS
 
     def sounds(self, microphone: LiveMicrophone, since: int) -> dict[str, ClassSounds]:
         """Return the events of each shown class since a time, corrected by people."""
-        names = microphone.shown_names([*microphone.classes, *microphone.labels()])
-        found = {name: ClassSounds([], []) for name in names if name != SILENCE}
-        for label in [*found]:
-            events = microphone.shown_events(label, since)
-            given = self.corrections(events)
-            counted = {event.id for event in microphone.counted(events)}
-            for event in events:
-                name = given.get(event.id, label)
-                own = found.get(microphone.common_names.get(name, name))
-                if own is not None:
-                    own.events.append(event)
-                    if event.id in counted or event.id in given:
-                        own.counted.append(event)
-        for own in found.values():
-            own.events.sort(key=_start_of)
-            own.counted.sort(key=_start_of)
-        return {name: found[name] for name in ordered(found)}
+        return microphone.sounds(since, self.corrections, microphone.common_names)
 
     def span(self) -> DaySpan:
         """Return the day from midnight to midnight."""

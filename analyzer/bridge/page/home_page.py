@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import date
-from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,8 @@ from typing import Any
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.sureness import UNMEASURED, read_sureness
 from hearthlog.analyzer.activity.values import BASELINE_DAYS
-from hearthlog.analyzer.bridge.commands import EventCorrections, class_of, explained
+from hearthlog.analyzer.bridge.commands import class_of
+from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
@@ -36,7 +36,6 @@ from hearthlog.analyzer.bridge.wording import Words, clock, preferred_language, 
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.never_tell import read_list, write_list
-from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError
@@ -88,11 +87,9 @@ class HomePage:
         self._events: dict[str, SoundEvent] = {}  # of today and the last night, by id
         self._bouts: dict[str, Bout] = {}  # by id
         self._events_key: Any = None
-        self._corrections = EventCorrections(home.folder, home.node)
         self._recurring = RecurringSounds(home.folder)
         self._past = PastDays(home)
         self._sounds = KeptSounds(home.folder, home.node)
-        self._is_read_back = False
         self._sureness = UNMEASURED
         self._measured: date | None = None  # day of the last measurement of it
         self._views: dict[str, PageView] = {}
@@ -149,9 +146,6 @@ class HomePage:
             return
         self._made = time.monotonic()
         self._state = news.state
-        if not self._is_read_back:
-            self._is_read_back = True
-            threading.Thread(target=self._read_back, daemon=True).start()
         day = local_time(news.today.now, news.zone).date()
         if self._measured != day:
             self._measured = day
@@ -179,11 +173,11 @@ class HomePage:
         view.put("recurring", self._recurring.describe(moment, words))
         problem = self._recurring.problem
         view.put("health", health_list(news, self._home.node, started, problem, words))
-        day = local_time(moment.now, news.zone).date()
-        key = self._events_key, self._corrections.number, day, self._sureness, _classes_key(news)
+        day, corrections = local_time(moment.now, news.zone).date(), news.state.corrections
+        key = self._events_key, corrections.number, day, self._sureness, _classes_key(news)
         view.put_changed("events", key, lambda: self._last_bouts(news, words))
-        every, corrections = [*news.state.microphones.values()], self._corrections
-        home = HomeDay(every, news.today, news.zone, words, corrections=corrections.labels)
+        every = [*news.state.microphones.values()]
+        home = HomeDay(every, news.today, news.zone, words, corrections=corrections)
         key_of_day = _day_key(news), corrections.number
         view.put_changed("day", key_of_day, lambda: picture_of(home))
 
@@ -200,7 +194,9 @@ class HomePage:
     def _last_bouts(self, news: News, words: Words) -> Any:
         microphones = news.state.microphones.values()
         names = ordered(label for each in microphones for label in [*each.classes, *each.labels()])
-        shown = self._shown(words, news.today.now, is_alone=len(microphones) == 1)
+        shown = self._shown(
+            words, news.today.now, news.state.corrections, is_alone=len(microphones) == 1
+        )
         shown = shown._replace(common_names=news.state.common_names)
         every = [shown.describe(bout) for bout in self._latest()]
         hidden = ordered(news.state.never_tell)
@@ -221,10 +217,10 @@ class HomePage:
         return found
 
     def _shown(
-        self, words: Words, now: int, *, is_alone: bool, marks: Sequence[Mark] | None = None
+        self, words: Words, now: int, corrections: EventCorrections, *, is_alone: bool
     ) -> ShownBouts:
         def correction(event: SoundEvent) -> str:
-            found = self._corrections.of(event, marks)
+            found = corrections.of(event)
             if found is None:
                 return ""
             is_nothing = found.label == SILENCE
@@ -288,10 +284,10 @@ class HomePage:
         day = self._past.read(requested, self._state.never_tell)
         moment, zone = day.moment, self._home.zone
         microphones = [*day.state.microphones.values()]
-        given = partial(self._corrections.labels, marks=day.marks)
+        given = self._state.corrections.of_day(day.marks)
         home = HomeDay(microphones, moment, zone, words, is_past=True, corrections=given)
         every = bouts(events_between(microphones, moment.midnight, moment.now + 1))
-        shown = self._shown(words, moment.now, is_alone=len(microphones) == 1, marks=day.marks)
+        shown = self._shown(words, moment.now, given, is_alone=len(microphones) == 1)
         shown = shown._replace(common_names=day.state.common_names)
         return picture_of(home) | {"events": [shown.describe(b) for b in every[:_MOST_OF_DAY]]}
 
@@ -309,8 +305,11 @@ class HomePage:
         if not events:
             raise BridgeError("This event is too long ago for the page: `hearthlog review` has it.")
         label = class_of(text)
-        for event in events:
-            self._corrections.add(event, label)
+        try:
+            for event in events:
+                self._state.corrections.add(event, label)
+        except BridgeError as error:
+            raise explained(error) from error
         name = words.text("mark.nothing") if label == SILENCE else words.class_words(label)
         return words.text("mark.own", **{"class": name})
 
@@ -335,12 +334,6 @@ class HomePage:
         with suppress(HearthlogError, OSError):  # not measured
             logs = find_home_logs([self._home.folder])
             self._sureness = read_sureness(logs, now - BASELINE_DAYS * _DAY, now)
-
-    def _read_back(self) -> None:
-        try:
-            self._corrections.read_back()
-        except HearthlogError as error:
-            self._say(f"page: earlier marks are not shown: {error}")
 
 
 def _classes_key(news: News) -> Any:

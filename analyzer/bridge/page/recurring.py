@@ -9,7 +9,8 @@ from pathlib import Path
 from threading import Lock, Thread, Timer
 from typing import IO, Any, NamedTuple, cast
 
-from hearthlog.analyzer.bridge.commands import READ_ONLY, REVIEWER, class_of
+from hearthlog.analyzer.bridge.commands import class_of
+from hearthlog.analyzer.bridge.corrections import READ_ONLY, REVIEWER
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import ENGLISH, Words, room, told
 from hearthlog.analyzer.discover.summary import (
