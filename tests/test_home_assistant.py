@@ -110,7 +110,7 @@ def publishes(topic, payload):
 
 def test_everything_that_is_heard_is_an_entity_of_one_device(home):
     wait_for(lambda: is_well(home), 60)
-    wait_for(lambda: home.state(f"{SENSOR}coughing_today") != "0", 60)
+    wait_for(lambda: home.state(f"{SENSOR}coughing_today").strip("0").isdigit(), 60)
     device = device_id(home)
     registry = home.ask(type="config/entity_registry/list")
     assert {each["entity_id"] for each in registry if each["device_id"] == device} == entities_of(
@@ -121,6 +121,10 @@ def test_everything_that_is_heard_is_an_entity_of_one_device(home):
     assert states[f"{ON}problem"]["state"] == "off"
     assert states[f"{ON}music"]["state"] == "off"
     assert states[f"{SENSOR}music_today"]["state"] == "0"
+    count = states[f"{SENSOR}music_today"]["attributes"]
+    assert count["state_class"] == "total"  # which may fall
+    reset = datetime.fromisoformat(count["last_reset"])
+    assert timedelta() < datetime.now(UTC) - reset < timedelta(hours=25)
     assert states[f"{SENSOR}music_last_heard"]["state"] == "unknown"
     assert states[f"{SENSOR}heard"]["state"] in {"silence", *GENERAL}
     last = datetime.fromisoformat(states[f"{SENSOR}coughing_last_heard"]["state"])
