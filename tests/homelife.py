@@ -34,6 +34,10 @@ HOUR = 3600
 Event = tuple[float, float, str, float]  # second of the day (UTC), seconds, label, confidence
 
 
+# second of the day (UTC), seconds, label, confidence, probabilities, dB above the quiet around
+Doubt = tuple[float, float, str, float, Mapping[str, float], float]
+
+
 def at(text: str) -> float:
     """Read a time of day, `07:30` or `07:30:15`, in seconds."""
     hours, minutes, *seconds = map(int, text.split(":"))
@@ -59,11 +63,15 @@ def write_day(  # noqa: PLR0913
     timezone: str | None = None,
     file_hours: int = 1,
     others: Mapping[str, Iterable[Event]] = MappingProxyType({}),
+    doubts: Iterable[Doubt] = (),
 ) -> list[Path]:
     """Write the logs of a day: events, and silence where there is no gap, both in UTC.
 
-    The recorder may have other microphones, with events of their own and no gap.
+    The recorder may have other microphones, with events of their own and no gap. Only of `doubts`
+    there are frames, those of the quiet around each of them too; they are events as well.
     """
+    doubts = list(doubts)
+    events = [*events, *((second, seconds, *about[:2]) for second, seconds, *about in doubts)]
     begin, gaps, hours, step = midnight(day), list(gaps), list(hours), file_hours
     rooms = {microphone: list(_tiled(sorted(events), gaps, hours))}
     rooms |= {name: list(_tiled(sorted(own), [], hours)) for name, own in others.items()}
@@ -79,6 +87,7 @@ def write_day(  # noqa: PLR0913
             },
             [gap for gap in gaps if hour * HOUR < gap[0] + gap[1] <= (hour + step) * HOUR],
             [said for said in health if hour * HOUR <= said[0] < (hour + step) * HOUR],
+            [each for each in doubts if hour * HOUR <= each[0] < (hour + step) * HOUR],
             {"version": "0", "node": node} | ({"timezone": timezone} if timezone else {}),
         )
         for hour in hours[::step]
@@ -128,6 +137,37 @@ def _bathroom(rng: np.random.Generator) -> list[Event]:
     return found
 
 
+def frames_of(  # noqa: PLR0913, PLR0917
+    microphone, classes, start, seconds, label, confidence, shares, level_db
+) -> list[TopicBatch]:
+    """Return the labels and features of a sound, and of ten seconds of quiet before and after."""
+    around, count = 200, round(seconds * 20)
+    stamps = start + (np.arange(count + 2 * around) - around) * (NANOSECONDS // 20)
+    is_sound = (stamps >= start) & (stamps < start + count * NANOSECONDS // 20)
+    probabilities = np.zeros((len(stamps), len(classes)), np.float32)
+    probabilities[~is_sound, classes.index("silence")] = 1.0
+    for name, share in {label: confidence, **shares}.items():
+        if name in classes:
+            probabilities[is_sound, classes.index(name)] = share
+    values = np.zeros((len(stamps), len(FEATURE_NAMES)), np.float32)
+    values[:, FEATURE_NAMES.index("energy")] = np.where(is_sound, 10 ** (level_db / 10), 1.0) * 1e-6
+    head = {
+        "header.stamp": stamps,
+        "header.frame_id": microphone,
+        "frame": np.arange(len(stamps)),
+    }
+    labels = {
+        "label": np.where(is_sound, label, "silence").tolist(),
+        "confidence": probabilities.max(axis=1),
+        "novelty": np.zeros(len(stamps), np.float32),
+        "probabilities": probabilities,
+    }
+    return [
+        TopicBatch(f"/{microphone}/label", stamps, head | labels),
+        TopicBatch(f"/{microphone}/features", stamps, head | {"values": values}),
+    ]
+
+
 def _tiled(events: list[Event], gaps: list[tuple[float, float, str]], hours: list[int]):
     """Cut events so that they do not overlap, and put silence between them, hour by hour."""
     blocks = [(start, start + seconds) for start, seconds, _ in gaps]
@@ -153,7 +193,7 @@ def _tiled(events: list[Event], gaps: list[tuple[float, float, str]], hours: lis
 
 
 def _write_hour(  # noqa: PLR0913, PLR0917
-    path, microphone, classes, begin, rooms, gaps, health, about
+    path, microphone, classes, begin, rooms, gaps, health, doubts, about
 ) -> Path:
     topics = [each for name in rooms for each in topics_of(name, FEATURE_NAMES, classes)]
     writer = LogWriter(path, [*{each.name: each for each in topics}.values()], about)
@@ -171,6 +211,9 @@ def _write_hour(  # noqa: PLR0913, PLR0917
                 "confidence": np.array([row[3] for row in rows], np.float32),
             }
             batches.append(TopicBatch(f"/{name}/segment", ends, fields))
+    for second, *doubt in doubts:
+        first = begin + round(second * NANOSECONDS)
+        batches += frames_of(microphone, classes, first, *doubt)
     if batches:
         writer.write_columns(batches)
     for start, seconds, reason in gaps:

@@ -41,6 +41,7 @@ from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.timeline_plot import save_timelines
 from hearthlog.models.classes import ordered
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch
 from hearthlog.schemas.messages.message_types import nanoseconds
 
@@ -739,3 +740,61 @@ def test_a_log_that_is_there_twice_is_refused(tmp_path):
     (tmp_path / "b" / log.name).write_bytes(log.read_bytes())
     with pytest.raises(Exception, match="overlap; is a log there twice"):
         look(tmp_path)
+
+
+# What needs a look
+
+SCREAM = 4.0, "music", 0.33, {"coughing": 0.13, "yelling": 0.12}, 48.0
+PLATES = 5.0, "objects_activity", 0.4, {"coughing": 0.05, "yelling": 0.05}, 20.0
+COUGH = 1.0, "objects_activity", 0.4, {"coughing": 0.33}, 19.0
+
+
+def needing_look_in(page):
+    alert = page.partition('<section class="alert">')[2].partition("</section>")[0]
+    return [line for line in re.findall(r"<p[^>]*>(.*?)</p>", alert) if "Needs a look" in line]
+
+
+@pytest.mark.parametrize(
+    ("sound", "line"),
+    [
+        (
+            SCREAM,
+            "Needs a look, 14:02 and 15:05: loud, and the model is not sure; it might be coughing "
+            "or shouting.",
+        ),
+        (COUGH, "Needs a look, 14:02 and 15:05: the model is not sure; it might be coughing."),
+        (
+            (4.0, "unknown", 0.3, {}, 40.0),
+            "Needs a look, 14:02 and 15:05: loud, and the model is not sure.",
+        ),
+        (PLATES, None),
+        ((4.0, "music", 0.9, {"yelling": 0.05}, 48.0), None),  # loud, and the model is sure
+    ],
+)
+def test_a_loud_or_worrying_sound_that_the_model_is_unsure_of_needs_a_look(tmp_path, sound, line):
+    write_day(tmp_path, DAY, doubts=[(at(time), *sound) for time in ("14:02", "15:05")])
+    lines = needing_look_in(page_of(tmp_path, tmp_path))
+    assert lines == ([] if line is None else [line])
+
+
+def test_doubtful_sounds_of_one_time_are_one_and_only_the_loudest_five_times_need_a_look(tmp_path):
+    near = [(at("08:00") + 60 * number, *SCREAM) for number in range(4)]
+    later = [(at("09:00") + 1200 * n, *SCREAM[:4], 31.0 + n) for n in range(10)]
+    write_day(tmp_path, DAY, doubts=[*near, *later])
+    (line,) = needing_look_in(page_of(tmp_path, tmp_path))
+    assert line.startswith("Needs a look, 08:00 to 08:03, 11:00, 11:20, 11:40 and 12:00: loud")
+
+
+def test_neither_a_television_nor_what_a_person_reviewed_or_hides_needs_a_look(tmp_path):
+    talking = [(at("13:00") + 60 * number, 8, "speech", 0.9) for number in range(60)]
+    doubts = [(at(time), *SCREAM) for time in ("13:30", "16:00", "17:00")]
+    write_day(tmp_path, DAY, talking, doubts=doubts)
+    log = next(log for log in find_logs(tmp_path) if "T16" in log.name)
+    start = midnight(DAY) + round(at("16:00") * 1e9)
+    write_marks(log, [Mark("mic", start, start + 4 * 10**9, "yelling")])
+    (line,) = needing_look_in(page_of(tmp_path, tmp_path))
+    assert line.startswith("Needs a look, 17:00: loud")
+    write_list(tmp_path, frozenset({"music"}))
+    other = tmp_path / "other"
+    other.mkdir()
+    assert not needing_look_in(page_of(tmp_path, other))

@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.layers import find_with_layers
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
 from hearthlog.analyzer.logs.spans import NEVER, joined, one, pieces, remains
 from hearthlog.models.classes import CLASS_NAME, class_name, translation
-from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
@@ -57,6 +57,11 @@ class Labelling:
 
     def __len__(self) -> int:
         return len(self.starts)
+
+    def rows(self, which: Bool) -> "Labelling":
+        """Select spans."""
+        columns = self.starts, self.ends, self.labels, self.confidences
+        return Labelling(*(column[which] for column in columns))
 
     def called_as(self, classes: Sequence[str]) -> "Labelling":
         """Rename labels to the equivalent names in a list of classes.

@@ -7,6 +7,8 @@ from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from hearthlog.analyzer.activity.checked_minutes import read_checked_minutes
 from hearthlog.analyzer.activity.daily_metrics import (
     HOUR,
@@ -17,6 +19,12 @@ from hearthlog.analyzer.activity.daily_metrics import (
 )
 from hearthlog.analyzer.activity.day_anomaly import Routines
 from hearthlog.analyzer.activity.day_profile import Profiles
+from hearthlog.analyzer.activity.doubtful_sounds import (
+    DoubtfulSound,
+    doubtful_events,
+    read_doubtful_sounds,
+)
+from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import (
     HomeData,
     ScenarioMinutes,
@@ -24,16 +32,17 @@ from hearthlog.analyzer.activity.home_data import (
     read_scenario_minutes,
 )
 from hearthlog.analyzer.activity.values import BASELINE_DAYS
-from hearthlog.analyzer.logs.home_logs import HomeLogs, check_day, network_changes
+from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, check_day, network_changes
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import common, joined, one
+from hearthlog.analyzer.logs.spans import common, joined, one, rows_at
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import Account
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
-from hearthlog.schemas.messages.topics import LIVE
+from hearthlog.schemas.logs.files import RELABEL_LAYER
+from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
 from hearthlog.schemas.new_files import check_new, new_file
 
 WEEK = 7
@@ -137,6 +146,7 @@ def read_account(
         unheard=_unheard(data, *span),
         gaps=_within(data.gaps, span),
         troubles=_within(data.troubles, span),
+        doubts=_doubts(logs, data, labelling, shown),
         checks=checks,
         model=model,
         scenarios=_scenarios(logs, days, zone, data) if labelling == LIVE else {},
@@ -151,6 +161,29 @@ def _model(logs: HomeLogs, close: tuple[int, int]) -> str:
     """Return the SHA-256 of the model of the last log of the period."""
     records = latest_records(entry.path for entry in logs.between(*close))
     return next(records, {}).get("model_sha256", "")
+
+
+def _doubts(
+    logs: HomeLogs, data: HomeData, labelling: str, days: Sequence[DayMetrics]
+) -> list[DoubtfulSound]:
+    """Return the doubtful sounds of the days that need a look: none beside a television."""
+    start, end = int(days[0].span.starts[0]), int(days[-1].span.ends[0])
+    close, name, layer = logs.between(start, end), LIVE, list[HomeLog]()
+    if labelling != LIVE:
+        name, layer = relabelling(labelling), logs.between(start, end, RELABEL_LAYER + labelling)
+    known = [day.home.minutes for day in days]
+    television = np.concatenate([each.starts[each.television] for each in known])
+    found: list[DoubtfulSound] = []
+    for (node, microphone), labels in data.labelled.items():
+        events = doubtful_events(labels)
+        own = (events.starts >= start) & (events.starts < end)
+        own &= ~np.isin(events.starts // MINUTE * MINUTE, television)
+        own &= rows_at(known[0].reviewed, events.starts) < 0
+        own &= ~np.isin(events.labels, [*data.never_told])
+        entries = [(e.path, e.start, e.end) for e in (*close, *layer) if e.node == node]
+        topics = labelling_topic(microphone, name, "label"), f"/{microphone}/features"
+        found += read_doubtful_sounds(entries, topics, events.rows(own))
+    return [sound for sound in found if sound.needs_look(data.never_told)]
 
 
 def _scenarios(

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
 from hearthlog.analyzer.activity.daily_metrics import DayMetrics
 from hearthlog.analyzer.activity.day_anomaly import DayAnomaly
+from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
 from hearthlog.analyzer.activity.event_counts import FEWEST as FEWEST_CHECKED
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import ScenarioMinutes
@@ -174,6 +175,7 @@ class Account:
     unheard: Mapping[str, float]  # by microphone: hours without coverage
     gaps: Sequence[Trouble]
     troubles: Sequence[Trouble]
+    doubts: Sequence[DoubtfulSound]  # of `days`: those that need a look
     checks: CheckedMinutes  # randomly drawn, reviewed minutes of these weeks
     model: str  # SHA-256 of the model that labelled the days; empty if unknown
     scenarios: ScenarioMinutes  # of `days`; live labels only

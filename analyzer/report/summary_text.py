@@ -6,6 +6,7 @@ import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.activity.day_anomaly import FEWEST
+from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
@@ -26,6 +27,8 @@ _MOST = 6  # kinds of gaps or troubles
 _MINUTE = HOUR // 60
 _PAUSE = 20 * _MINUTE  # shorter pauses of a television are not told
 _TIMES = 3
+_BREAK = 5 * _MINUTE  # longest pause between doubtful sounds of one time
+_MOST_DOUBTS = 5  # times
 _HALF = 0.5  # hours
 _MORNING, _MIDNIGHT = 4 * 60 + 30, 23 * 60 + 30  # minutes
 
@@ -61,6 +64,32 @@ def gist_of_week(account: Account) -> Iterator[str]:
         yield f"None of the {len(told)} days that can be judged was unlike those before it."
     for day, judged in unusual:
         yield f"{short_day(day)}: {judgement_text(judged)}"
+
+
+def needing_look(account: Account) -> Iterator[str]:
+    """Yield the times of loud or possibly worrying sounds that the model is not sure of.
+
+    Yields
+    ------
+    str
+        `Needs a look, 14:02 and 14:05: loud, and the model is not sure; it might be shouting.`
+        At most five times, the loud ones first.
+    """
+    runs: list[list[DoubtfulSound]] = []
+    for sound in sorted(account.doubts, key=lambda sound: sound.start):
+        if runs and sound.start <= runs[-1][-1].end + _BREAK:
+            runs[-1].append(sound)
+        else:
+            runs.append([sound])
+    shown = sorted(runs, key=lambda run: -max(sound.level_db for sound in run))[:_MOST_DOUBTS]
+    lines: dict[str, list[str]] = {}
+    for run in sorted(shown, key=lambda run: run[0].start):
+        names = [in_words(name).lower() for name in perhaps(run, account.hidden)]
+        text = "the model is not sure" + (f"; it might be {listed(names, 'or')}" if names else "")
+        loud = "loud, and " if any(sound.is_loud for sound in run) else ""
+        lines.setdefault(loud + text, []).append(_clocks(account, run[0].start, run[-1].end))
+    for text, times in lines.items():
+        yield f"Needs a look, {listed(times, 'and')}: {text}."
 
 
 def not_recorded(account: Account) -> Iterator[str]:
@@ -222,11 +251,15 @@ def _lasting(troubles: Sequence[Trouble]) -> int:
 def _when(account: Account, troubles: Sequence[Trouble]) -> str:
     """Return time and duration of troubles: `12 min, once (03:10 to 03:22)`."""
     how_often = "once" if len(troubles) == 1 else f"{len(troubles)} times"
-    shown = []
-    for trouble in sorted(troubles, key=lambda trouble: trouble.start)[:3]:
-        times = dict.fromkeys(clock_text(t, account.zone) for t in (trouble.start, trouble.end))
-        day = local_time(trouble.start, account.zone).date()
-        shown.append((f"{short_day(day)} " if len(account.days) > 1 else "") + " to ".join(times))
+    first = sorted(troubles, key=lambda trouble: trouble.start)[:3]
+    shown = [_clocks(account, trouble.start, trouble.end) for trouble in first]
     more = " …" if len(troubles) > len(shown) else ""
     length = Duration(_lasting(troubles) / _MINUTE).text
     return f"{length}, {how_often} ({', '.join(shown)}{more})"
+
+
+def _clocks(account: Account, start: int, end: int) -> str:
+    """Format a time span: `03:10 to 03:22`, in a week with its day."""
+    times = dict.fromkeys(clock_text(time, account.zone) for time in (start, end))
+    day = local_time(start, account.zone).date()
+    return (f"{short_day(day)} " if len(account.days) > 1 else "") + " to ".join(times)

@@ -1,0 +1,181 @@
+"""Doubtful sounds: those that a model is not sure of, and that are loud or may be of a person."""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from math import nan
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.activity.event_counts import events_of
+from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.selection import array_names
+from hearthlog.analyzer.logs.spans import rows_at
+from hearthlog.models.classes import (
+    COUGHING,
+    CRYING,
+    PHONE_RING,
+    SILENCE,
+    TELEVISION,
+    YELLING,
+    class_name,
+)
+from hearthlog.schemas.arrays import Bool, Float64
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.logs.columns import Columns, read_columns
+
+WORRYING = (COUGHING, CRYING, YELLING)
+_LISTED = frozenset({*WORRYING, PHONE_RING, SILENCE, TELEVISION})  # labels that need no doubt
+_DOUBTFUL = 0.5  # confidence below which no class has most of the probability
+_LOUD_DB = 30.0  # above the quiet around: household sounds reach 25, a scream in the room 45
+_NAMED, _LIKELY = 0.1, 0.25  # probability to name a class; to list a sound that is not loud
+_MOST = 100  # events of which frames are read, the least sure first
+_AROUND = 10 * NANOSECONDS  # before and after an event, for the level of the quiet
+_DELAY = 10 * NANOSECONDS  # longest from a frame to its label
+_QUIET = 10  # percentile of the levels around
+_SECOND = 20  # frames
+_TINY = 1e-12
+_FIELDS = "header.stamp", "label", "probabilities", "values"
+
+
+class DoubtfulSound(NamedTuple):
+    """An event of which the model is not sure.
+
+    Attributes
+    ----------
+    level_db : float
+        Level of its loudest second above the quiet around; NaN if unknown.
+    shares : mapping of str to float
+        Mean probability of each of `WORRYING` that the model has.
+    """
+
+    label: str
+    start: int
+    end: int
+    level_db: float
+    shares: Mapping[str, float]
+
+    @property
+    def is_loud(self) -> bool:
+        """Whether it was much louder than household sounds are."""
+        return self.level_db >= _LOUD_DB
+
+    def needs_look(self, hidden: Collection[str] = ()) -> bool:
+        """Whether a person should look at it: it was loud, or is likely coughing or crying."""
+        likely = (share >= _LIKELY for name, share in self.shares.items() if name not in hidden)
+        return self.label not in hidden and (self.is_loud or any(likely))
+
+
+def perhaps(sounds: Collection[DoubtfulSound], hidden: Collection[str] = ()) -> list[str]:
+    """Return which of `WORRYING` some sounds might be, the most probable first."""
+    shares = {
+        name: max(sound.shares.get(name, 0.0) for sound in sounds)
+        for name in WORRYING
+        if name not in hidden
+    }
+    return [name for name in sorted(shares, key=lambda n: -shares[n]) if shares[name] >= _NAMED]
+
+
+def is_doubtful(label: str, confidence: float) -> bool:
+    """Whether an event is in doubt, by its label and the highest confidence of its segments."""
+    return confidence < _DOUBTFUL and class_name(label) not in _LISTED
+
+
+def doubtful_events(labels: Labelling) -> Labelling:
+    """Return the events that are in doubt, with the highest confidence of their segments."""
+    parts = []
+    for name in sorted(set(labels.labels[labels.confidences < _DOUBTFUL])):
+        own, events = labels.labels == name, events_of(labels, name)
+        highest = np.zeros(len(events.starts), np.float32)
+        np.maximum.at(highest, rows_at(events, labels.starts[own]), labels.confidences[own])
+        rows = [is_doubtful(name, confidence) for confidence in highest.tolist()]
+        names = np.full(sum(rows), name, object)
+        parts.append(Labelling(events.starts[rows], events.ends[rows], names, highest[rows]))
+    return _in_order(parts)
+
+
+def _in_order(parts: Sequence[Labelling]) -> Labelling:
+    empty = np.empty(0, np.int64)
+    every = [Labelling(empty, empty, empty.astype(object)), *parts]
+    starts = np.concatenate([part.starts for part in every])
+    order = np.argsort(starts, kind="stable")
+    return Labelling(
+        starts[order],
+        np.concatenate([part.ends for part in every])[order],
+        np.concatenate([part.labels for part in every])[order],
+        np.concatenate([part.confidences for part in every])[order],
+    )
+
+
+def read_doubtful_sounds(
+    logs: Iterable[tuple[Path, int, int]], topics: tuple[str, str], events: Labelling
+) -> list[DoubtfulSound]:
+    """Read level and probabilities of doubtful events, of at most a hundred.
+
+    Parameters
+    ----------
+    logs : iterable of (Path, int, int)
+        Logs with start and end, in nanoseconds of UTC; layers with the labels, too.
+    topics : (str, str)
+        Of the labels, and of the features.
+
+    Returns
+    -------
+    list of DoubtfulSound
+        In time order. Events without readable labels are left out.
+    """
+    logs, found = list(logs), []
+    for row in np.sort(np.argsort(events.confidences, kind="stable")[:_MOST]).tolist():
+        start, end = int(events.starts[row]), int(events.ends[row])
+        first, last = start - _AROUND, end + _AROUND + _DELAY
+        paths = [path for path, begin, stop in logs if begin < last and stop > first]
+        try:
+            columns = read_columns(paths, topics, first, last, _FIELDS)
+        except LogError:
+            continue  # as without labels
+        labels, features = map(columns.get, topics)
+        shares = None if labels is None else _shares(labels, start, end)
+        if shares is not None:
+            level = nan if features is None else _level(features, start, end)
+            found.append(DoubtfulSound(str(events.labels[row]), start, end, level, shares))
+    return found
+
+
+def _shares(labels: Columns, start: int, end: int) -> dict[str, float] | None:
+    """Return the mean probabilities of `WORRYING` in the frames with sound; None without any."""
+    names = [class_name(name) for name in array_names(labels.metadata, "probabilities")]
+    own = labels.take(np.flatnonzero(_inside(labels, start, end) & (labels["label"] != SILENCE)))
+    probabilities = own["probabilities"]
+    if not len(own) or probabilities.shape[1:] != (len(names),):
+        return None
+    mean = probabilities.mean(axis=0, dtype=np.float64).tolist()
+    return {
+        name: sum(share for own, share in zip(names, mean, strict=True) if own == name)
+        for name in WORRYING
+        if name in names
+    }
+
+
+def _level(features: Columns, start: int, end: int) -> float:
+    """Return the level of the loudest second of an event above the quiet around, in dB."""
+    names, values = array_names(features.metadata, "values"), features["values"]
+    if "energy" not in names or values.shape[1:] != (len(names),):
+        return nan
+    energy = values[:, names.index("energy")].astype(np.float64)
+    own = energy[_inside(features, start, end)]
+    if not len(own):
+        return nan
+    frames = min(_SECOND, len(own))
+    loudest = np.convolve(own, np.full(frames, 1 / frames), "valid").max()
+    return _decibels(loudest) - _decibels(np.percentile(energy, _QUIET))
+
+
+def _inside(columns: Columns, start: int, end: int) -> Bool:
+    stamps = columns["header.stamp"]
+    inside: Bool = (stamps >= start) & (stamps < end)
+    return inside
+
+
+def _decibels(energy: Float64 | float) -> float:
+    return float(10.0 * np.log10(np.maximum(energy, _TINY)))
