@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta, timezone
 from threading import Event, Thread
 
 import numpy as np
-from homelife import GENERAL
+from homelife import GENERAL, frames_of
 from pydantic import TypeAdapter
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule
@@ -76,6 +76,19 @@ class LiveHome:
             "confidence": np.array([confidence], np.float32),
         }
         self._write(f"/{microphone}/segment", start + length, fields)
+        return start
+
+    def doubts(self, minutes_ago, *doubt, microphone="mic"):
+        """Write a segment, and its frames with those around it; return when it began.
+
+        Parameters
+        ----------
+        *doubt
+            Seconds, label, confidence, other probabilities, dB above the quiet around.
+        """
+        start = self.heard(doubt[1], minutes_ago, doubt[0], doubt[2], microphone)
+        self._writer.write_columns(frames_of(microphone, self.classes, start, *doubt))
+        self._writer.flush()
         return start
 
     def hears(self, label, microphone="mic"):

@@ -18,13 +18,19 @@ from pydantic import ValidationError
 from servedhome import JSON, PALE_TEXTS, Phone, proxying, serving
 from viewers import browsing, patiently
 
+from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
-from hearthlog.analyzer.bridge.page.sounds import bouts
+from hearthlog.analyzer.bridge.page.sounds import (
+    ShownBouts,
+    bouts,
+    events_between,
+    uncounted_ids,
+)
 from hearthlog.analyzer.bridge.settings import PageSettings
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import languages, preferred_language, words_of
@@ -161,7 +167,7 @@ def test_the_counts_of_the_sentence_are_those_below_it():
     picture = picture_of(home_at(9, tiled((-3, 9), *NIGHT)))
     (lane,) = (each for each in picture["rooms"][0]["lanes"] if each["label"] == "coughing")
     assert (lane["today"], lane["night"]) == (2, 2)
-    assert [time for time, _ in lane["times"][0]["times"]] == ["06:13", "02:10"]
+    assert [time for time, *_ in lane["times"][0]["times"]] == ["06:13", "02:10"]
     assert lane["times"][0]["times"][0][1].startswith("mic-coughing-")
 
 
@@ -181,9 +187,29 @@ def test_what_people_say_of_a_sound_is_what_the_page_counts(tmp_path):
     home = home._replace(corrections=corrections.of_day(marks))
     picture = picture_of(home)
     lanes = {lane["label"]: lane for lane in picture["rooms"][0]["lanes"]}
-    assert [time for time, _ in lanes["coughing"]["times"][0]["times"]] == ["13:24", "11:30"]
-    assert [time for time, _ in lanes["crying"]["times"][0]["times"]] == ["10:30"]
+    assert [time for time, *_ in lanes["coughing"]["times"][0]["times"]] == ["13:24", "11:30"]
+    assert [time for time, *_ in lanes["crying"]["times"][0]["times"]] == ["10:30"]
     assert picture["sentence"].startswith("Today: coughing twice (11:30 and 13:24) and crying once")
+
+
+def test_what_is_not_counted_is_drawn_pale_and_its_entry_says_so():
+    talking = [(13 + n / 60, 3, "speech") for n in range(60)]
+    coughs = [(hour, 4, "coughing") for hour in (9.26, 13.409, 13.45)]
+    home = home_at(15, tiled((-3, 15), *talking, *coughs))
+    (lane,) = (e for e in picture_of(home)["rooms"][0]["lanes"] if e["label"] == "coughing")
+    marked = [{n / 30 for n, bar in enumerate(lane[key]) if bar != "0"} for key in ("bars", "pale")]
+    assert [{round(hour, 2) for hour in own} for own in marked] == [{9.23}, {13.4, 13.43}]
+    events = events_between(home.microphones, MIDNIGHT, MIDNIGHT + 24 * HOUR)
+    uncounted = uncounted_ids(home.microphones, events)
+    shown = ShownBouts(MIDNIGHT + 15 * HOUR, UTC, words_of("en"), lambda _: "", True)
+    shown = shown._replace(uncounted=uncounted)
+    texts = {bout.first.label: [] for bout in bouts(events)}
+    for bout in bouts(events):
+        texts[bout.first.label].append(shown.describe(bout)["beside"])
+    assert texts["coughing"] == ["beside a television, not counted", ""]
+    assert {*texts["speech"]} == {""}
+    corrected = shown._replace(correction=lambda _: "You said: Coughing")
+    assert {corrected.describe(bout)["beside"] for bout in bouts(events)} == {""}
 
 
 def test_hours_that_no_log_has_are_hatched_and_no_0_is_said_of_them():
@@ -536,13 +562,55 @@ def test_the_page_works_behind_the_ingress_of_home_assistant(phone, lived):
         assert phone.of("location.href") == address
         phone.until("!document.getElementById('day-before').disabled")
         phone.of("document.getElementById('day-before').click()")
-        phone.until("document.getElementById('past-sentence').innerText")
+        phone.until("document.getElementById('day-sentence').innerText")
         assert phone.of("seen") == []
         assert phone.of("document.querySelector('[rel=manifest]').href.startsWith(location.href)")
     hostile = {"X-Ingress-Path": '"><script>alert(1)</script>'}
     assert "alert(1)" not in str(lived.ask("GET", "/", **hostile))
     assert lived.ask("GET", "/", cookie=None, **{"X-Ingress-Path": path})[0] == 403
     assert lived.ask("GET", "/", Host="evil.example", **{"X-Ingress-Path": path})[0] == 403
+
+
+SCREAM = 4.0, "music", 0.33, {"coughing": 0.05, "yelling": 0.12}, 48.0
+
+
+def test_a_loud_sound_that_the_model_is_unsure_of_needs_a_look_on_its_day_and_later(tmp_path):
+    yesterday = (datetime.now(UTC) - timedelta(hours=30)).replace(minute=2)
+    sound = (3600.0 * yesterday.hour + 60 * yesterday.minute, *SCREAM)
+    write_day(tmp_path / "logs", yesterday.date(), doubts=[sound])
+    with serving(tmp_path) as served, served.stream() as part:
+        served.log.heard("music", 62, 4, 0.95)
+        served.log.doubts(60, 5.0, "objects_activity", 0.4, {"coughing": 0.05}, 20.0)
+        scream = served.log.doubts(58, *SCREAM)
+        events = part("events", lambda it: any(each["doubtful"] for each in it["events"]))["events"]
+        (entry,) = (each for each in events if each["look"])
+        assert (entry["words"], entry["sure"], entry["times"]) == (
+            "Perhaps shouting",
+            "loud, and the model is not sure",
+            "",
+        )
+        assert [each["label"] for each in events if not each["look"]] == [
+            "objects_activity",
+            "music",
+        ]
+        assert served.mark(entry["id"], "yelling")[0] == 200
+        assert [(mark.start, mark.label) for mark in served.marks()] == [(scream, "yelling")]
+        date = yesterday.astimezone(served.home.zone).date().isoformat()
+        past = json.loads(served.ask("GET", f"/day?{date}")[2])
+        (entry,) = past["events"]
+        assert (entry["words"], entry["look"]) == ("Perhaps shouting", True)
+
+
+def test_at_most_four_doubtful_entries_need_a_look_and_these_are_the_loudest():
+    events = [event(10 * number, "music") for number in range(9)]
+    doubts = {
+        each.id: DoubtfulSound("music", each.start, each.end, 30.0 + number, {})
+        for number, each in enumerate(events)
+    }
+    folded = bouts(events, doubts)
+    assert len(folded) == 9
+    important = [bout.first for bout in folded if bout.is_important]
+    assert important == events[:4:-1]
 
 
 # In a browser
@@ -574,10 +642,32 @@ def test_a_lane_is_opened_by_keyboard_and_shows_its_times(phone, lived):
     phone.press("Enter", "\r")
     phone.shows(".panel", "Coughing · Today")
     phone.shows(".panel", "Hide coughing everywhere")
-    assert len(phone.text(".panel ol.times").split()) == 1
+    assert phone.of("document.querySelectorAll('.panel li').length") == 1
     assert phone.of(f"{lane('Coughing')}.getAttribute('aria-expanded')") == "true"
     phone.press("Enter", "\r")
     phone.until("!document.querySelector('.panel')")
+
+
+def test_one_of_the_times_of_a_count_is_corrected_there_and_no_other(phone, tmp_path):
+    with serving(tmp_path) as served:
+        served.log.hears("silence")
+        starts = [served.log.heard("coughing", minutes, 2) for minutes in (65, 63, 61)]
+        phone.open(served)
+        phone.until(lane("Coughing"))
+        phone.of(f"{lane('Coughing')}.dispatchEvent(new MouseEvent('click', {{bubbles: true}}))")
+        phone.until("document.querySelectorAll('.panel li').length === 3")
+        phone.of("document.querySelectorAll('.panel li summary')[2].click()")
+        phone.until("document.querySelector('.panel li fieldset')")
+        phone.of(
+            "document.querySelector('.panel input[value=laughing]').click();"
+            "document.querySelector('.panel form button').click()"
+        )
+        phone.until("document.querySelectorAll('.panel li').length === 2")
+        assert [(mark.start, mark.label) for mark in served.marks()] == [(starts[0], "laughing")]
+        phone.until(lane("Laughing"))
+        assert phone.of(PALE_TEXTS) == []
+        assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+        assert phone.of("seen") == []
 
 
 def test_a_past_day_and_the_week_are_one_tap_away_and_have_their_sound(phone, lived):
@@ -589,7 +679,7 @@ def test_a_past_day_and_the_week_are_one_tap_away_and_have_their_sound(phone, li
         "const dates = document.getElementById('dates');"
         f"dates.value = '{lived.date}'; dates.dispatchEvent(new Event('change'));"
     )
-    phone.shows("#past-sentence", "coughing once")
+    phone.shows("#day-sentence", "coughing once")
     phone.shows("#events-heading", "Sounds of this day")
     phone.until("document.querySelector('#look .play:not([hidden])')")
     phone.of("document.querySelector('#look .play').click()")
@@ -598,7 +688,7 @@ def test_a_past_day_and_the_week_are_one_tap_away_and_have_their_sound(phone, li
     assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
     phone.of("dates.value = dates.options[0].value; dates.dispatchEvent(new Event('change'));")
     phone.shows("#events-heading", "Last sounds")
-    assert phone.of("document.getElementById('past-sentence').hidden")
+    phone.shows("#day-sentence", "Today")
     assert phone.of("document.querySelector('#events .play:not([hidden])')") is None
     assert phone.of("seen") == []
 

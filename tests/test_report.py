@@ -416,7 +416,7 @@ def test_the_headline_of_a_quiet_day_names_its_coughs(tmp_path):
     write_day(tmp_path / "logs", DAY, [*coughs, (at("16:00"), 5, "yelling", 0.9)])
     assert headline(tmp_path / "logs", tmp_path) == (
         "Sunday was quiet. By the sound of it, one bout of coughing in the night (06:13) and two "
-        "after 07:00 (15:26, 15:30); shouting once after 07:00 (16:00)."
+        "by day (15:26 and 15:30); shouting once by day (16:00)."
     )
 
 
@@ -742,6 +742,16 @@ def test_a_log_that_is_there_twice_is_refused(tmp_path):
         look(tmp_path)
 
 
+def test_the_headline_tells_night_day_and_evening_apart_with_the_times_of_rare_sounds(tmp_path):
+    times = "02:10 06:13 12:00 22:30 23:15"
+    write_day(tmp_path, DAY, [(at(time), 2, "coughing", 0.9) for time in times.split()])
+    page = page_of(tmp_path, tmp_path)
+    assert text_of(page).count(
+        "By the sound of it, two bouts of coughing in the night (02:10 and 06:13), one by day "
+        "(12:00) and two after 22:00 (22:30 and 23:15)."
+    )
+
+
 # What needs a look
 
 SCREAM = 4.0, "music", 0.33, {"coughing": 0.13, "yelling": 0.12}, 48.0
@@ -759,8 +769,10 @@ def needing_look_in(page):
     [
         (
             SCREAM,
-            "Needs a look, 14:02 and 15:05: loud, and the model is not sure; it might be coughing "
-            "or shouting.",
+            (
+                "Needs a look, 14:02 and 15:05: loud, and the model is not sure; it might be "
+                "coughing or shouting."
+            ),
         ),
         (COUGH, "Needs a look, 14:02 and 15:05: the model is not sure; it might be coughing."),
         (

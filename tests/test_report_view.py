@@ -200,7 +200,7 @@ def test_what_sounded_beside_a_television_is_pale_and_the_table_says_so(browser,
     text = browser.evaluate("document.body.textContent")
     assert "beside a television: not counted" in text
     assert "not counted: 1" in text
-    assert "By the sound of it, one bout of coughing after 07:00 (16:00)." in text
+    assert "By the sound of it, one bout of coughing by day (16:00)." in text
 
 
 def test_a_printed_day_has_two_sheets_with_the_assessment(browser, short_sounds, tmp_path):

@@ -1,7 +1,7 @@
 """Doubtful sounds: those that a model is not sure of, and that are loud or may be of a person."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from math import nan
+from math import inf
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,7 +45,7 @@ class DoubtfulSound(NamedTuple):
     Attributes
     ----------
     level_db : float
-        Level of its loudest second above the quiet around; NaN if unknown.
+        Level of its loudest second above the quiet around; minus infinity if unknown.
     shares : mapping of str to float
         Mean probability of each of `WORRYING` that the model has.
     """
@@ -137,7 +137,7 @@ def read_doubtful_sounds(
         labels, features = map(columns.get, topics)
         shares = None if labels is None else _shares(labels, start, end)
         if shares is not None:
-            level = nan if features is None else _level(features, start, end)
+            level = -inf if features is None else _level(features, start, end)
             found.append(DoubtfulSound(str(events.labels[row]), start, end, level, shares))
     return found
 
@@ -161,11 +161,11 @@ def _level(features: Columns, start: int, end: int) -> float:
     """Return the level of the loudest second of an event above the quiet around, in dB."""
     names, values = array_names(features.metadata, "values"), features["values"]
     if "energy" not in names or values.shape[1:] != (len(names),):
-        return nan
+        return -inf
     energy = values[:, names.index("energy")].astype(np.float64)
     own = energy[_inside(features, start, end)]
     if not len(own):
-        return nan
+        return -inf
     frames = min(_SECOND, len(own))
     loudest = np.convolve(own, np.full(frames, 1 / frames), "valid").max()
     return _decibels(loudest) - _decibels(np.percentile(energy, _QUIET))

@@ -68,10 +68,11 @@ class ListeningThreshold(NamedTuple):
 
 
 class ClassSounds(NamedTuple):
-    """Events of a class, corrected by people, and those of them that count."""
+    """Events of a class, those of them that count, and the ids that people gave to it."""
 
     events: list[SoundEvent]
     counted: list[SoundEvent]
+    given: set[str]
 
 
 NO_CORRECTIONS = EventCorrections(Path(), "")
@@ -227,7 +228,7 @@ class LiveMicrophone:
             Common names of classes, such as `common_names`; empty for the classes of the model.
         """
         shown = [names.get(label, label) for label in [*self.classes, *self.labels()]]
-        found = {name: ClassSounds([], []) for name in ordered(shown) if name != SILENCE}
+        found = {name: ClassSounds([], [], set()) for name in ordered(shown) if name != SILENCE}
         every: list[SoundEvent] = []
         for label in [*found]:
             events = self._named_events(label, since, names)
@@ -239,6 +240,7 @@ class LiveMicrophone:
                 own = found.get(names.get(name, name))
                 if own is not None:
                     own.events.append(event)
+                    own.given.update({event.id} & given.keys())
                     if event.id in counted or event.id in given:
                         own.counted.append(event)
         for event in corrections.added(self.name, every, since):
@@ -281,12 +283,13 @@ class LiveMicrophone:
     def _counted(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
         """Return the events that count: `SET_APART` classes only without a television beside."""
         apart = [event for event in events if event.label in SET_APART]
-        television = self._television_minutes() if apart else set()
-        return [
-            event
-            for event in events
-            if event.label not in SET_APART or event.start // MINUTE not in television
-        ]
+        left = {*self.without_television(apart)}
+        return [event for event in events if event.label not in SET_APART or event in left]
+
+    def without_television(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
+        """Return the events of a class, or of several, that begin without a television beside."""
+        television = self._television_minutes() if events else set()
+        return [event for event in events if event.start // MINUTE not in television]
 
     def _television_minutes(self) -> set[int]:
         """Return the minutes, since 1970, that resemble a television."""

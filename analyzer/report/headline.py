@@ -14,7 +14,6 @@ from hearthlog.analyzer.report.wording import (
     number_in_words,
     several_in_words,
     short_day,
-    times_in_words,
     weekday,
 )
 from hearthlog.models.classes import COUGHING, CRYING, YELLING, in_words
@@ -153,20 +152,29 @@ def _runs(day: DayMetrics, lively: Bool) -> list[str]:
 
 
 def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
-    """Yield the counts of coughing, crying and shouting, and whether a person reviewed them."""
-    after = one(int(day.night.ends[0]), int(day.span.ends[0]))
+    """Yield the counts of coughing, crying and shouting, and whether a person reviewed them.
+
+    Those of the night that ends on the day, of 07:00 to 22:00, and of the evening after that.
+    """
+    morning, evening = (at_hour(day.day, hour, day.zone) for hour in (MORNING, EVENING))
+    times_of_day = (
+        (day.night, "in the night"),
+        (one(morning, evening), "by day"),
+        (one(evening, int(day.span.ends[0])), f"after {EVENING}:00"),
+    )
     for name in _WORRYING:
         parts: list[str] = []
         is_known = True
-        for span, when in ((day.night, "in the night"), (after, "after 07:00")):
+        for span, when in times_of_day:
             starts = counted_events(day, name, span)
             if len(starts):
                 count = day.home.minutes.between(span).count(name, day.home.rates.get(name))
-                times = f" ({times_in_words(starts, day.zone)})" if len(starts) <= _TIMES else ""
+                clocks = [clock_text(start, day.zone) for start in np.sort(starts).tolist()]
+                times = f" ({listed(clocks, 'and')})" if len(clocks) <= _TIMES else ""
                 parts.append(f"{amount(name, count, named=not parts)} {when}{times}")
                 is_known &= count.certain == count.labelled
         if parts:
-            yield " and ".join(parts), is_known
+            yield listed(parts, "and"), is_known
 
 
 def _were(number: int) -> str:

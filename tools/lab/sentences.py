@@ -29,7 +29,7 @@ from hearthlog.analyzer.bridge.page.sounds import ShownBouts, bouts, events_betw
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.wording import ENGLISH
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.local_time import MORNING, at_hour
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, cut, joined, lengths, one
 from hearthlog.analyzer.logs.summary import summarise
 from hearthlog.analyzer.report.headline import LIVELY_MINUTES
@@ -305,16 +305,21 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
 
 
 def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statement]:
-    """Check counts of classes in a sentence: of the night, after 07:00, or of the day."""
+    """Check counts of classes in a sentence: of night, day and evening, or of the whole day."""
     day = truth.metrics
-    after = one(int(day.night.ends[0]), int(day.span.ends[0]))
+    evening = at_hour(day.day, EVENING, day.zone)
+    parts = {
+        "night": day.night,
+        "by day": one(int(day.night.ends[0]), evening),
+        "22:00": one(evening, int(day.span.ends[0])),
+    }
     modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
     for stated in sentence.split("; "):
         for name in (name for name in _sounds_of(day) if _mentions(stated, name)):
             known = {in_words(name).lower(), several_in_words(name).lower()}
             words = f"(?:{'|'.join(map(re.escape, sorted(known)))})"
-            after_number = rf"(?:bouts? of |times of )?{words}|after"
-            for part in re.split(r" and (?=\w+ after 07:00)", stated):
+            after_number = rf"(?:bouts? of |times of )?{words}|by day|after"
+            for part in re.split(r"(?:,| and) (?=\w+ (?:by day|after 22:00))", stated):
                 bare = re.sub(r"\([^)]*\)", "", part).lower()
                 match = re.search(rf"{words} ({_NUMBER})", bare) or re.search(
                     rf"({_NUMBER})(?: to ({_NUMBER}))? (?={after_number})", bare
@@ -323,7 +328,7 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
                     continue
                 low = _number(match[1])
                 high = _number(match[2]) if match.lastindex == 2 else low
-                span = day.night if "night" in part else after if "07:00" in part else day.span
+                span = next((own for when, own in parts.items() if when in part), day.span)
                 true = day.home.minutes.between(span).count(name, None).labelled
                 yield _counted(surface, part, (low, high), true, modest=modest)
                 if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):

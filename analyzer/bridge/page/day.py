@@ -1,10 +1,11 @@
 """A day on the page: its picture, counts, times, and one sentence about it."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import tzinfo
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity.sureness import UNMEASURED, Sureness
 from hearthlog.analyzer.bridge.corrections import EventCorrections
 from hearthlog.analyzer.bridge.home_state import (
     MOST,
@@ -64,6 +65,11 @@ class HomeDay(NamedTuple):
     words: Words = ENGLISH
     is_past: bool = False
     corrections: EventCorrections = NO_CORRECTIONS
+    sureness: Sureness = UNMEASURED
+
+    def sure(self, event: SoundEvent) -> str:
+        """Return a word for the confidence of an event; empty if none can be justified."""
+        return self.words.sureness(event.confidence, self.sureness)
 
     def sounds(self, microphone: LiveMicrophone, since: int) -> dict[str, ClassSounds]:
         """Return the events of each shown class since a time, corrected by people."""
@@ -124,7 +130,8 @@ def _lane(
     counted = [e for e in sounds.counted if e.start < day.end]
     of_night = [e for e in counted if today.night <= e.start < today.morning]
     of_day = [e for e in counted if e.start >= today.midnight]
-    beside = sum(e.start >= today.midnight for e in events) - len(of_day)
+    uncounted = sorted({*events} - {*counted})
+    beside = sum(e.start >= today.midnight for e in uncounted)
     count: int | None = len(of_day) if of_day or known.day else None
     night: int | None = len(of_night) if of_night or known.night else None
     last = (events if home.is_past and events else [None, *sounds.events])[-1]
@@ -140,19 +147,33 @@ def _lane(
         "label": label,
         "words": name,
         "colour": colour_on_paper(label),
-        "bars": bars((event for event in events if event.end > day.start), day),
+        "bars": bars((event for event in counted if event.end > day.start), day),
+        "pale": bars((event for event in uncounted if event.end > day.start), day),
         "told": description,
         "today": count,
         "night": night,
         "last": at,
-        "times": [_times(of_day, day.zone), _times(of_night, day.zone)],
+        "times": [_times(each, name, sounds.given, home) for each in (of_day, of_night)],
     }
 
 
-def _times(events: Sequence[SoundEvent], zone: tzinfo) -> Any:
-    """Return when events began, newest first, with their ids, and how many older are left out."""
-    shown = events[-_MOST_TIMES:]
-    times = [(clock(event.start, zone), event.id) for event in reversed(shown)]
+def _times(events: Sequence[SoundEvent], name: str, given: Collection[str], home: HomeDay) -> Any:
+    """Return events, newest first, and how many older are left out.
+
+    Of each event: when it began, its id, its length and sureness, and the class that people gave
+    it, in words.
+    """
+    words, shown = home.words, events[-_MOST_TIMES:]
+    mark = words.text("mark.other", **{"class": name})
+    times = [
+        (
+            clock(event.start, home.zone),
+            event.id,
+            " · ".join(filter(None, (words.length(event.seconds), home.sure(event)))),
+            mark if event.id in given else "",
+        )
+        for event in reversed(shown)
+    ]
     return {"times": times, "before": len(events) - len(shown)}
 
 

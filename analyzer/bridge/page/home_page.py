@@ -18,7 +18,8 @@ from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
-from hearthlog.analyzer.bridge.page.past_days import PastDays
+from hearthlog.analyzer.bridge.page.doubts import CurrentDoubts, Doubts, doubtful
+from hearthlog.analyzer.bridge.page.past_days import PastDay, PastDays
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
 from hearthlog.analyzer.bridge.page.sounds import (
@@ -27,6 +28,7 @@ from hearthlog.analyzer.bridge.page.sounds import (
     ShownBouts,
     bouts,
     events_between,
+    uncounted_ids,
 )
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scenario_lines
 from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, page_token
@@ -43,6 +45,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
 
 _EVERY_SECONDS = 1.0
+_MARKS = {"/mark": False, "/mark-one": True}  # whether a mark is of the event alone
 _SHOW = {"yes": True, "no": False}
 _MOST_LOOKED_AT, _MOST_OTHERS = 8, 20  # bouts of the current day
 _MOST_OF_DAY = 200  # bouts of a past day
@@ -86,9 +89,12 @@ class HomePage:
         self._state = HomeState()  # the latest
         self._events: dict[str, SoundEvent] = {}  # of today and the last night, by id
         self._bouts: dict[str, Bout] = {}  # by id
+        self._doubtful: list[SoundEvent] = []
+        self._uncounted: frozenset[str] = frozenset()
         self._events_key: Any = None
         self._recurring = RecurringSounds(home.folder)
         self._past = PastDays(home)
+        self._doubts = CurrentDoubts(home.folder, home.node)
         self._sounds = KeptSounds(home.folder, home.node)
         self._sureness = UNMEASURED
         self._measured: date | None = None  # day of the last measurement of it
@@ -151,12 +157,17 @@ class HomePage:
             self._measured = day
             threading.Thread(target=self._measure, args=(news.today.now,), daemon=True).start()
         first = min(news.today.midnight, news.today.night)
-        key = _events_key(news)
+        microphones, doubts = news.state.microphones.values(), self._doubts.found
+        key = _events_key(news), len(doubts)
         if key != self._events_key:
             self._events_key = key
-            every = events_between(news.state.microphones.values(), first, news.today.now + _DAY)
+            every = events_between(microphones, first, news.today.now + _DAY)
             self._events = {event.id: event for event in every}
-            self._bouts = {bout.first.id: bout for bout in bouts(every)}
+            self._doubtful = doubtful(microphones, every)
+            folded = bouts(every, _need_look(doubts, self._doubtful, news.state.never_tell))
+            self._bouts = {bout.first.id: bout for bout in folded}
+            self._uncounted = uncounted_ids(microphones, every)
+        self._doubts.update(self._doubtful, news.today.now)
         for view in views:
             self._update_view(view, news)
 
@@ -177,8 +188,8 @@ class HomePage:
         key = self._events_key, corrections.number, day, self._sureness, _classes_key(news)
         view.put_changed("events", key, lambda: self._last_bouts(news, words))
         every = [*news.state.microphones.values()]
-        home = HomeDay(every, news.today, news.zone, words, corrections=corrections)
-        key_of_day = _day_key(news), corrections.number
+        home = HomeDay(every, news.today, news.zone, words, False, corrections, self._sureness)
+        key_of_day = _day_key(news), corrections.number, self._sureness
         view.put_changed("day", key_of_day, lambda: picture_of(home))
 
     def close(self) -> None:
@@ -197,7 +208,11 @@ class HomePage:
         shown = self._shown(
             words, news.today.now, news.state.corrections, is_alone=len(microphones) == 1
         )
-        shown = shown._replace(common_names=news.state.common_names)
+        shown = shown._replace(
+            common_names=news.state.common_names,
+            uncounted=self._uncounted,
+            hidden=news.state.never_tell,
+        )
         every = [shown.describe(bout) for bout in self._latest()]
         hidden = ordered(news.state.never_tell)
         return {
@@ -231,8 +246,8 @@ class HomePage:
 
     def act(self, path: str, subject: str, label: str, words: Words) -> str:
         """Carry out what a person asked for; return what was done, in words."""
-        if path == "/mark":
-            return self._mark(subject, label, words)
+        if path in _MARKS:
+            return self._mark(subject, label, words, is_single=_MARKS[path])
         if path == "/group":
             return self._recurring.name(subject, label, words)
         return self._show(subject, label, words)
@@ -285,21 +300,30 @@ class HomePage:
         moment, zone = day.moment, self._home.zone
         microphones = [*day.state.microphones.values()]
         given = self._state.corrections.of_day(day.marks)
-        home = HomeDay(microphones, moment, zone, words, is_past=True, corrections=given)
-        every = bouts(events_between(microphones, moment.midnight, moment.now + 1))
+        home = HomeDay(microphones, moment, zone, words, True, given, self._sureness)
+        events = events_between(microphones, moment.midnight, moment.now + 1)
+        every = self._past_bouts(day, events)
         shown = self._shown(words, moment.now, given, is_alone=len(microphones) == 1)
-        shown = shown._replace(common_names=day.state.common_names)
+        shown = shown._replace(
+            common_names=day.state.common_names,
+            uncounted=uncounted_ids(microphones, events),
+            hidden=self._state.never_tell,
+        )
         return picture_of(home) | {"events": [shown.describe(b) for b in every[:_MOST_OF_DAY]]}
 
-    def _mark(self, identifier: str, text: str, words: Words) -> str:
-        bout = self._bouts.get(identifier)
+    def _past_bouts(self, day: PastDay, events: Sequence[SoundEvent]) -> list[Bout]:
+        microphones, hidden = day.state.microphones.values(), self._state.never_tell
+        return bouts(events, _need_look(day.doubts, doubtful(microphones, events), hidden))
+
+    def _mark(self, identifier: str, text: str, words: Words, *, is_single: bool) -> str:
+        bout = None if is_single else self._bouts.get(identifier)
         events: Sequence[SoundEvent] = [] if bout is None else bout.events
         past = None if events else self._past.find_event(identifier)
         if past is not None:
             day, event = past
             same = events_between(day.state.microphones.values(), 0, day.moment.now + 1)
-            own = [each for each in bouts(same) if event in each.events]
-            events = own[0].events if own else [event]
+            own = [each for each in self._past_bouts(day, same) if event in each.events]
+            events = own[0].events if own and not is_single else [event]
         elif not events and identifier in self._events:
             events = [self._events[identifier]]
         if not events:
@@ -334,6 +358,12 @@ class HomePage:
         with suppress(HearthlogError, OSError):  # not measured
             logs = find_home_logs([self._home.folder])
             self._sureness = read_sureness(logs, now - BASELINE_DAYS * _DAY, now)
+
+
+def _need_look(doubts: Doubts, events: Sequence[SoundEvent], hidden: frozenset[str]) -> Doubts:
+    """Return the doubts on some events that need a look."""
+    own = {event.id: doubts[event.id] for event in events if event.id in doubts}
+    return {name: doubt for name, doubt in own.items() if doubt.needs_look(hidden)}
 
 
 def _classes_key(news: News) -> Any:

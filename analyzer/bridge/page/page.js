@@ -9,7 +9,6 @@ const LEVELS = ["well", "warning", "wrong"], SIGNS = ["✓", "!", "✕"];
 function showNow({ nothing, rooms }) {
   const sentences = rooms.length ? rooms.map(({ sentence }) => sentence) : [nothing];
   keep(place("heard"), sentences, () => make("span"), (child, text) => write(child, `${text} `));
-  if (today) keepHeight();
   keep(place("levels"), rooms.filter(({ level }) => level), () => {
     const bar = make("div", { class: "bar", role: "meter", "aria-valuemin": 0, "aria-valuemax": 100 },
       make("span"));
@@ -68,24 +67,23 @@ const fetched = new Map(); // past days by date, for a while
 function showToday(day) {
   const isNext = today?.date !== day.date;
   today = day;
-  write(place("day-sentence"), day.sentence);
-  if (isNext) { sentence.style.minHeight = ""; readDates(); }
+  if (isNext) readDates();
   if (!chosen) showChosen(day);
   document.body.classList.remove("waiting"); // the last part of the first news: now nothing moves
 }
 
-// The sentence keeps its height when it gets shorter, so that what is below stays where it is.
-const sentence = document.querySelector(".sentence");
-
-function keepHeight() {
-  sentence.style.minHeight = `${sentence.offsetHeight}px`;
-}
-
 function showChosen(day) {
   write(place("date"), chosen ? day.title : say("today"));
-  place("past-sentence").hidden = !chosen;
-  write(place("past-sentence"), chosen ? day.sentence : "");
+  showSentence(day);
   showDay(day);
+}
+
+// The sentence of a day keeps its height when it gets shorter: what is below stays where it is.
+function showSentence({ date, sentence }) {
+  const element = place("day-sentence");
+  element.style.minHeight = element.dataset.date === date ? `${element.offsetHeight}px` : "";
+  element.dataset.date = date;
+  write(element, sentence);
 }
 
 async function readDates() {
@@ -175,14 +173,14 @@ async function showWeek() {
 
 function showDayOfWeek(row, day) {
   const width = 480, height = 22;
-  const lanes = day.rooms.flatMap((room) => room.lanes).filter(({ bars }) => bars);
+  const lanes = day.rooms.flatMap((room) => room.lanes).filter(({ bars, pale }) => bars || pale);
   const now = day.now ?? 1;
   set(row.svg, "viewBox", `0 0 ${width} ${height}`);
   row.svg.replaceChildren(draw("path", { class: "shade", d: spans(day.nights, width, height) }),
     ...day.rooms.map(({ gaps }) => draw("path", { fill: "url(#unheard)", d: spans(gaps, width, height) })),
     draw("rect", { class: "future", x: now * width, width: (1 - now) * width, height }),
-    ...lanes.toReversed().map(({ bars, colour }) => draw("path", { class: "marks", fill: `rgb(${colour.join(" ")})`,
-      d: marks(bars, width, day.hours.length, 0, height) })));
+    ...lanes.toReversed().flatMap(({ bars, pale, colour }) => [[pale, "marks pale"], [bars, "marks"]].map(([own, kind]) =>
+      draw("path", { class: kind, fill: `rgb(${colour.join(" ")})`, d: marks(own, width, day.hours.length, 0, height) }))));
   write(row.about, day.sentence);
 }
 
@@ -230,7 +228,7 @@ addEventListener("offline", () => trouble(say("offline")));
 let width = innerWidth;
 addEventListener("resize", () => {
   if (innerWidth !== width) {
-    sentence.style.minHeight = "";
+    place("day-sentence").style.minHeight = "";
     drawAgain();
   }
   width = innerWidth;

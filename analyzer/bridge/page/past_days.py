@@ -11,6 +11,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
+from hearthlog.analyzer.bridge.page.doubts import Doubts, doubtful, read_doubts
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.logs.confused_classes import common_names_of
@@ -37,12 +38,15 @@ class PastDay(NamedTuple):
     ----------
     marks : sequence of Mark
         Marks of people in the logs of the day.
+    doubts : mapping of str to DoubtfulSound
+        By the ids of events.
     """
 
     moment: Today
     state: HomeState
     marks: Sequence[Mark]
     events: Mapping[str, SoundEvent]  # by id
+    doubts: Doubts
 
 
 class PastDays:
@@ -109,7 +113,9 @@ def _read(logs: HomeLogs, node: str, day: date, zone: tzinfo) -> PastDay:
         for label in each.all_labels()
         for event in each.events(label, night[0])
     }
-    return PastDay(Today(end - 1, start, *night), state, marks, events)
+    unsure = doubtful(state.microphones.values(), events.values())
+    doubts = read_doubts(entries, unsure)
+    return PastDay(Today(end - 1, start, *night), state, marks, events, doubts)
 
 
 def _read_log(entry: HomeLog, limits: tuple[int, int], end: int, state: HomeState) -> list[Mark]:

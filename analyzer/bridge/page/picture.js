@@ -1,6 +1,6 @@
 // A day as one picture, its counts, and the times behind a lane or a count.
-import { draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
-import { playButton, showPlayable } from "./sounds.js";
+import { draw, inside, make, place, say, send, set, swatch, write } from "./elements.js";
+import { showEntries } from "./sounds.js";
 
 const LANE = 36, NAME = 15, GAP = 3, HOURS = 20; // pixels
 const BINS_AN_HOUR = 30;
@@ -38,10 +38,11 @@ function choose(chosen) {
   close();
   if (same) return;
   const close_ = make("button", { type: "button", class: "quiet back" });
-  open = { ...chosen, heading: make("p", { class: "what" }), list: make("ol", { class: "times" }),
+  open = { ...chosen, heading: make("p", { class: "what" }), list: make("ol", { class: "sounds times" }), items: new Map(),
     note: make("p", { class: "about" }), hide: close_ };
   close_.addEventListener("click", () => hideClass(open.data().it.label));
   open.panel = make("div", { class: "panel" }, open.heading, open.list, open.note, close_);
+  open.list.addEventListener("toggle", () => { if (open) showTimes(); }, true); // an answered one may go now
   open.where(open.panel);
   set(chosen.button, "aria-expanded", "true");
   showTimes();
@@ -59,14 +60,8 @@ function showTimes() {
   if (!data) { close(); return; }
   const { it, times, before, value, night } = data;
   write(open.heading, say("times of", { what: it.words, when: night ? nightName() : dayName() }));
-  keep(open.list, times, () => make("li", {}, make("span")), (child, [time, id]) => {
-    write(child.firstElementChild, time);
-    if (child.dataset.id === id) return;
-    child.dataset.id = id;
-    child.querySelector("button")?.remove();
-    child.append(playButton(() => [id], () => `${it.words}, ${time}`));
-  });
-  showPlayable(times.map(([, id]) => id));
+  showEntries(open.list, open.items, times.map(([time, id, about, said]) =>
+    ({ id, ids: [id], label: it.label, words: it.words, time, about, said, isSingle: true })));
   let text = before ? say("before", { count: before }) : "";
   if (!times.length) text = value === null ? `${capital(say("not known"))}.` : say("not once");
   write(open.note, text);
@@ -84,12 +79,12 @@ async function hideClass(label) {
 
 function beginLane(room, number) {
   const name = draw("text", { class: "name" }), figure = draw("text", { class: "count" });
-  const lane = { name, figure, marks: draw("path", { class: "marks" }), line: draw("path", { class: "line" }),
+  const lane = { name, figure, marks: draw("path", { class: "marks" }), pale: draw("path", { class: "marks pale" }), line: draw("path", { class: "line" }),
     hit: draw("rect", { class: "hit" }) };
   lane.element = draw("g", { class: "lane", role: "button", tabindex: 0, "aria-expanded": "false" },
-    lane.hit, lane.line, lane.marks, name, figure);
+    lane.hit, lane.line, lane.pale, lane.marks, name, figure);
   const chosen = { button: lane.element, where: (panel) => room.svg.after(panel),
-    data: () => { const it = room.sounded[number]; return it && timesOf(it, 0); } };
+    data: () => { const it = room.sounded.find(({ label }) => label === lane.label); return it && timesOf(it, 0); } };
   lane.element.addEventListener("click", () => choose(chosen));
   lane.element.addEventListener("keydown", (pressed) => {
     if (pressed.key === "Enter" || pressed.key === " ") { pressed.preventDefault(); choose(chosen); }
@@ -147,7 +142,7 @@ function beginRoom(name, isAlone) {
 
 function showRoom(room, { gaps, lanes }, day) {
   room.lanes = lanes;
-  room.sounded = lanes.filter(({ bars }) => bars);
+  room.sounded = lanes.filter(({ bars, pale }) => bars || pale);
   const width = Math.max(Math.floor(room.svg.getBoundingClientRect().width), 100);
   const height = Math.max(room.sounded.length, 1) * LANE, whole = height + HOURS;
   set(room.svg, "viewBox", `0 0 ${width} ${whole}`);
@@ -172,8 +167,12 @@ function showRoom(room, { gaps, lanes }, day) {
     set(lane.element, "aria-label", it.told);
     for (const [name, value] of [["x", 0], ["y", top], ["width", width], ["height", LANE]]) set(lane.hit, name, value);
     set(lane.line, "d", number ? `M0 ${top}H${width}` : "");
-    set(lane.marks, "d", marks(it.bars, width, day.hours.length, top + NAME, LANE - NAME - GAP));
-    set(lane.marks, "fill", `rgb(${it.colour.join(" ")})`);
+    if (open?.button === lane.element && lane.label !== it.label) close(); // its times would be those of another class
+    lane.label = it.label;
+    for (const [path, bars] of [[lane.marks, it.bars], [lane.pale, it.pale]]) {
+      set(path, "d", marks(bars, width, day.hours.length, top + NAME, LANE - NAME - GAP));
+      set(path, "fill", `rgb(${it.colour.join(" ")})`);
+    }
     write(lane.name, it.words);
     write(lane.figure, it.today ? `${it.today}×` : "");
     for (const [text, x] of [[lane.name, 6], [lane.figure, width - 6]]) { set(text, "x", x); set(text, "y", top + 12.5); }

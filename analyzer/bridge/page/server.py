@@ -216,7 +216,7 @@ _QUERIES = {"/days", "/day", "/kept"}  # answered as JSON
 _TEXT = re.compile(r"\{\{(page\.[a-z ]+)\}\}")  # in page.html
 _GROUND = "#f4f6f8"  # as in page.css
 # JSON field beside the label: a subject, or whether the class is shown.
-_SUBJECTS = {"/mark": "event", "/group": "group", "/show": "show"}
+_SUBJECTS = {"/mark": "event", "/mark-one": "event", "/group": "group", "/show": "show"}
 _JSON = "application/json"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "

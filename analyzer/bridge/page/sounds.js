@@ -155,17 +155,17 @@ function arrange(list, items, entries, begun, show) {
 
 function beginBout(entry) {
   const item = begin(() => {
-    const { id, label, words, time } = item.entry;
-    const others = classes.filter(([name]) => name !== label);
+    const { id, label, words, time, doubtful, isSingle } = item.entry;
+    const others = classes.filter(([name]) => doubtful || name !== label);
     return {
       legend: say("question", { class: words, time }),
-      choices: [[label, say("right", { class: words })], ...others, ["television", say("television")], ["silence", say("silence")]],
-      save: (chosen) => send("mark", { event: id, label: chosen }),
+      choices: [...(doubtful ? [] : [[label, say("right", { class: words })]]), ...others, ["television", say("television")], ["silence", say("silence")]],
+      save: (chosen) => send(isSingle ? "mark-one" : "mark", { event: id, label: chosen }),
     };
   });
   item.entry = entry;
   item.isReviewable = true;
-  item.what.append(swatch(entry.colour), entry.words, item.often = make("span", { class: "often" }));
+  item.what.append(...(entry.isSingle ? [entry.time] : [swatch(entry.colour), entry.words]), item.often = make("span", { class: "often" }));
   item.play = playButton(() => item.entry.ids, () => `${item.entry.words}, ${item.entry.time}`);
   item.details.before(item.play);
   return item;
@@ -174,9 +174,15 @@ function beginBout(entry) {
 function showBout(item, entry) {
   item.entry = entry;
   write(item.often, entry.times ? ` · ${entry.times}` : "");
-  write(item.about, [entry.time, entry.length, entry.sure, entry.room].filter(Boolean).join(" · "));
+  write(item.about, entry.isSingle ? entry.about : [entry.time, entry.length, entry.sure, entry.beside, entry.room].filter(Boolean).join(" · "));
   showAnswer(item, entry.said);
   write(item.hint, ` (${[entry.words, entry.time, entry.room].filter(Boolean).join(", ")})`);
+}
+
+// The entries of single events, such as those of a count.
+export function showEntries(list, items, entries) {
+  arrange(list, items, entries, beginBout, showBout);
+  showPlayable(entries.map(({ id }) => id));
 }
 
 let latest = null, shownIds = null, isPast = false;

@@ -1,18 +1,21 @@
 """List of sounds on the page: events of one class folded, what needs a look, and their sound."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
+from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.sources import source_microphone
 from hearthlog.analyzer.activity.sureness import UNMEASURED, Sureness
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.bridge.page.day import IMPORTANT
+from hearthlog.analyzer.bridge.page.doubts import Doubts
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import Words, clock, room
 from hearthlog.analyzer.colours import colour_on_paper
@@ -25,6 +28,7 @@ from hearthlog.schemas.messages.topics import LIVE, labelling_topic
 
 _PAUSE = 300 * NANOSECONDS  # longest between two events of a bout
 _MOST_OF_BOUT = 50  # events
+_MOST_DOUBTFUL = 4  # bouts of a day
 
 
 class Bout(NamedTuple):
@@ -34,9 +38,12 @@ class Bout(NamedTuple):
     ----------
     events : sequence of SoundEvent
         The oldest first; its id is that of the bout.
+    doubts : sequence of DoubtfulSound
+        The same events if they are in doubt and need a look; else none.
     """
 
     events: Sequence[SoundEvent]
+    doubts: Sequence[DoubtfulSound] = ()
 
     @property
     def first(self) -> SoundEvent:
@@ -51,23 +58,39 @@ class Bout(NamedTuple):
     @property
     def is_important(self) -> bool:
         """Whether the bout needs a look."""
-        return self.first.label in IMPORTANT
+        return bool(self.doubts) or self.first.label in IMPORTANT
 
 
-def bouts(events: Iterable[SoundEvent]) -> list[Bout]:
-    """Fold events to bouts, the newest first."""
+def bouts(events: Iterable[SoundEvent], doubts: Doubts = MappingProxyType({})) -> list[Bout]:
+    """Fold events to bouts, the newest first.
+
+    Parameters
+    ----------
+    doubts : mapping of str to DoubtfulSound, optional
+        Events that need a look, by id: the loudest of them are bouts of their own, at most four.
+    """
+    events = list(events)
+    folded = _folded(events, doubts)
+    doubtful = [bout for bout in folded if bout.doubts]
+    if len(doubtful) > _MOST_DOUBTFUL:
+        doubtful.sort(key=lambda bout: -max(doubt.level_db for doubt in bout.doubts))
+        ids = {event.id for bout in doubtful[:_MOST_DOUBTFUL] for event in bout.events}
+        folded = _folded(events, {each: doubts[each] for each in ids})
+    return sorted(folded, key=lambda bout: (bout.last.start, bout.last.id), reverse=True)
+
+
+def _folded(events: Sequence[SoundEvent], doubts: Doubts) -> list[Bout]:
     found: list[list[SoundEvent]] = []
-    going: dict[tuple[str, str], list[SoundEvent]] = {}
+    going: dict[tuple[str, str, bool], list[SoundEvent]] = {}
     for event in sorted(events, key=lambda event: event.start):
-        key = event.microphone, event.label
+        key = event.microphone, event.label, event.id in doubts
         own = going.get(key)
         if own and event.start - own[-1].end <= _PAUSE and len(own) < _MOST_OF_BOUT:
             own.append(event)
         else:
             going[key] = [event]
             found.append(going[key])
-    folded = [Bout(each) for each in found]
-    return sorted(folded, key=lambda bout: (bout.last.start, bout.last.id), reverse=True)
+    return [Bout(own, [doubts[e.id] for e in own if e.id in doubts]) for own in found]
 
 
 def events_between(microphones: Iterable[LiveMicrophone], start: int, end: int) -> list[SoundEvent]:
@@ -82,6 +105,17 @@ def events_between(microphones: Iterable[LiveMicrophone], start: int, end: int) 
     ]
 
 
+def uncounted_ids(
+    microphones: Iterable[LiveMicrophone], events: Iterable[SoundEvent]
+) -> frozenset[str]:
+    """Return the ids of the events that do not count, because of a television beside."""
+    own = {each.name: each for each in microphones}
+    apart = [event for event in events if event.label in SET_APART]
+    by_room = {name: [e for e in apart if e.microphone == name] for name in own}
+    counted = {e.id for name, same in by_room.items() for e in own[name].counted(same)}
+    return frozenset(event.id for event in apart) - counted
+
+
 class ShownBouts(NamedTuple):
     """How bouts are shown.
 
@@ -89,6 +123,8 @@ class ShownBouts(NamedTuple):
     ----------
     correction : callable
         Returns the correction of an event in words; empty if there is none.
+    uncounted : collection of str
+        Ids of the events that do not count, because of a television beside.
     """
 
     now: int
@@ -98,6 +134,8 @@ class ShownBouts(NamedTuple):
     is_alone: bool
     sureness: Sureness = UNMEASURED
     common_names: Mapping[str, str] = MappingProxyType({})
+    uncounted: Collection[str] = ()
+    hidden: Collection[str] = ()
 
     def describe(self, bout: Bout) -> Any:
         """Return a bout for JSON."""
@@ -112,17 +150,45 @@ class ShownBouts(NamedTuple):
         return {
             "id": first.id,
             "label": first.label,
-            "words": words.class_words(self.common_names.get(first.label, first.label)),
+            "words": self._heading(bout),
             "colour": colour_on_paper(first.label),
             "times": words.times(count) if count > 1 else "",
             "time": time,
             "length": length,
-            "sure": words.sureness(max(each.confidence for each in bout.events), self.sureness),
+            "sure": self._sureness(bout),
+            "beside": self._beside(bout),
+            "doubtful": bool(bout.doubts),
             "room": "" if self.is_alone else room(first.microphone),
             "said": corrections[-1] if corrections else "",
             "look": bout.is_important,
             "ids": [event.id for event in reversed(bout.events)],
         }
+
+    def _heading(self, bout: Bout) -> str:
+        if not bout.doubts:
+            label = bout.first.label
+            return self.words.class_words(self.common_names.get(label, label))
+        names = [self.words.class_words(name) for name in perhaps(bout.doubts, self.hidden)]
+        if not names:
+            return self.words.text("doubt.loud")
+        classes = self.words.listed([*map(self.words.inside, names)], "or")
+        return self.words.text("doubt.perhaps", classes=classes)
+
+    def _sureness(self, bout: Bout) -> str:
+        if not bout.doubts:
+            highest = max(each.confidence for each in bout.events)
+            return self.words.sureness(highest, self.sureness)
+        is_loud = any(doubt.is_loud for doubt in bout.doubts)
+        return self.words.text("doubt.why loud" if is_loud else "doubt.why")
+
+    def _beside(self, bout: Bout) -> str:
+        """Return how many events of a bout do not count, because of a television beside."""
+        number = sum(e.id in self.uncounted and not self.correction(e) for e in bout.events)
+        if not number:
+            return ""
+        if number == len(bout.events):
+            return self.words.text("beside")
+        return self.words.text("beside.some", count=self.words.number(number))
 
 
 _LONGEST_SOUND = 60 * NANOSECONDS

@@ -127,7 +127,10 @@ def _page(home: Home) -> Image.Image:
         seen.append(browser.picture())
         show("de", dark=True)
         browser.evaluate('document.getElementById("day-before").click()')
-        browser.wait_for('!document.getElementById("past-sentence").hidden')
+        browser.wait_for(
+            'document.getElementById("day-sentence").dataset.date'
+            ' === document.getElementById("dates").options[1].value'
+        )
         seen.insert(1, browser.picture())
     width, height = _PHONE
     whole = Image.new("RGB", (len(seen) * (width + _BETWEEN) - _BETWEEN, height), _GREY)
