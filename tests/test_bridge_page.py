@@ -735,7 +735,7 @@ def test_a_tap_on_a_count_shows_when_and_hides_a_sound_everywhere(phone, lived):
     phone.until(f"{row}.nextSibling.innerText.includes({start!r})")
     assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
     phone.of(f"{row}.nextSibling.querySelector('.back').click()")
-    phone.shows("#hidden-said", "Music is shown nowhere now.")
+    phone.shows("#hidden-said", "Music is now hidden everywhere.")
     phone.until(f"!{row}")
     phone.shows("#hidden-classes", "Show music again")
     assert phone.of(PALE_TEXTS) == []
@@ -751,7 +751,7 @@ def test_what_is_wrong_is_said_at_the_top_and_opens_to_the_list(phone, lived):
     assert phone.of('document.getElementById("working").className') == "wrong"
     assert phone.of('document.querySelector("#working .dot").getBoundingClientRect().top') < 100
     phone.of('document.querySelector("#working summary").click()')
-    assert "Disk: Look at this (2 days left)" in phone.text("#health")
+    assert "Disk: Needs a look (2 days left)" in phone.text("#health")
     assert "Bathroom: Not working (not listening: no device of this name)" in phone.text("#health")
 
 
@@ -765,22 +765,22 @@ def test_a_screen_reader_is_told_what_everything_is(phone, lived):
     named = {"button", "DisclosureTriangle", "image", "link", "meter", "radio", "region", "textbox"}
     assert [node for node in tree if node[0] in named | {"table"} and not node[1]] == []
     headings = [name for role, name in tree if role == "heading"]
-    assert {*headings} >= {"Home", "Now", "Today", "Needs a look", "Last sounds"}
+    assert {*headings} >= {"Home", "Now", "Today", "Needs a look", "Latest sounds"}
     assert {"main", "banner", "contentinfo", "list", "columnheader", "rowheader"} <= {
         role for role, _ in tree
     }
-    regions = ["Now", "Today", "Last sounds", "Also listened for"]
+    regions = ["Now", "Today", "Latest sounds", "Also listened for"]
     assert [name for role, name in tree if role == "region"] == regions
     lanes = [
         name
         for role, name in tree
-        if role == "button" and " today by the sound of it, last at " in name
+        if role == "button" and " today, by the sound of it, last at " in name
     ]
     cells = [name for role, name in tree if role in {"cell", "gridcell"}]
     # Nothing was recorded before the last night.
     assert "Coughing, Living room, Last night: not known" in cells
     assert any(
-        name.startswith("Coughing: once today by the sound of it, last at ") for name in lanes
+        name.startswith("Coughing: once today, by the sound of it, last at ") for name in lanes
     )
     assert "Crying, Living room, Today: 0" in cells
     buttons = [name for role, name in tree if role == "DisclosureTriangle"]

@@ -107,9 +107,9 @@ NIGHT = [(2.17, 3, "coughing"), (6.22, 3, "coughing")]
             9,
             (5, 9),
             NIGHT[1:],
-            "Last night was not listened to throughout: coughing once (06:13), by the sound of it.",
+            "Only part of last night was heard: coughing once (06:13), by the sound of it.",
         ),
-        (9, (5, 9), [], "Last night was not listened to throughout."),
+        (9, (5, 9), [], "Only part of last night was heard."),
         (
             9,
             (-3, 9),
@@ -119,7 +119,7 @@ NIGHT = [(2.17, 3, "coughing"), (6.22, 3, "coughing")]
         (9, (-3, 9), [(1, 1800, "speech")], "Last night: talking once, by the sound of it."),
         (14, (-3, 14), [(10, 3, "coughing")], "Today: coughing once (10:00), by the sound of it."),
         (14, (-3, 14), [], "Today: no coughing or crying, by the sound of it."),
-        (14, (9, 14), [], "Today was not listened to throughout."),
+        (14, (9, 14), [], "Only part of today was heard."),
     ],
 )
 def test_the_sentence_is_true_and_calls_nothing_quiet_that_was_not_listened_to(
@@ -687,7 +687,7 @@ def test_a_past_day_and_the_week_are_one_tap_away_and_have_their_sound(phone, li
     assert phone.of(PALE_TEXTS) == []
     assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
     phone.of("dates.value = dates.options[0].value; dates.dispatchEvent(new Event('change'));")
-    phone.shows("#events-heading", "Last sounds")
+    phone.shows("#events-heading", "Latest sounds")
     phone.shows("#day-sentence", "Today")
     assert phone.of("document.querySelector('#events .play:not([hidden])')") is None
     assert phone.of("seen") == []

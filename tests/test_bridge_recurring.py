@@ -109,7 +109,7 @@ def test_those_without_a_name_come_first_and_ten_of_them_at_a_time():
     shown = recurring_list(summary_of(*named, *unnamed), NOW, {}, MOMENT)
     words = [each["words"] for each in shown["groups"]]
     assert words == [*(f"Sound {number}" for number in range(4, 14)), *["Kettle"] * 3]
-    assert shown["more"] == "6 more without a name come later."
+    assert shown["more"] == "6 more without a name will follow."
 
 
 def test_rooms_are_named_where_there_are_several():
@@ -218,7 +218,7 @@ def acting(monkeypatch, text):
 def test_what_came_of_a_name_is_one_line(tmp_path, monkeypatch, acts, says):
     acting(monkeypatch, f"import sys; sys.stdout = sys.stderr; {acts}")
     naming = GroupNaming(tmp_path)
-    assert naming.start(KEY, 3, "kettle").startswith("Being marked: Kettle.")
+    assert naming.start(KEY, 3, "kettle").startswith("Marking as Kettle.")
     told = patiently(lambda: naming.said[KEY], lambda text: "Being" not in text)
     assert says in told
     assert len(told) < 500
@@ -230,7 +230,7 @@ def test_one_group_is_named_at_a_time_and_an_end_of_the_bridge_is_one_of_that(
     acting(monkeypatch, "import time; time.sleep(600)")
     naming = GroupNaming(tmp_path)
     naming.start(KEY, 3, "")
-    with pytest.raises(BridgeError, match="still marks another sound"):
+    with pytest.raises(BridgeError, match="still marking another sound"):
         naming.start("4 of 5b4e0d1c", 4, "kettle")
     assert naming.said.keys() == {KEY}
     naming.close()
@@ -249,11 +249,11 @@ def test_what_came_of_a_name_is_not_said_of_a_group_of_another_file(tmp_path, mo
     def said():
         return [each["said"] for each in recurring.describe(MOMENT)["groups"]]
 
-    patiently(said, lambda texts: texts == ["It was not done: exit status 4"])
+    patiently(said, lambda texts: texts == ["This failed: exit status 4"])
     keep(tmp_path, group(3), of="00c0ffee")
     assert said() == [""]
     keep(tmp_path, group(3))
-    assert said() == ["It was not done: exit status 4"]
+    assert said() == ["This failed: exit status 4"]
 
 
 def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
@@ -265,9 +265,9 @@ def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("key", "text", "says"),
     [
-        ("1 of 00000000", "kettle", "grouped anew"),
-        ("2 of 5b4e0d1c", "kettle", "grouped anew"),
-        ("--undo", "", "grouped anew"),
+        ("1 of 00000000", "kettle", "regrouped"),
+        ("2 of 5b4e0d1c", "kettle", "regrouped"),
+        ("--undo", "", "regrouped"),
         ("1 of 5b4e0d1c", "silence", "cannot be named silence"),
         ("1 of 5b4e0d1c", "; rm -rf /", "letters a to z"),
         ("1 of 5b4e0d1c", " ", "letters a to z"),
@@ -368,7 +368,7 @@ def test_a_screen_reader_is_told_which_sound_each_button_is_of(phone, listed):
     phone.open(listed)
     phone.until('document.querySelectorAll("#recurring li").length === 3')
     tree = phone.tree()
-    assert ("region", "Sounds that recur") in tree
+    assert ("region", "Recurring sounds") in tree
     buttons = [name for role, name in tree if role in {"button", "DisclosureTriangle"}]
     assert len({*buttons}) == len(buttons)
     assert "▸ That was … (Sound 1)" in buttons
@@ -385,7 +385,7 @@ def test_the_list_is_not_there_before_sounds_were_grouped_and_a_damaged_one_is_a
         phone.shows("#health", "Bridge: Good")
         assert phone.of('document.getElementById("recurs").hidden')
         (tmp_path / "logs" / SUMMARY).write_text("{")
-        phone.shows("#health", "Sounds that recur: Look at this (")
+        phone.shows("#health", "Recurring sounds: Needs a look (")
         assert "is no summary of groups; `hearthlog discover` writes it" in phone.text("#health")
         assert phone.of('document.getElementById("recurs").hidden')
         keep(tmp_path / "logs", group(1))

@@ -126,7 +126,7 @@ def test_the_page_hides_a_class_for_all_and_shows_it_again(tmp_path):
 
         part("day", lambda day: {"music", "coughing"} <= labels(day))
         status, answer = served.post("/show", {"show": "no", "label": "music"})
-        assert (status, json.loads(answer)) == (200, {"said": "Music is shown nowhere now."})
+        assert (status, json.loads(answer)) == (200, {"said": "Music is now hidden everywhere."})
         assert read_list(served.home.folder) == {"music"}
         part("now", lambda now: now["rooms"][0]["words"] == "A sound")
         last = part("events", lambda last: last["hidden"])

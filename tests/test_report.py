@@ -377,7 +377,7 @@ def test_what_no_model_listens_for_is_not_said_to_be_absent_though_a_person_mark
     page = page_of(tmp_path / "logs", tmp_path)
     assert "toilet flush" not in re.search("never labelled: coughing[^<]*", page)[0]
     assert "does not know these sounds" in page
-    assert "toilet flush" in re.search("tells nothing of them: [^.]*", page)[0]
+    assert "toilet flush" in re.search("says nothing about them: [^.]*", page)[0]
 
 
 def test_a_relabelling_is_read_in_place_of_what_the_recorder_said(tmp_path):
@@ -479,7 +479,7 @@ def test_a_hidden_class_is_not_among_those_that_a_model_does_not_know(tmp_path):
     write_day(tmp_path / "logs", DAY, [(at("10:00"), 5, "crying", 0.9)])
     write_list(tmp_path / "logs", ["crying"])
     page = page_of(tmp_path / "logs", tmp_path)
-    assert "tells nothing of them: toilet flush, shower and water tap." in page
+    assert "says nothing about them: toilet flush, shower and water tap." in page
     assert "rying" not in page
 
 
@@ -574,7 +574,7 @@ def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
     assert "Sunday, 1 March 2026" in text
     assert "Recorded: 23 h 10 min of the day (97 %)" in text
     assert re.search(r"Coughing 40 more often usually \d+ \(\d+ to \d+\) 01:00 to 04:15", text)
-    assert "How unusual the day was cannot be told yet: that needs 14 days" in text
+    assert "How unusual the day was cannot be said yet: that takes 14 mostly recorded days" in text
     assert "Not recorded: 50 min (3 %)" in text
     assert "The microphone went silent: 50 min, once (14:10 to 15:00)" in text
     assert "The microphone bathroom did not record for 10 h 00 min" in text

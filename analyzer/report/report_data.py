@@ -140,8 +140,8 @@ _ACTIVITY = (
 )
 _BATHROOM_NOTE = "Night is 22:00 to 07:00. A person, not the report, knows who used the bathroom."
 _NIGHT_NOTE = (
-    "22:00 to 07:00, counted to the day on which the night ends. Ten quiet minutes part one "
-    "time with sound from the next."
+    "22:00 to 07:00, counted on the day on which the night ends. Times with sound are separated "
+    "by at least ten quiet minutes."
 )
 _ACTIVITY_NOTE = (
     "“Sound from” and “until” are the first and the last ten minutes with at least one minute of "
@@ -278,8 +278,8 @@ class Account:
         there = {0: "no day", 1: "only 1 day"}.get(number, f"only {number} days")
         return (
             f"Not compared with other days: of the {BASELINE_DAYS} days before, "
-            f"{there} could be used; {FEWEST} are needed that were heard for the most part, with "
-            "their night."
+            f"{there} could be used; {FEWEST} are needed that were mostly recorded, nights "
+            "included."
         )
 
 

@@ -105,7 +105,7 @@ def not_recorded(account: Account) -> Iterator[str]:
     if missing >= _MINUTE:
         text = Duration(missing / _MINUTE).text
         share = percent(missing / length)
-        yield f"Not recorded: {text} ({share}). The report knows nothing of that time."
+        yield f"Not recorded: {text} ({share}). The report knows nothing about that time."
     for microphone, hours in account.unheard.items():
         if hours * HOUR > missing + _MINUTE:  # another microphone covers this time
             text = Duration(hours * 60).text
@@ -134,7 +134,7 @@ def not_well(account: Account) -> Iterator[str]:
     told = {gap.text for gap in account.gaps}
     troubles = [trouble for trouble in account.troubles if trouble.text not in told]
     if troubles:
-        yield "The box reported trouble; have it looked at if this goes on."
+        yield "The box reported problems; have it checked if this goes on."
     for name, same in _by_lasting(troubles, lambda t: f"{t.source.split(': ')[-1]}: {t.text}"):
         yield f"{plain(name)}: {_when(account, same)}."
 
@@ -217,7 +217,7 @@ def _night(day: DayMetrics) -> str:
     if day.night_sound is not None:
         parts.append(f"{day.night_sound.text} of sound in all")
     if not parts:
-        return "Too little of the night was recorded to tell anything of it."
+        return "Too little of the night was recorded to say anything about it."
     hours = day.night.length / HOUR
     partly = ""
     if day.night_hours < hours - _HALF:

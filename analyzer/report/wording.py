@@ -111,8 +111,8 @@ def judgement_text(judged: DayAnomaly) -> str:
 def too_few_text(days: int) -> str:
     """Return a note on too few days for a judgement."""
     return (
-        f"How unusual the day was cannot be told yet: that needs {FEWEST} days of the four weeks "
-        f"before it, heard for the most part, and there are {days}."
+        f"How unusual the day was cannot be said yet: that takes {FEWEST} mostly recorded days in "
+        f"the four weeks before it, and there are {days}."
     )
 
 

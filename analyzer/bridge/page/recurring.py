@@ -160,7 +160,9 @@ class GroupNaming:
             text = words.text("recurring.marking", **{"class": words.class_words(label)})
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
-                raise BridgeError("The box still marks another sound: try again when it is done.")
+                raise BridgeError(
+                    "The box is still marking another sound. Try again when it has finished."
+                )
             if not os.access(self._folder, os.W_OK):
                 raise BridgeError(READ_ONLY)
             process = self._process = _started([*options, "--json", "--", str(self._folder)])
@@ -275,10 +277,12 @@ class RecurringSounds:
         summary = self._summary
         group = None if summary is None else shown_groups(summary).get(key)
         if group is None:
-            raise BridgeError("These sounds were grouped anew meanwhile: look at the list again.")
+            raise BridgeError(
+                "These sounds have been regrouped in the meantime. Look at the list again."
+            )
         label = class_of(text) if text else ""
         if label == SILENCE:
-            raise BridgeError("Write what it was: a sound that recurs cannot be named silence.")
+            raise BridgeError("Write what it was: a recurring sound cannot be named silence.")
         return self._naming.start(key, group.number, label, words)
 
     def close(self) -> None:
