@@ -106,7 +106,7 @@ def test_info_tells_times_of_the_home_and_trouble_and_names_no_class_that_is_hid
     result = hearthlog("info", tmp_path)
     assert result.returncode == 3
     what, heard, state, _, *rest = result.stdout.splitlines()
-    assert re.search(r"2026-03-02 02:00:00 to 2026-03-03 01:00:00 \(Europe/Vienna\)", what)
+    assert re.search(r"2026-03-02 02:00 to 2026-03-03 01:00 \(Europe/Vienna\)", what)
     assert heard.endswith("; labelled most: talking 2 h 30 min and coughing 1.5 min")
     assert state.startswith("Not heard: 1 gap, together 3600.000 s")
     assert [row.split()[0] for row in rest[:3]] == ["Coughing", "Talking", "Quiet"]

@@ -103,6 +103,15 @@ def test_each_sound_that_the_report_counts_is_a_line(home, hearthlog):
     assert listed["listened"] == pytest.approx(1, abs=1e-4), "the hall was listened to"
 
 
+def test_lines_name_the_clock_of_the_home_and_end_their_figures_below_each_other(home, hearthlog):
+    head, *lines = hearthlog("events", home, "--day", DAY).stdout.splitlines()
+    assert head.startswith("when (CET)  sound ")
+    rows = [line for line in lines if re.match(r"\d\d:\d\d:\d\d ", line)]
+    lengths = {re.search(r"\d (s|min|h)\b(?= +\d+ %)", line).end() for line in rows}
+    assert lengths == {head.index("length") + len("length")}
+    assert {line.index(" %") + 2 for line in rows} == {head.index("sure") + len("sure")}
+
+
 def test_a_night_is_that_of_the_report(home, hearthlog):
     day = day_metrics(home)
     night = found(hearthlog, home, "--night", "--day", DAY)

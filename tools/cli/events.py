@@ -1,6 +1,6 @@
 """`hearthlog events`: the sounds of a home one by one, as a report counts them."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from datetime import date, timedelta, tzinfo
 from functools import reduce
 from pathlib import Path
@@ -240,15 +240,25 @@ def _print(
     several = len({name for event in found for name in event.microphones}) > 1
     days = len({_date(event.start, zone) for event in found}) > 1
     form = "%a %H:%M:%S" if days else "%H:%M:%S"
-    head = ("when", "sound", "length", "sure", *(["where"] if several else []), "")
+    clock = " or ".join(
+        dict.fromkeys(f"{local_time(event.start, zone):%Z}" for event in (found[0], found[-1]))
+        if found
+        else ()
+    )
+    lengths = _right("length", [_length(event.seconds) for event in found])
+    shares = _right("sure", [f"{100 * event.confidence:.0f} %" for event in found])
+    head = (
+        f"when ({clock})" if clock else "when", "sound", next(lengths), next(shares),
+        *(["where"] if several else []), "",
+    )  # fmt: skip
     print_table(
         head,
         [
             (
                 f"{local_time(event.start, zone):{form}}",
                 in_words(event.label),
-                _length(event.seconds),
-                f"{100 * event.confidence:.0f} %",
+                next(lengths),
+                next(shares),
                 *([", ".join(event.microphones)] if several else []),
                 ", ".join(
                     ["reviewed"] * event.reviewed + ["beside a television"] * event.television
@@ -277,6 +287,12 @@ def _print(
             f"{100 * share:.0f} % of that time was listened to, not: "
             f"{listed([*pauses[:_MOST_PAUSES], *more], 'and')}"
         )
+
+
+def _right(head: str, cells: Sequence[str]) -> Iterator[str]:
+    """Yield the head and the cells of a column of figures, which ends in one line."""
+    width = max(map(len, (head, *cells)))
+    return (cell.rjust(width) for cell in (head, *cells))
 
 
 def _length(seconds: float) -> str:

@@ -117,7 +117,8 @@ class Overview:
             return f"{whose}: no messages"
         first, last = self._summary.span
         length = _hours(self._summary.seconds)
-        span = f"{self.local(first)} to {self.local(last)} ({_zone_name(self._zone)})"
+        begin, end = (f"{local_time(time, self._zone):%Y-%m-%d %H:%M}" for time in (first, last))
+        span = f"{begin} to {end} ({_zone_name(self._zone)})"
         return f"{whose}: {length}, {span}"
 
     def _heard(self) -> str:

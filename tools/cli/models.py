@@ -158,6 +158,7 @@ models = typer.Typer(
 models.command()(fetch)
 
 _HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "MB")
+_WORDS = _HEAD.index("macro F1")
 
 
 class _ClassShare(NamedTuple):
@@ -190,7 +191,7 @@ def list_(folder: _Folder = None, as_json: Json = False) -> None:
     if as_json:
         print(json.dumps([_as_json(entry) for entry in entries], indent=2))
     else:
-        print_table(_HEAD, map(_row, entries), words=len(_HEAD))
+        print_table(_HEAD, map(_row, entries), words=_WORDS)
     end_with_warnings([entry.problem for entry in entries if entry.model is None])
 
 
