@@ -13,7 +13,7 @@ from viewers import patiently, pixels
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.review.lanes import FEATURES, SHARES, features_image
-from hearthlog.analyzer.review.timeline import SoundClip
+from hearthlog.analyzer.review.timeline import Key, Question, SoundClip
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.viewer import open_hidden
 from hearthlog.models.classes import ordered
@@ -21,7 +21,7 @@ from hearthlog.models.classes import ordered
 SECOND = 1_000_000_000
 MARGIN = 20 * SECOND
 _LEFT = 190  # pixels at the left of the plot of what is asked
-_LANES, _SPECTRUM = 202, slice(110, 230)  # where the spectrogram is, at 1920 x 1080
+_LANES, _SPECTRUM = 202, slice(225, 280)  # where the spectrogram is, at 1920 x 1080
 _NEAR = 14  # of 255: how far a colour may be off
 
 
@@ -60,7 +60,7 @@ def view(timeline):
 def ask(view, logs, start, end):
     """Go to a span, as a queue does."""
     view.draw_close_up(read_timeline([logs], start - MARGIN, end + MARGIN))
-    view.ask(start, end, "music? 3.0 s")
+    view.ask(start, end, Question("Music?", "1 of 10", [Key("a", "yes")]))
     view.show(start, end, MARGIN)
 
 

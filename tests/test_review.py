@@ -269,8 +269,8 @@ class Screen:
     def refresh(self):
         self.refreshed += 1
 
-    def ask(self, start, end, text):
-        self.asked.append((start, end, text))
+    def ask(self, start, end, question):
+        self.asked.append((start, end, question))
 
     def play(self, start):
         self.played.append(start)
@@ -326,7 +326,7 @@ def test_a_key_names_the_span_that_is_marked_with_the_mouse(home):
     assert sitting.run("2") == 1
     assert [(m.start, m.end, m.label) for m in layers(home)] == [(*span, "speech")]
     assert sitting.screen.lane == [(*span, "speech")]
-    assert sitting.said[1].endswith("talking")
+    assert sitting.said[1].startswith("marked as talking: ")
     assert sitting.said[-1].startswith("1 span reviewed in")
 
 
@@ -374,17 +374,20 @@ def test_the_ends_of_a_span_are_set_at_the_cursor(home):
     sitting.session.press("[")
     sitting.screen.at = START + 8 * SECOND
     sitting.session.press("]")
-    assert "a span ends after it begins" in sitting.said[-1]
+    assert sitting.said[-1].startswith("put the time cursor on the start and press [")
 
 
 @pytest.mark.parametrize(
     ("key", "said"),
     [
-        ("2", "no span is marked: drag a span on the time ruler"),
-        ("c", "no span is marked"),
-        ("]", "there is no time cursor"),
-        ("?", "'?' is no key; c correct"),
-        ("n", "'n' is no key"),
+        ("2", "no span is selected: drag a span on the time ruler"),
+        ("c", "no span is selected"),
+        ("]", "click on the time ruler first"),
+        (
+            "?",
+            "'?' does nothing; the keys are: c confirm the labels, Enter confirm the rest, 1 quiet",
+        ),
+        ("n", "'n' does nothing"),
     ],
 )
 def test_a_key_that_does_not_fit_is_explained_and_changes_nothing(home, key, said):
@@ -422,9 +425,9 @@ def test_a_mark_that_cannot_be_shown_is_made_once_and_undone_once(home):
     sitting.screen.marked = (START + 15 * SECOND, START + 19 * SECOND)
     sitting.screen.draws = False
     sitting.session.press("3")
-    assert "the change was made" in sitting.said[-1]
+    assert "saved, but not shown" in sitting.said[-1]
     sitting.session.press("z")
-    assert "the change was made" in sitting.said[-1]
+    assert "saved, but not shown" in sitting.said[-1]
     assert [mark.label for mark in layers(home)] == ["speech"]
 
 
@@ -440,7 +443,8 @@ def test_a_queue_goes_on_by_itself_and_ends_after_the_last_span(home):
         (*item[:2], label)
         for item, label in zip(items, ["speech", "coughing", "unknown"], strict=True)
     ]
-    assert [line[:3] for line in sitting.said if line[1:2] == "/"] == ["1/3", "2/3", "3/3"]
+    found = [line[:6] for line in sitting.said if line[1:5] == " of "]
+    assert found == ["1 of 3", "2 of 3", "3 of 3"]
     assert all(
         a < item.start and b > item.end for (a, b), item in zip(sitting.closely, items, strict=True)
     )
@@ -465,7 +469,8 @@ def test_the_ends_of_a_mark_are_moved_by_a_drag_over_it_and_undone(home):
     sitting.session.press("m")
     assert seconds_of(home) == [(9.5, 14.5, "speech"), (14.5, 16, "coughing")]
     assert sitting.screen.lane == [(m.start, m.end, m.label) for m in layers(home)]
-    assert sitting.said[-1].endswith("+ 5.0 s  talking moved")
+    assert sitting.said[-1].startswith("mark moved: talking: ")
+    assert sitting.said[-1].endswith(", 5.0 s")
     sitting.session.press("z")
     assert layers(home) == before
     assert sitting.screen.lane == [(m.start, m.end, m.label) for m in before]
@@ -476,7 +481,7 @@ def test_the_last_mark_is_moved_to_a_span_without_a_mark_but_an_older_one_is_not
     sitting = Sitting(home)
     select(sitting, 20, 21)
     sitting.session.press("m")
-    assert "no mark lies in this span" in sitting.said[-1]
+    assert "no mark in the selection" in sitting.said[-1]
     sitting.session.press("2")
     sitting.session.press("m")
     assert "the mark has these ends" in sitting.said[-1]
@@ -594,7 +599,8 @@ def test_undo_in_a_queue_goes_back_to_the_span_that_was_undone(home):
         (items[0].start, "speech"),
         (items[2].start, "silence"),
     ]
-    assert sitting.screen.asked[-2] == (*items[2][:2], "music? 5.0 s")
+    start, end, question = sitting.screen.asked[-2]
+    assert ((start, end), question.text) == (items[2][:2], "Music?")
 
 
 def minute_of(start):
@@ -632,7 +638,7 @@ def test_in_a_minute_a_key_without_a_drag_names_nothing(home, key):
     sitting.run("")
     assert sitting.screen.marked is None
     sitting.session.press(key)
-    assert sitting.said[-1].startswith("drag over the sound first: without that the key would name")
+    assert sitting.said[-1].startswith("drag over the sound first; Enter confirms the rest")
     assert (reviewed(home), layers(home)) == ([], [])
     sitting.session.press(" ")  # all of it is played
     assert sitting.heard == [(START + 30 * SECOND, START + 90 * SECOND)]
@@ -714,8 +720,10 @@ def test_a_reviewer_reads_the_names_that_the_lanes_have_and_one_key_means_not_su
     ]
     assert classes == ["quiet", "shouting", "telephone ringing", "not sure"]
     sitting.run("3")
-    assert sitting.screen.asked == [(*item[:2], "shouting? 5.0 s")]
-    assert sitting.said[2].endswith("  telephone ringing")
+    ((*span, question),) = sitting.screen.asked
+    assert (tuple(span), question.text) == (item[:2], "Shouting?")
+    assert [one.cap for one in question.keys] == [*"a13tun", "Space", "z"]  # 2 is what is asked
+    assert sitting.said[2].startswith("marked as telephone ringing: ")
     assert [mark.label for mark in layers(home)] == ["phone_ring"]
 
 
@@ -979,7 +987,7 @@ def test_a_drag_with_the_mouse_in_the_window_ends_as_a_mark_in_the_layer(home, d
         assert moved[0] == selected[0]
         assert moved[1] > selected[1]
         review.press("m")
-        review.wait_for("music moved")
+        review.wait_for("mark moved: music")
         assert one_mark(home)[1:4] == (*moved, "music")
         assert review.quit() == 0
     assert review.lines[-2].startswith("2 spans reviewed in")
@@ -1003,11 +1011,43 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             assert (mark.label, mark.reviewer, mark.corrects) == ("speech", "Ann", "live")
             seconds = (mark.end - mark.start) / SECOND
             assert 25 < seconds < 45  # of 200 in about 870 pixels
-            patiently(page.text, lambda text: text.endswith("talking"))
+            patiently(page.text, lambda text: text.startswith("marked as talking"))
             page.evaluate(f"{buttons}.find(each => each.textContent == 'undoz').click()")
             patiently_without_layer(home)
             page.evaluate(f"{buttons}.find(each => each.textContent == 'quitq').click()")
             assert review.process.wait(60) == 0
+
+
+@pytest.mark.parametrize(("width", "height"), [(1366, 768), (390, 844)])
+def test_the_page_shows_the_line_before_and_the_last_one_whole_above_the_buttons(
+    home, tmp_path, width, height
+):
+    options = ("--web", "--port", free_port(), "--queue", "uncertain")
+    lines = """[...document.querySelectorAll("#lines p")].map((line) => {
+        const box = line.getBoundingClientRect(), whole = document.createRange();
+        whole.selectNodeContents(line);
+        const text = whole.getBoundingClientRect();
+        return [line.textContent, text.left >= 0 && text.right <= innerWidth && text.top >= box.top
+            && text.bottom <= box.bottom + 1 && box.bottom <= innerHeight];
+    })"""
+    tops = """[...document.querySelectorAll("button")].map((b) => b.getBoundingClientRect().top
+        - document.querySelector("#lines").getBoundingClientRect().bottom)"""
+    with reviewing(home, *options, BROWSER="true") as review:
+        line = review.wait_for("http://127.0.0.1:")
+        address = line[line.index("http:") :].split()[0]
+        with browsing(address, tmp_path / "browser") as page:
+            page.call(
+                "Emulation.setDeviceMetricsOverride",
+                width=width, height=height, deviceScaleFactor=1, mobile=False,
+            )  # fmt: skip
+            review.wait_for("1 of ")
+            review.press("u")
+            asked = review.wait_for("2 of ")
+            patiently(page.text, lambda text: text == asked)
+            (done, is_whole), (last, also) = page.evaluate(lines)
+            assert done.startswith("marked as not sure: ")
+            assert (last, is_whole, also) == (asked, True, True)
+            assert min(page.evaluate(tops)) >= 0
 
 
 def request(port, path, **headers):
@@ -1037,7 +1077,7 @@ def test_the_page_plays_the_kept_sound_of_the_span_and_nobody_else_gets_it(home,
         secret = urlsplit(address).path
         flags = ("--autoplay-policy=no-user-gesture-required",)
         with browsing(address, tmp_path / "browser", flags=flags) as page:
-            review.wait_for("1/2")
+            review.wait_for("1 of 2")
             status, kind, content = request(port, f"{secret}sound")
             assert (status, kind) == (200, "audio/wav")
             with wave.open(io.BytesIO(content)) as file:
@@ -1055,9 +1095,9 @@ def test_the_page_plays_the_kept_sound_of_the_span_and_nobody_else_gets_it(home,
                 "[...document.querySelectorAll('button')].find(b => b.textContent.includes('▶'))"
             )
             page.evaluate(f"{button}.click()")
-            patiently(page.text, lambda text: text == "playing 2.0 s; Space stops")
+            patiently(page.text, lambda text: text == "playing 2.0 s; Space stops it")
             review.press("n")
-            review.wait_for("2/2")
+            review.wait_for("2 of 2")
             found = patiently(lambda: request(port, f"{secret}sound"), lambda one: one[0] != 200)
             assert (found[0], found[2]) == (404, b"no sound of this span was kept\n")
             assert review.quit() == 0
@@ -1093,10 +1133,10 @@ def test_a_review_that_is_ended_ends_its_viewer(home, number):
 def test_marks_of_a_review_that_is_killed_are_in_the_layer(home, display):
     options = ("--port", free_port(), "--queue", "uncertain", "--spans", "6")
     with reviewing(home, *options, DISPLAY=display) as review:
-        review.wait_for("1/6")
+        review.wait_for("1 of 6")
         for number in (2, 3, 4):
             review.press("u")
-            review.wait_for(f"{number}/6")
+            review.wait_for(f"{number} of 6")
         viewers = programs_of(review)[1:]
         review.process.send_signal(signal.SIGKILL)
         review.process.wait()

@@ -114,7 +114,7 @@ class Marking:
         )
         labels = [span for span in spans if span[0] < span[1]]
         if not labels:
-            raise DataError(f"{self.corrects} has no label in this span: name the sound")
+            raise DataError("no label to confirm in this span: press the key of its class")
         return self._write(start, end, labels)
 
     def delete(self, start: int, end: int) -> list[Mark]:
@@ -164,7 +164,7 @@ class Marking:
         """
         old, pieces, now = self._mark_near(start, end), self._pieces(start, end), time.time_ns()
         if (old[0].start, old[-1].end) == (pieces[0][1], pieces[-1][2]):
-            raise DataError("the mark has these ends: drag its new span, from start to end")
+            raise DataError("the mark has these ends already: drag its new span")
         new = {
             log: old[0]._replace(start=first, end=last, reviewer=self.reviewer, made=now)
             for log, first, last in pieces
@@ -212,7 +212,7 @@ class Marking:
             return parts[int(np.argmax(common))]
         made = [one for one in parts if one[0].made == self._last]
         if not made:
-            raise DataError("no mark lies in this span: drag over the mark, from start to end")
+            raise DataError("no mark in the selection: drag over the mark")
         return made[-1]
 
     def undo(self) -> tuple[int, int] | None:
@@ -273,7 +273,7 @@ class Marking:
         end = min([end, *self.coverage.ends[-1:]])
         pieces = self.coverage.split(start, end) if start < end else []
         if not pieces:
-            raise DataError("part of this span was not recorded: mark a recorded part")
+            raise DataError("part of this span was not recorded: select a recorded part")
         return pieces
 
     def _write(

@@ -51,6 +51,12 @@ class ReviewItem(NamedTuple):
 
 
 QUEUES = (*RANKINGS, RANDOM, HINT)
+_WHY = {
+    "uncertainty": "unsure",
+    "disagreement": "they differ",
+    "novelty": "a new kind of sound",
+    USEFUL: "useful to learn from",
+}
 _TEN = 10  # a person needs ten minutes for them
 _MINUTE_EVERY = 5  # items of a queue of useful spans
 _MINUTES_LEFT = 10  # labelled minutes per drawn one, or a short log would have no useful span
@@ -208,6 +214,6 @@ def _text(span: ReviewSpan) -> str:
         return f"the network: {class_words(span.label_b)}? {old}: {class_words(span.label_a)}"
     label, other = (in_words(name).lower() for name in (span.label_a, span.label_b))
     if span.reason == RANDOM:
-        return f"{old}: mostly {label} (a minute at random: mark what is wrong in it)"
+        return f"{old}: mostly {label}; drag over each wrong sound and press its key"
     said = f", {new}: {other or 'nothing'}" if span.b else ""
-    return f"{old}: {label}{said} ({span.reason})"
+    return f"{old}: {label}{said}, {_WHY[span.reason]}"

@@ -16,7 +16,7 @@ from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.marks.marks import PERSON, RANDOM, Mark
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_queue import ReviewItem
-from hearthlog.analyzer.review.timeline import Key, LabelledSpans, SoundClip, sound_of
+from hearthlog.analyzer.review.timeline import Key, LabelledSpans, Question, SoundClip, sound_of
 from hearthlog.models.classes import TELEVISION, UNKNOWN, in_words
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import HearthlogError, LogError
@@ -26,9 +26,10 @@ _POLL_SECONDS = 0.3
 _LEAST_MARGIN = 20 * NANOSECONDS
 _AROUND = 600 * NANOSECONDS
 _RIGHT = "."
+_CAPS = {_RIGHT: "Enter", "p": "Space"}
 _NO_SOUND = "no sound of this span was kept"
 _CLASS_KEYS = "1234567890eghijklorsvwxy"
-_HELP = "drag a span on the time ruler, or set its ends with [ and ] at the time cursor; then"
+_SELECT = "drag a span on the time ruler, or press [ at its start and ] at its end"
 
 
 class Screen(Protocol):
@@ -57,15 +58,13 @@ class Screen(Protocol):
     def refresh(self) -> None:
         """Draw the selected span, and put the lanes beside their names again."""
 
-    def ask(self, start: int, end: int, text: str) -> None:
-        """Draw the requested span, in place of the previous one.
+    def ask(self, start: int, end: int, question: Question) -> None:
+        """Draw the requested span and its question, in place of the previous ones.
 
         Parameters
         ----------
         start, end : int
             In nanoseconds of UTC.
-        text : str
-            The question.
         """
 
     def play(self, start: int) -> None:
@@ -128,7 +127,7 @@ class ReviewSession:
         """All keys."""
         labels = self._labels()
         own = [
-            Key(key, text, colour(labels[key]) if key in labels else None)
+            Key(key, text, colour(labels[key]) if key in labels else None, _CAPS.get(key, ""))
             for key, (text, _) in self._actions().items()
         ]
         return [*own, Key("q", "quit")]
@@ -143,26 +142,26 @@ class ReviewSession:
         """Text and function of each key."""
         actions: dict[str, tuple[str, Callable[[], None]]] = {}
         if self.items:
-            actions["a"] = "accept the label", self._accept
+            actions["a"] = "confirm the label", self._accept
         else:
-            actions["c"] = "correct as labelled", lambda: self._mark(self.marking.confirm)
-        actions[_RIGHT] = "or Enter: all else in the span is right", self._rest_is_right
+            actions["c"] = "confirm the labels", lambda: self._mark(self.marking.confirm)
+        actions[_RIGHT] = "confirm the rest", self._rest_is_right
         for key, label in self._labels().items():
             actions[key] = _words(label), partial(self._mark_as, label)
         actions |= {
-            "m": ("move the mark here", self._move),
-            "d": ("delete marks", lambda: self._mark(self.marking.delete)),
+            "m": ("move the mark", self._move),
+            "d": ("delete the marks", lambda: self._mark(self.marking.delete)),
             "z": ("undo", self._undo),
-            "p": ("or Space: play, stop", self._play),
-            "[": ("from", self._begin_here),
-            "]": ("to", self._end_here),
+            "p": ("play or stop", self._play),
+            "[": ("set the start", self._begin_here),
+            "]": ("set the end", self._end_here),
         }
         if self.items:
             return actions | {
                 "n": ("skip", lambda: self._go(1)),
-                "b": ("back", lambda: self._go(-1)),
+                "b": ("go back", lambda: self._go(-1)),
             }
-        return actions | {"f": ("frames near the cursor", self._look_around)}
+        return actions | {"f": ("draw each frame", self._look_around)}
 
     def run(self, keys: "SimpleQueue[str]") -> int:
         """Process keys until the reviewer quits or closes the viewer, or the last item is done.
@@ -171,7 +170,11 @@ class ReviewSession:
         """
         self._began = time.monotonic()
         self._redraw()
-        self.say(f"{_HELP} press a key")
+        self.say(
+            "press a if the label is right, else the key of the right class; n skips"
+            if self.items
+            else f"{_SELECT}; then press a key"
+        )
         if self.items:
             self._go(1)
         while self.screen.is_open() and self._at < max(len(self.items), 1):
@@ -201,7 +204,7 @@ class ReviewSession:
         except HearthlogError as error:
             self.say(str(error))
         except (ConnectionError, TimeoutError):
-            self.say("the viewer did not answer, so nothing was done; press the key again")
+            self.say("nothing was done, as the viewer did not answer: press the key again")
 
     def _press(self, key: str) -> None:
         actions = self._actions()
@@ -209,9 +212,8 @@ class ReviewSession:
         if same in actions:
             actions[same][1]()
         elif key.strip():
-            self.say(
-                f"{key!r} is no key; {', '.join(f'{one.key} {one.text}' for one in self.keys)}"
-            )
+            known = ", ".join(f"{one.cap} {one.text}" for one in self.keys)
+            self.say(f"{key!r} does nothing; the keys are: {known}")
 
     def _mark_as(self, label: str) -> None:
         chosen = "" if self._in_minute or not self.items else self.items[self._at].chosen
@@ -234,15 +236,15 @@ class ReviewSession:
         else:
             start, end, chosen = *self._chosen(), PERSON
         self.marking.review(start, end, chosen)
-        self._done(start, end, "all else is right")
+        self._done(start, end, "the rest is confirmed")
         if self.items:
             self._go(1)
 
     def _mark(self, change: Callable[[int, int], list[Mark]]) -> None:
         start, end = self._chosen()
         made = change(start, end)
-        labels = dict.fromkeys(_words(mark.label) for mark in made)
-        self._done(start, end, ", ".join(labels) or "no mark")
+        labels = ", ".join(dict.fromkeys(_words(mark.label) for mark in made))
+        self._done(start, end, f"marked as {labels}" if labels else "marks deleted")
         if self.items and not self._in_minute:
             self._go(1)
 
@@ -251,13 +253,13 @@ class ReviewSession:
         span = self.screen.selection()
         item = self.items[self._at] if self.items else None
         if span is None or (item and span == (item.start, item.end)):
-            raise DataError("drag the new span of the mark first, from start to end")
+            raise DataError("drag the new span of the mark first, then press m")
         made = self.marking.move(*span)
-        self._done(made[0].start, made[-1].end, f"{_words(made[0].label)} moved")
+        self._done(made[0].start, made[-1].end, f"mark moved: {_words(made[0].label)}")
 
     def _done(self, start: int, end: int, text: str) -> None:
         self._judged.append(self._at)
-        self.say(f"{self._text(start, end)}  {text}")
+        self.say(f"{text}: {self._text(start, end)}")
         self._redraw()
 
     def _undo(self) -> None:
@@ -266,7 +268,7 @@ class ReviewSession:
             self.say("nothing to undo")
             return
         judged = self._judged.pop()
-        self.say(f"{self._text(*span)}  undone")
+        self.say(f"undone: {self._text(*span)}")
         self._redraw()
         if judged != self._at:
             self._go(judged - self._at)
@@ -283,7 +285,7 @@ class ReviewSession:
         try:
             yield
         except (ConnectionError, TimeoutError):
-            self.say("the viewer did not answer: the change was made, but is not shown")
+            self.say("saved, but not shown, as the viewer did not answer")
 
     def _play(self) -> None:
         """Play the selected span, or the item; stop a sound that plays."""
@@ -313,7 +315,7 @@ class ReviewSession:
     def _look_around(self) -> None:
         cursor = self._cursor()
         self.look_closely(cursor - _AROUND, cursor + _AROUND)
-        self.say(f"every frame from {self._text(cursor - _AROUND, cursor + _AROUND)}")
+        self.say(f"each frame drawn: {self._text(cursor - _AROUND, cursor + _AROUND)}")
 
     def _begin_here(self) -> None:
         """Begin a span, or move the start of the selected one."""
@@ -323,14 +325,15 @@ class ReviewSession:
             self._select(cursor, selection[1])
             return
         self._begin = cursor
-        self.say(f"from {local_time(self._begin, self.zone):%H:%M:%S}; set the end with ]")
+        begin = local_time(self._begin, self.zone)
+        self.say(f"start set, {begin:%H:%M:%S}: put the time cursor on the end and press ]")
 
     def _end_here(self) -> None:
         selection = self.screen.selection()
         start = self._begin if self._begin is not None else selection and selection[0]
         end = self._cursor()
         if start is None or start >= end:
-            raise DataError("a span ends after it begins: put the cursor where it begins, press [")
+            raise DataError("put the time cursor on the start and press [, then on the end and ]")
         self._begin = None
         self._select(start, end)
 
@@ -341,7 +344,7 @@ class ReviewSession:
     def _cursor(self) -> int:
         cursor = self.screen.cursor()
         if cursor is None:
-            raise DataError("there is no time cursor; click on the time axis first")
+            raise DataError("click on the time ruler first: there is no time cursor")
         return cursor
 
     def _chosen(self) -> tuple[int, int]:
@@ -350,12 +353,9 @@ class ReviewSession:
         if span is not None:
             return span
         if self._in_minute:
-            raise DataError(
-                "drag over the sound first: without that the key would name the whole minute "
-                "(Enter: all of it is right as it is labelled)"
-            )
+            raise DataError("drag over the sound first; Enter confirms the rest of the minute")
         if not self.items:
-            raise DataError(f"no span is marked: {_HELP} press a key")
+            raise DataError(f"no span is selected: {_SELECT}")
         item = self.items[self._at]
         return item.start, item.end
 
@@ -365,19 +365,19 @@ class ReviewSession:
         if self._at >= len(self.items):
             return
         item = self.items[self._at]
-        self.say(
-            f"{self._at + 1}/{len(self.items)}  {self._text(item.start, item.end)}  {item.text}"
-        )
+        place = f"{self._at + 1} of {len(self.items)}"
+        self.say(f"{place}: {_asked(item)} {self._text(item.start, item.end)}; {item.text}")
         margin = _margin(item.start, item.end)
         with self._unless_silent():
             self.look_closely(item.start - margin, item.end + margin)
-            self.screen.ask(item.start, item.end, _question(item))
+            text = f"{place}, {self._text(item.start, item.end)}"
+            self.screen.ask(item.start, item.end, Question(_asked(item), text, self._answers()))
             # A minute has several sounds: what is named in it is selected by hand.
             self.screen.show(item.start, item.end, margin, select=item.chosen != RANDOM)
 
     def _text(self, start: int, end: int) -> str:
         length = (end - start) / NANOSECONDS
-        return f"{local_time(start, self.zone):%a %d %b %H:%M:%S} + {length:.1f} s"
+        return f"{local_time(start, self.zone):%a %d %b %H:%M:%S}, {length:.1f} s"
 
     def _conclude(self) -> None:
         minutes = (time.monotonic() - self._began) / 60
@@ -385,11 +385,22 @@ class ReviewSession:
         spans = "1 span" if count == 1 else f"{count} spans"
         self.say(f"{spans} reviewed in {minutes:.1f} min, {count / minutes:.1f} a minute")
 
+    def _answers(self) -> list[Key]:
+        """Return the keys that answer the question of the current item."""
+        item, labels = self.items[self._at], self._labels()
+        yes = Key("a", "yes")
+        if self._in_minute:
+            yes = Key(_RIGHT, "yes, or the rest is right", shown=_CAPS[_RIGHT])
+        others = [key for key, label in labels.items() if self._in_minute or label != item.label]
+        named = {one.key: one for one in self.keys}
+        more = Key("n", "skip"), Key("p", "play", shown=_CAPS["p"]), Key("z", "undo")
+        return [yes, *(named[key] for key in others), *more]
 
-def _question(item: ReviewItem) -> str:
+
+def _asked(item: ReviewItem) -> str:
     if item.chosen == RANDOM:
-        return "all of this minute?"
-    return f"{_words(item.label)}? {(item.end - item.start) / NANOSECONDS:.1f} s"
+        return "Is all of this minute labelled right?"
+    return f"{in_words(item.label)}?"
 
 
 def _words(label: str) -> str:
@@ -442,4 +453,4 @@ def listen(
     except LogError as error:
         return 0.0, str(error)
     seconds = len(samples) / rate
-    return seconds, f"playing {seconds:.1f} s; Space stops"
+    return seconds, f"playing {seconds:.1f} s; Space stops it"

@@ -426,8 +426,23 @@ class Timeline:
 
 
 class Key(NamedTuple):
-    """A key of a review, its action, and the colour of the class that it names."""
+    """A key of a review, its action, the colour of the class that it names, and its cap."""
 
     key: str
     text: str
     colour: Colour | None = None
+    shown: str = ""  # as `Enter`; empty for the key itself
+
+    @property
+    def cap(self) -> str:
+        """What is on the key."""
+        return self.shown or self.key
+
+
+class Question(NamedTuple):
+    """What is asked about a span: a few words, which span it is, and the keys that answer."""
+
+    text: str
+    place: str
+    keys: Sequence[Key] = ()
+    keys_in: str = ""  # where they are pressed, if not in the viewer

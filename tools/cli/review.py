@@ -308,7 +308,7 @@ def _offer(
 def _print_keys(keys: "Sequence[Key]") -> None:
     """Print the keys: on a terminal in columns, with the colours of their classes."""
     if not sys.stdout.isatty():
-        print(printable(", ".join(f"{one.key} {one.text}" for one in keys)), flush=True)
+        print(printable(", ".join(f"{one.cap} {one.text}" for one in keys)), flush=True)
         return
     from rich.columns import Columns
     from rich.console import Console
@@ -316,7 +316,7 @@ def _print_keys(keys: "Sequence[Key]") -> None:
 
     cells = [
         Text.assemble(
-            (f" {one.key} ", "reverse" if one.colour is None else f"black on rgb{one.colour}"),
+            (f" {one.cap} ", "reverse" if one.colour is None else f"black on rgb{one.colour}"),
             f" {printable(one.text)}",
         )
         for one in keys

@@ -86,9 +86,9 @@ class Canvas:
         texts = rr.TextDocument.columns(text=[""] * len(times))
         self.recording.send_columns(entity, [self._time_column(times)], texts)
 
-    def write(self, entity: str, text: str) -> None:
-        """Set the text of a text entity."""
-        self.recording.log(entity, rr.TextDocument(text), static=True)
+    def write(self, entity: str, text: str, media_type: str | None = None) -> None:
+        """Set the text of a text entity, plain or such as `text/markdown`."""
+        self.recording.log(entity, rr.TextDocument(text, media_type=media_type), static=True)
 
     def configure_states(self, entity: str, colours: Mapping[str, Colour]) -> None:
         """Set the colours and displayed names of the states of a lane.

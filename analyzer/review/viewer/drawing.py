@@ -1,5 +1,6 @@
 """Rerun entities of a timeline, and the views that show them."""
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ from hearthlog.analyzer.review.lanes import (
 from hearthlog.analyzer.review.timeline import (
     MicrophoneTimeline,
     Plot,
+    Question,
     Style,
     Timeline,
     spectrogram,
@@ -39,7 +41,7 @@ LINES, CLIP, WORDS, HOURS = "events", "clip", "words", "hours"
 SPECTRUM = "spectrum"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # suffix of a microphone's name
-ASKED, ASKED_WORDS = "asked", "words/asked"
+ASKED, ASKED_WORDS, ASKED_NAME = "asked", "words/asked", "words/asked_name"
 _ASKED_STROKES = 600  # maximum strokes of a band
 _ASKED: Colour = (245, 240, 225)
 
@@ -199,8 +201,8 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
         canvas.show_image(f"{microphone.name}/{SPECTRUM}", grid.start, shade, text)
 
 
-def draw_requested(number: int, start: int, end: int, text: str, canvas: Canvas) -> None:
-    """Draw the requested span, in place of the previous one.
+def draw_requested(number: int, start: int, end: int, question: Question, canvas: Canvas) -> None:
+    """Draw the requested span and its question, in place of the previous ones.
 
     Parameters
     ----------
@@ -210,9 +212,18 @@ def draw_requested(number: int, start: int, end: int, text: str, canvas: Canvas)
     if number:
         canvas.hide(f"{ASKED}/{number - 1}")
     entity, middle = f"{ASKED}/{number}", np.array([(start + end) // 2])
-    canvas.configure(entity, Style.BANDS, [text], [_ASKED])
+    canvas.configure(entity, Style.BANDS, [question.text], [_ASKED])
     canvas.add_bands(entity, middle, np.ones((1, 1)), end - start, _ASKED_STROKES)
-    canvas.write(ASKED_WORDS, text)
+    keys = " · ".join(f"**{_plain(one.cap)}** {_plain(one.text)}" for one in question.keys)
+    where = f"{_plain(question.keys_in)}: " if question.keys_in else ""
+    text = f"## {_plain(question.text)} {_plain(question.place)}\n\n{where}{keys}"
+    canvas.write(ASKED_WORDS, text, rr.MediaType.MARKDOWN)
+    canvas.write(ASKED_NAME, "Asked about")
+
+
+def _plain(text: str) -> str:
+    """Escape what Markdown would take for marks."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
 def draw_frames(
@@ -318,13 +329,14 @@ APPLICATION = "hearthlog"
 # The viewer keeps the shared range of linked time axes under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
-_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 140, 44
+_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 140, 26
+_QUESTION_HEIGHT = 92
 _CLOSE_HEIGHT = 100  # of a plot in a close-up
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
 # Numbers of the lanes' axis are as wide as those of the plots below: the plots begin at one place.
 LANE_HEIGHT = 0.1
-_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 110
+_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 84
 _SPECTRUM_SHAPE = (128, 1792)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 HOUR_COLUMNS = (2, 11)  # the same, of the hours, whose view has no vertical axis
@@ -466,10 +478,13 @@ def review_layout(
         for time in (timeline.grid.start, timeline.grid.end)
     )
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
-    asked: list[Row] = [(_ASKED_HEIGHT, _requested_view())]
+    asked: list[Row] = [
+        (_QUESTION_HEIGHT, _text(ASKED_WORDS)),
+        (_ASKED_HEIGHT, _requested_view()),
+    ]
     whole = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []
-    everything = [*(asked if close_up else []), *hours, whole]
+    everything = [*(asked if close_up else hours), whole]
     share = max(own[close_up][0] for own in stacks.values()) / sum(part for part, _ in everything)
     return TimelineBlueprint(everything, panel, start, end, lanes_share=share)
 
@@ -543,7 +558,7 @@ def _spectrum_view(microphone: str) -> rrb.Container:
 
 def _requested_view() -> rrb.Container:
     lane = _time_series("Which span is asked", [ASKED], (0.0, 1.0))
-    return rrb.Horizontal(_text(ASKED_WORDS), lane, column_shares=COLUMNS)
+    return rrb.Horizontal(_text(ASKED_NAME), lane, column_shares=COLUMNS)
 
 
 def _close_up(plot: Plot, clock: str) -> rrb.Container:

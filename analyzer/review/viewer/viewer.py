@@ -26,6 +26,7 @@ from hearthlog.analyzer.review.timeline import (
     HomeClock,
     Key,
     LabelledSpans,
+    Question,
     Timeline,
     TimelineGrid,
     no_spans,
@@ -216,9 +217,11 @@ class Viewer(ABC):
         self._close = joined(np.append(starts, grid.start), np.append(ends, grid.end))
         self._flush()
 
-    def ask(self, start: int, end: int, text: str) -> None:
+    def ask(self, start: int, end: int, question: Question) -> None:
         """Draw the requested span, in place of the previous one."""
-        draw_requested(self._asked, start, end, text, self._canvas)
+        if not self.address:
+            question = question._replace(keys_in="Press in the terminal")
+        draw_requested(self._asked, start, end, question, self._canvas)
         self._asked += 1
         self._flush()
 

@@ -19,6 +19,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, local_time
 from hearthlog.analyzer.logs.spans import NONE
 from hearthlog.analyzer.review.lanes import class_precision
+from hearthlog.analyzer.review.timeline import Key, Question
 from hearthlog.analyzer.review.timeline_reader import read_frames, read_timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
@@ -85,7 +86,8 @@ def queue_text(logs: Path) -> str:
     drawn.add_layout(review_layout(timeline, marking=True, close_up=True))
     draw(timeline, canvas, marking=True)
     draw_close_up(read_timeline([logs], start - _MARGIN, end + _MARGIN), NONE, canvas)
-    draw_requested(0, start, end, "music? 3.0 s", canvas)
+    question = Question("Music?", "1 of 10", [Key("a", "yes"), Key("n", "skip")])
+    draw_requested(0, start, end, question, canvas)
     return drawn.text()
 
 
