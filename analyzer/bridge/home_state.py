@@ -234,7 +234,7 @@ class LiveMicrophone:
             events = self._named_events(label, since, names)
             every += events
             given = corrections.labels(events)
-            counted = {event.id for event in self._counted(events)}
+            counted = {event.id for event in self.counted(events)}
             for event in events:
                 name = given.get(event.id, label)
                 own = found.get(names.get(name, name))
@@ -280,7 +280,7 @@ class LiveMicrophone:
             for name, (day, night) in self._counts[1].items()
         }
 
-    def _counted(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
+    def counted(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
         """Return the events that count: `SET_APART` classes only without a television beside."""
         apart = [event for event in events if event.label in SET_APART]
         left = {*self.without_television(apart)}

@@ -60,8 +60,9 @@ class Labelling:
 
     def rows(self, which: Bool) -> "Labelling":
         """Select spans."""
-        columns = self.starts, self.ends, self.labels, self.confidences
-        return Labelling(*(column[which] for column in columns))
+        return Labelling(
+            self.starts[which], self.ends[which], self.labels[which], self.confidences[which]
+        )
 
     def called_as(self, classes: Sequence[str]) -> "Labelling":
         """Rename labels to the equivalent names in a list of classes.

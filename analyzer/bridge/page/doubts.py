@@ -81,7 +81,10 @@ class CurrentDoubts:
         """Begin to read the frames of events that have ended, unless others are being read."""
         if self._thread is not None and self._thread.is_alive():
             return
-        new = [e for e in events if now - e.end > _FINAL and e.id not in self._done]
+        current = {event.id: event for event in events}
+        self._done &= current.keys()
+        self.found = {name: own for name, own in self.found.items() if name in current}
+        new = [e for e in current.values() if now - e.end > _FINAL and e.id not in self._done]
         if new:
             self._thread = Thread(target=self._read, args=(new, now), daemon=True)
             self._thread.start()
