@@ -86,7 +86,7 @@ class Canvas:
         texts = rr.TextDocument.columns(text=[""] * len(times))
         self.recording.send_columns(entity, [self._time_column(times)], texts)
 
-    def write(self, entity: str, text: str, media_type: str | None = None) -> None:
+    def write(self, entity: str, text: str, media_type: rr.MediaType | None = None) -> None:
         """Set the text of a text entity, plain or such as `text/markdown`."""
         self.recording.log(entity, rr.TextDocument(text, media_type=media_type), static=True)
 

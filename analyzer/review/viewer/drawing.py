@@ -330,7 +330,7 @@ APPLICATION = "hearthlog"
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
 _LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 140, 26
-_QUESTION_HEIGHT = 92
+_QUESTION_HEIGHT = 112
 _CLOSE_HEIGHT = 100  # of a plot in a close-up
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
