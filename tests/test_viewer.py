@@ -274,6 +274,38 @@ def check_seen(png, timeline):
     assert rows.min() > tops[-1][1]
 
 
+def notches(png, shade):
+    """By how many pixels each strip of the topmost lane of a colour is narrower in some row."""
+    near = np.abs(pixels(png) - shade).max(axis=2) <= _NEAR
+    rows = np.flatnonzero(near.any(axis=1))
+    lane, *_ = np.split(rows, np.flatnonzero(np.diff(rows) > _CAP) + 1)
+    inner = near[lane[0] + 2 : lane[-1] - 1]  # without the round ends
+    columns = np.flatnonzero(inner.any(axis=0))
+    strips = np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1)
+    assert len(inner) > 6
+    return [int(np.ptp(inner[:, strip].sum(axis=1))) for strip in strips]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_strip_is_one_piece_without_beads_at_every_zoom(short_sounds, size):
+    timeline = read_timeline([short_sounds], *day_span(DAY, UTC))
+    begin, seconds = SOUGHT["yelling"][0]
+    start = timeline.grid.start + round(begin * 1e9)
+    with hidden(size) as viewer:
+        viewer.draw(timeline, close_up=False)
+        viewer.wait_until_drawn()
+        for margin in (10 * HOUR, HOUR // 6, HOUR // 200):
+            viewer.show(start, start + round(seconds * 1e9), margin, select=False)
+            patiently(viewer.cursor, lambda cursor: cursor == start)
+
+            def found(viewer=viewer):
+                with suppress(AssertionError, ValueError, IndexError):
+                    return notches(viewer.picture(), colour("yelling"))
+                return [99]
+
+            patiently(found, lambda each: max(each) <= 1)
+
+
 def is_seen(png, timeline, path):
     path.write_bytes(png)
     with suppress(AssertionError):

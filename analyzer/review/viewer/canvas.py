@@ -17,7 +17,8 @@ from hearthlog.schemas.arrays import Float64, Int64
 
 _STROKE_WIDTH = 2.0  # pixels
 # Ends of lines are round and reach half a width too far, so thin lines side by side fill a strip.
-_STRIP_LINES, _STRIP_WIDTH = 8, 4.0  # screen points
+# The last line goes around the others: else a short sound would be a row of dots on a large screen.
+_STRIP_LINES, _STRIP_WIDTH = 12, 5.0  # screen points
 _ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 4, 6.0, 0.8
 ROWS_HEIGHT = 0.2  # of all rows: with numbers as wide as those of lanes, both begin at one place
 _SHADES = 10  # of a row; each change of its colour is a line of its own for the viewer
@@ -66,10 +67,12 @@ class Canvas:
         )
         self.recording.log(entity, style, static=True)
         starts, ends = spans  # a hole before each, or the first one is cut off in the middle
-        times = np.stack([starts, starts, ends, ends], axis=1).ravel()
+        times = np.stack([starts, starts, starts, ends, ends, ends], axis=1).ravel()
         lines = height + thickness * np.linspace(-0.5, 0.5, _STRIP_LINES)
-        holes = np.full(_STRIP_LINES, np.nan)
-        self.draw_lines(entity, times, np.tile([holes, lines, lines, holes], (len(starts), 1)))
+        begin, holes = lines.copy(), np.full(_STRIP_LINES, np.nan)
+        begin[-1] = lines[0]
+        shape = [holes, begin, lines, lines, begin, holes]
+        self.draw_lines(entity, times, np.tile(shape, (len(starts), 1)))
 
     def hide(self, entity: str) -> None:
         """Hide strips; a recording cannot delete data."""
