@@ -341,7 +341,7 @@ def _open(
             try:
                 stream = sounddevice.RawInputStream(
                     samplerate=rate,
-                    blocksize=int(rate * BLOCK_SECONDS),
+                    blocksize=int(rate * min(BLOCK_SECONDS, latency)),
                     device=device.index,
                     channels=channels,
                     dtype="int16",

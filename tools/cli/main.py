@@ -35,7 +35,7 @@ PANELS = {
     "A model of the home": (
         *("review", "train", "enrol", "discover", "voices", "relabel", "models", "annotate"),
     ),
-    "House and service": ("bridge", "install_service", "retain", "alerts", "config"),
+    "House and service": ("setup", "bridge", "install_service", "retain", "alerts", "config"),
     "Files": ("doctor", "recover", "cat", "export", "cut", "merge", "catalog"),
     "Research": ("replay", "diff", "manifest", "evaluate"),
 }

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from hearthlog.recorder.config_problems import Key, Origins
     from hearthlog.recorder.disk_keeper import Thinned
     from hearthlog.recorder.retention import Deletion, KeepingRules
+    from hearthlog.schemas.errors import HearthlogError
 
 
 def devices(*, as_json: Json = False) -> None:
@@ -88,6 +89,21 @@ def check(
     others may read its secrets, a file should be a credential of the service, nobody would
     read a text file, or an alert can never notify.
     """
+    errors, problems, warnings = findings(file)
+    for line in [*map(str, errors), *problems, *warnings]:
+        print_notice(line)
+    if errors or problems:
+        raise typer.Exit(max([1, *(error.status for error in errors)]))
+    print(f"{file}: valid")
+    if warnings:
+        raise typer.Exit(3)
+
+
+def findings(file: Path) -> "tuple[list[HearthlogError], list[str], list[str]]":
+    """Return the errors of the recorder, those of the bridge, and the warnings of both.
+
+    Raise `ConfigurationError` if the configuration is invalid.
+    """
     from hearthlog.analyzer.bridge.alerts.rule_checks import rule_doubts, unheard_classes
     from hearthlog.analyzer.bridge.bridge import exposed_files, output_problems
     from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
@@ -102,13 +118,7 @@ def check(
     warnings += rule_doubts(bridge.alert, settings, microphones)
     warnings += unheard_classes(bridge.alert, settings, microphones)
     warnings += [*exposed_passwords(settings, file), *exposed_files(bridge, file, bridge.state)]
-    for line in [*map(str, errors), *problems, *warnings]:
-        print_notice(line)
-    if errors or problems:
-        raise typer.Exit(max([1, *(error.status for error in errors)]))
-    print(f"{file}: valid")
-    if warnings:
-        raise typer.Exit(3)
+    return errors, problems, warnings
 
 
 @config.command()

@@ -5,10 +5,12 @@ import json
 import os
 import pwd
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -23,6 +25,10 @@ from hearthlog.schemas.errors import HearthlogError
 
 class ServiceError(HearthlogError):
     """The service cannot be installed as requested."""
+
+
+class StartError(ServiceError):
+    """The service is installed and does not start."""
 
 
 STATE = Path("/var/lib/hearthlog")  # state directory of the unit in systemd's terms
@@ -195,6 +201,83 @@ def place_of(folder: Path, name: str) -> Path:
     return unit
 
 
+_PACKAGED_UNITS = Path("/usr/lib/systemd/system")
+
+
+def is_packaged(name: str) -> bool:
+    """Return whether the distribution brings a unit, and nothing replaces it."""
+    return (_PACKAGED_UNITS / name).exists() and not os.path.lexists(SYSTEM_UNITS / name)
+
+
+def check_unit(unit: Path, verb: str, config: Path, folder: Path | None) -> None:
+    """Check that an existing unit starts this installation, for a configuration and a folder.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Of a user's service.
+
+    Raises
+    ------
+    ServiceError
+        If it starts another installation, or a user's service records in another folder.
+    """
+    if not unit.exists():
+        return
+    lines = dict(line.partition("=")[::2] for line in unit.read_text("utf-8").splitlines())
+    words = shlex.split(lines.get("ExecStart", "").replace("$$", "$").replace("%%", "%"))
+    program = words[0].lstrip("@") if words else ""
+    if Path(program).resolve() != Path(verb_command(verb, None)[0]).resolve():
+        remove = f"systemctl disable --now {unit.name}, and remove {unit}"
+        raise ServiceError(
+            f"{unit}: starts {program or 'nothing'}, another installation of hearthlog; use the "
+            f"setup of that one, or first: {remove}"
+        )
+    records = lines.get("WorkingDirectory", "").replace("%%", "%")
+    if folder is not None and records != str(folder):
+        raise ServiceError(f"{unit}: records in {records}; run `hearthlog setup` in that folder")
+    if unit.parent == _PACKAGED_UNITS and str(config) not in words:
+        own = words[words.index("--config") + 1] if "--config" in words[:-1] else "no file"
+        raise ServiceError(f"{unit}: reads {own}; give that: --config {own}")
+
+
+def packaged_unit(name: str) -> Path:
+    """Return the path of a unit of the distribution."""
+    return _PACKAGED_UNITS / name
+
+
+def make_account(account: str) -> bool:
+    """Make the account of the recorder; return False if it exists.
+
+    Raise `ServiceError` if it cannot be made.
+    """
+    with suppress(KeyError):
+        pwd.getpwnam(account)
+        return False
+    _account_command("useradd", *_ACCOUNT, str(STATE), account)
+    return True
+
+
+def remove_account(account: str) -> None:
+    """Remove an account that was just made.
+
+    Raise `ServiceError` if it cannot be removed.
+    """
+    _account_command("userdel", account)
+
+
+_ACCOUNT = ("--system", "--user-group", "--home-dir")
+
+
+def _account_command(*command: str) -> None:
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+    except OSError as error:
+        raise ServiceError(f"{command[0]}: {error.strerror}") from error
+    if result.returncode:
+        raise ServiceError(" ".join(result.stderr.split()) or f"{command[0]} failed")
+
+
 def check_seen(what: str, path: Path | None) -> None:
     """Check that a file is visible to a system service.
 
@@ -229,10 +312,18 @@ def start_unit(name: str, *options: str, is_running: bool) -> bool:
     try:
         _systemctl(*options, "restart", name)
     except ServiceError as error:
-        raise ServiceError(
+        raise StartError(
             f"{name} did not start; `journalctl {' '.join([*options, '-u'])} {name}` says why"
         ) from error
     return True
+
+
+def stop_unit(name: str) -> None:
+    """Stop a service of the machine for good.
+
+    Raise `ServiceError` if it cannot be stopped.
+    """
+    _systemctl("disable", "--now", name)
 
 
 def _systemctl(*arguments: str, env: dict[str, str] | None = None) -> None:

@@ -1,0 +1,402 @@
+"""`hearthlog setup`: from an installation to a running recorder."""
+
+import os
+import pty
+import re
+import select
+import socket
+import subprocess
+import time
+import tomllib
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from conftest import FRESH_HEARTHLOG
+from systemd import PREFIX, PROGRAM
+from test_service import LOGS, UNIT, machine, service, wait_for_labels
+
+from hearthlog.analyzer.http import free_port
+from hearthlog.tools.cli.level_meter import users_of_microphones
+
+__all__ = ["machine", "service"]
+
+SECONDS = 60
+DEFAULTS = ("--no-service", "--yes", "--config", "home.toml")
+
+
+class Terminal:
+    """A terminal on which setup runs; a test reads what is shown and types."""
+
+    def __init__(self, process, screen):
+        self._process, self._screen, self.shown = process, screen, ""
+
+    def expect(self, text):
+        """Read until a text is shown; return what came before it, and forget both."""
+        deadline = time.monotonic() + SECONDS
+        while text not in self.shown:
+            assert time.monotonic() < deadline, f"{text!r} is not shown, but {self.shown!r}"
+            if select.select([self._screen], [], [], 0.2)[0]:
+                try:
+                    self.shown += os.read(self._screen, 4096).decode(errors="replace")
+                except OSError:  # closed
+                    pytest.fail(f"{text!r} is not shown, but {self.shown!r}")
+        before, _, self.shown = self.shown.partition(text)
+        return before
+
+    def type(self, text):
+        os.write(self._screen, text.encode())
+
+    def answer(self, question, text=""):
+        before = self.expect(question)
+        self.expect(": ")
+        self.type(f"{text}\n")
+        return before
+
+    def end(self):
+        """Return the exit status, and all that was shown until then."""
+        shown = self.shown
+        while True:
+            try:
+                data = os.read(self._screen, 4096)
+            except OSError:
+                data = b""
+            if not data:
+                return self._process.wait(timeout=SECONDS), shown
+            shown += data.decode(errors="replace")
+
+
+@contextmanager
+def dialogue(folder, env, *options):
+    screen, terminal = pty.openpty()
+    process = subprocess.Popen(
+        ["setsid", "--ctty", *FRESH_HEARTHLOG, "setup", *options],
+        cwd=folder, env=env | {"COLUMNS": "200"}, stdin=terminal, stdout=terminal, stderr=terminal,
+    )  # fmt: skip
+    os.close(terminal)
+    try:
+        yield Terminal(process, screen)
+    finally:
+        process.kill()
+        process.wait()
+        os.close(screen)
+
+
+QUESTIONS = (
+    "Number, or several",
+    "Room of nullsink",
+    "Name of the home",
+    "Time zone of the home",
+    "Keep sound?",
+    "Download the network yamnet",
+    "Serve a page",
+    "MQTT broker",
+    "Send alerts",
+    "Do this",
+)
+
+
+@pytest.fixture
+def home(pulse_microphone, tmp_path):
+    """A folder, and the environment of a machine with a microphone and without a network."""
+    nothing = str(tmp_path / "nothing")
+    pulse_microphone.env |= {"XDG_DATA_HOME": nothing, "XDG_DATA_DIRS": nothing}
+    return tmp_path, pulse_microphone.env
+
+
+def written(folder, name="home.toml"):
+    return tomllib.loads((folder / name).read_text())
+
+
+def test_a_clap_moves_the_bar_and_the_answers_are_written(home, pulse_microphone):
+    folder, env = home
+    with dialogue(folder, env, "--no-service", "--config", "home.toml") as seen:
+        seen.expect("1  nullsink")
+        seen.expect("-96 dB")
+        clap = np.zeros(16_000, np.int16)
+        clap[:1600] = 20_000
+        pulse_microphone.play(clap)
+        louder = seen.expect(" -4 dB")
+        assert re.search("(█|#){20}", louder)
+        seen.type("1\n")
+        seen.answer("Room of", "Living Room")
+        seen.answer("Name of the home", "an na")
+        assert "cannot be part of a file name" in seen.answer("Name of the home", "anna")
+        seen.answer("Time zone", "Europe/Berlin")
+        seen.answer("Keep sound?", "y")
+        seen.answer("Download the network yamnet, 4 MB", "n")
+        seen.answer("page", "y")
+        seen.answer("MQTT", "y")
+        seen.answer("Broker", "broker.lan")
+        seen.answer("User", "anna")
+        seen.answer("Password", "secret")
+        seen.answer("alerts", "y")
+        seen.answer("Address", "nonsense://")
+        seen.answer("Address", "json://127.0.0.1:9")
+        assert "secret" not in seen.answer("Do this", "y")
+        status, shown = seen.end()
+    assert status == 0, shown
+    assert "hearthlog record --config" in shown
+    content = written(folder)
+    assert content["microphone"] == [{"name": "living_room", "device": "nullsink"}]
+    assert (content["node"], content["timezone"]) == ("anna", "Europe/Berlin")
+    assert (content["keep_audio"], content["bridge"]["page"]) == ("unsure", {"port": 8380})
+    password = folder / "home/mqtt-password"
+    broker = {"host": "broker.lan", "user": "anna", "password_file": str(password)}
+    assert content["bridge"]["mqtt"] == broker
+    assert password.read_text() == "secret\n"
+    assert content["bridge"]["delivery"]["urls_file"] == str(folder / "home/alert-urls")
+    assert [rule["rule"] for rule in content["bridge"]["alert"]] == ["recorder_silent"]
+    assert [path for path in folder.rglob("*") if path.stat().st_mode & 0o077] == []
+
+
+@pytest.mark.parametrize("last", [0, 2, 4, 9])
+def test_ctrl_c_at_any_question_leaves_nothing_changed(home, last):
+    folder, env = home
+    with dialogue(folder, env, "--no-service", "--config", "home.toml") as seen:
+        for place, question in enumerate(QUESTIONS[:last]):
+            seen.expect(question)
+            seen.expect(": ")
+            seen.type("\n" if place else "1\n")
+        seen.expect(QUESTIONS[last])
+        seen.type("\x03")
+        status, shown = seen.end()
+    assert (status, "nothing was changed" in shown) == (130, True), shown
+    assert list(folder.iterdir()) == []
+
+
+def run(folder, env, *options):
+    return subprocess.run(
+        [*FRESH_HEARTHLOG, "setup", *options], cwd=folder, env=env, stdin=subprocess.DEVNULL,
+        capture_output=True, text=True, timeout=SECONDS, check=False,
+    )  # fmt: skip
+
+
+def refused(folder, env, *options, status=1):
+    """Run setup, which changes nothing; return its one line."""
+    before = times(folder)
+    result = run(folder, env, *options)
+    assert result.returncode == status, result.stderr
+    assert times(folder) == before
+    assert result.stdout == ""
+    return result.stderr.splitlines()[-1]
+
+
+def times(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+ANSWERED = {
+    "--microphone": ("nullsink=kitchen",),
+    "--node": ("anna",),
+    "--timezone": ("Europe/Berlin",),
+    "--no-keep-sound": (),
+    "--network": ("none",),
+    "--no-page": (),
+    "--mqtt": ("none",),
+    "--alerts": ("none",),
+    "--yes": (),
+}
+
+
+@pytest.mark.parametrize("option", [each for each in ANSWERED if each != "--yes"])
+def test_without_a_terminal_a_question_names_its_option(home, option):
+    given = [word for name, values in ANSWERED.items() for word in (name, *values)]
+    place = given.index(option)
+    left = given[:place] + given[place + 1 + len(ANSWERED[option]) :]
+    left.remove("--yes")
+    line = refused(*home, "--no-service", *left, status=2)
+    assert "there is no terminal to ask on; give" in line
+    assert option in line
+
+
+def test_options_answer_everything(home):
+    folder, env = home
+    (folder / "password").write_text("secret\n")
+    (folder / "urls").write_text("json://127.0.0.1:9\n")
+    result = run(
+        folder, env, *DEFAULTS, "--microphone", "nullsink=kitchen", "--node", "anna",
+        "--mqtt", "broker.lan", "--mqtt-user", "anna", "--mqtt-password-file", "password",
+        "--alerts", "urls", "--page", "--page-port", str(free_port()),
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    content = written(folder)
+    assert content["microphone"] == [{"name": "kitchen", "device": "nullsink"}]
+    assert (folder / "home/mqtt-password").read_text() == "secret\n"
+    assert "embedding" not in content or content["embedding"] == ""
+
+
+def test_an_existing_configuration_keeps_its_comments_and_other_keys(home):
+    folder, env = home
+    before = (
+        '# of Anna\nnode = "anna"  # her name\nmin_free_space = "1G"\n\n[[microphone]]\n'
+        'name = "kitchen"  # at the window\ndevice = "nullsink"\nchannel = 1\n'
+    )
+    (folder / "home.toml").write_text(before)
+    (folder / "home.toml").chmod(0o640)
+    line = refused(folder, env, *(each for each in DEFAULTS if each != "--yes"), status=2)
+    assert "there is no terminal" in line
+    result = run(folder, env, *DEFAULTS, "--node", "berta")
+    assert result.returncode == 0, result.stderr
+    assert '-node = "anna"  # her name\n+node = "berta"  # her name\n' in result.stderr
+    after = (folder / "home.toml").read_text()
+    assert after.startswith('# of Anna\nnode = "berta"  # her name\nmin_free_space = "1G"\n')
+    assert after.endswith(before[before.index("[[microphone]]") :])
+    assert (folder / "home.toml").stat().st_mode & 0o777 == 0o640
+    assert run(folder, env, *DEFAULTS).returncode == 0
+    assert (folder / "home.toml").read_text() == after
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "said"),
+    [
+        (("--node", "an na"), 2, "--node: node name 'an na' cannot be part of a file name"),
+        (("--timezone", "Mars"), 2, "--timezone: "),
+        (("--microphone", "nullsink"), 2, "is not DEVICE=ROOM, such as"),
+        (("--microphone", "nullsink=küche"), 2, "cannot be a topic: use lower-case letters"),
+        (("--microphone", "none=kitchen"), 1, "no microphone is called 'none'; there are"),
+        (("--network", "vggish"), 2, "is neither yamnet nor none"),
+        (("--mqtt", "mqtt://broker"), 2, "write only the host name"),
+        (("--mqtt-user", "anna"), 2, "need --mqtt HOST"),
+        (("--alerts", "missing"), 1, "missing: No such file or directory"),
+        (("--alerts", "wrong"), 1, "is none of Apprise's"),
+        (("--page-port", "80"), 2, "--page-port needs --page"),
+    ],
+)
+def test_a_wrong_answer_is_refused_with_one_line(home, options, status, said):
+    folder, env = home
+    (folder / "wrong").write_text("nonsense\n")
+    assert said in refused(folder, env, *DEFAULTS, *options, status=status)
+
+
+def test_an_occupied_port_is_refused_with_one_line(home):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = str(other.getsockname()[1])
+        line = refused(*home, *DEFAULTS, "--page", "--page-port", port, status=2)
+    assert f"port {port} is used by another program; choose another one" in line
+
+
+def test_a_machine_without_microphones_is_refused_with_one_line(home):
+    folder, env = home
+    (folder / "asound.conf").write_text("pcm.none { type hw card 99 }\n")
+    env = env | {"ALSA_CONFIG_PATH": str(folder / "asound.conf")}
+    assert "no microphone found: connect one" in refused(folder, env, *DEFAULTS)
+
+
+def test_a_missing_microphone_names_what_uses_the_cards(tmp_path):
+    for card, status in (
+        ("card0", "closed\n"),
+        ("card1", f"state: RUNNING\nowner_pid   : {os.getpid()}\n"),
+    ):
+        (tmp_path / card / "pcm0c/sub0").mkdir(parents=True)
+        (tmp_path / card / "pcm0c/sub0/status").write_text(status)
+        (tmp_path / card / "id").write_text("Yeti\n")
+    (user,) = users_of_microphones(tmp_path)
+    assert user.startswith("the card Yeti is used by ")
+    assert str(os.getpid()) in user
+
+
+def test_a_network_that_cannot_be_fetched_leaves_nothing_changed(home):
+    folder, env = home
+    env = env | {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+    line = refused(folder, env, *DEFAULTS, "--network", "yamnet")
+    assert "or give its file" in line
+
+
+@pytest.mark.parametrize("text", ["node = 'a'\nears = 2\n", "node = 'a"])
+def test_a_configuration_that_this_version_cannot_read_is_left_alone(home, text):
+    folder, env = home
+    (folder / "home.toml").write_text(text)
+    assert "home.toml" in refused(folder, env, *DEFAULTS, status=2)
+
+
+def test_a_full_disk_is_refused_with_one_line(home):
+    folder, env = home
+    (folder / "home.toml").write_text('min_free_space = "900T"\n')
+    assert "of the disk are free, and the recorder keeps" in refused(folder, env, *DEFAULTS)
+
+
+def test_a_configuration_that_cannot_be_used_is_taken_back(home):
+    folder, env = home
+    before = 'model = "gone.safetensors"\n'
+    (folder / "home.toml").write_text(before)
+    result = run(folder, env, *DEFAULTS, "--node", "anna")
+    assert result.returncode
+    assert "gone.safetensors: no such model file" in result.stderr
+    assert (folder / "home.toml").read_text() == before
+    assert [path.name for path in folder.iterdir()] == ["home.toml"]
+
+
+@pytest.fixture
+def unset(service):
+    """A machine without a user, a configuration and a service of hearthlog."""
+    service.run("userdel", "hearthlog")
+    service.run("rm", "-rf", "/etc/hearthlog.toml", "/etc/hearthlog")
+    yield service
+    service.run("systemctl", "disable", "--now", "hearthlog-bridge", check=False)
+    service.run("rm", "-rf", "/etc/hearthlog.toml", "/etc/hearthlog", BRIDGE_UNIT)
+    made = ("useradd", "--system", "--user-group", "--home-dir", "/var/lib/hearthlog", "hearthlog")
+    service.run(*made, check=False)
+
+
+def set_up(machine, *options, **how):
+    return machine.run(PROGRAM, "setup", "--yes", *options, seconds=300, **how)
+
+
+BRIDGE_UNIT = "/etc/systemd/system/hearthlog-bridge.service"
+
+
+def test_root_sets_up_a_service_that_records(unset):
+    unset.write("/root/password", "secret\n")
+    library = "[Service]\nEnvironment=LD_LIBRARY_PATH=/opt/python/lib\n"
+    unset.write(f"{BRIDGE_UNIT}.d/python.conf", library)
+    how = ("--microphone", "labmic=kitchen", "--node", "anna", "--page", "--mqtt", "127.0.0.1")
+    login = ("--mqtt-user", "anna", "--mqtt-password-file", "/root/password")
+    result = set_up(unset, *how, *login)
+    assert f"{LOGS}: the labels of kitchen arrive\n" in result.stdout
+    assert "the page: http://127.0.0.1:8380/?token=" in result.stdout
+    assert f"`sudo -u hearthlog hearthlog info {LOGS}`" in result.stdout
+    assert wait_for_labels(unset)
+    modes = unset.run("stat", "-c", "%a %U", "/etc/hearthlog.toml", "/etc/hearthlog/mqtt-password")
+    assert modes.stdout.split("\n")[:2] == ["644 root", "600 hearthlog"]
+    before = unset.shows("MainPID")
+    result = set_up(unset, "--no-page", "--mqtt", "none")  # while the recorder has the microphone
+    assert "-[bridge.page]" in result.stderr
+    assert unset.shows("MainPID") not in {before, "0"}
+    assert unset.shows("ActiveState", unit="hearthlog-bridge") == "inactive"
+
+
+def test_a_service_of_another_installation_is_left_alone(unset):
+    set_up(unset)
+    text = unset.run("cat", UNIT).stdout.replace(PREFIX, "/opt/other")
+    unset.write(UNIT, text)
+    result = set_up(unset, check=False)
+    assert result.returncode == 1
+    assert "/opt/other/bin/hearthlog, another installation" in result.stderr
+    assert unset.run("cat", UNIT).stdout == text
+
+
+def test_a_service_that_cannot_run_leaves_nothing_changed(unset):
+    unset.write("/etc/hearthlog.toml", "output = '/srv/none'\n")
+    result = set_up(unset, "--node", "anna", check=False)
+    assert "/srv/none: no such folder; make it, and give it to hearthlog" in result.stderr
+    assert unset.run("cat", "/etc/hearthlog.toml").stdout == "output = '/srv/none'\n"
+    assert unset.run("id", "hearthlog", check=False).returncode
+    assert unset.run("ls", UNIT, check=False).returncode
+
+
+PACKAGED = "/usr/lib/systemd/system/hearthlog.service"
+
+
+def test_the_service_of_a_package_is_restarted_as_it_is(unset):
+    set_up(unset)
+    unset.run("systemctl", "disable", "--now", "hearthlog")
+    unset.run("mv", UNIT, PACKAGED)
+    unset.run("systemctl", "daemon-reload")
+    result = set_up(unset, "--node", "anna")
+    assert "the labels of mic arrive" in result.stdout
+    assert unset.run("ls", UNIT, check=False).returncode
+    line = set_up(unset, "--config", "/etc/other.toml", check=False).stderr
+    assert f"{PACKAGED}: reads /etc/hearthlog.toml; give that" in line
+    unset.run("systemctl", "disable", "--now", "hearthlog")
+    unset.run("rm", PACKAGED)
