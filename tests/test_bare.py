@@ -79,7 +79,8 @@ NEEDS = {
     "foxglove": ("watch logs --foxglove",),
     "bridge": ("bridge logs --config broker.toml",),
 }
-EITHER = ("devices", "voices")  # there may be no microphone, and too little speech
+# There may be no microphone, and too little speech.
+EITHER = ("devices", "voices", "setup --no-service --yes")
 WRONG = "bridge nowhere/logs"
 FILES = {
     "rules.toml": '[[bridge.alert]]\nname = "cough"\nrule = "more_than"\nclass = "coughing"\n'

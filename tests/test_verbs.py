@@ -68,6 +68,7 @@ DRAWING = (
 )
 LISTENING = (
     "devices",
+    "setup --no-service --yes --config set-up.toml",
     "enrol coughing --home listened --microphone labmic --seconds 1",
 )
 RECORDING = "record --device labmic --output heard"
