@@ -82,9 +82,9 @@ def setup(
             show_default="/etc/hearthlog.toml for root, else ./hearthlog.toml",
         ),
     ] = None,
-    service: Annotated[
-        bool, typer.Option("--service/--no-service", help="Install the service, and start it.")
-    ] = True,
+    no_service: Annotated[
+        bool, typer.Option("--no-service", help="Only write the configuration.")
+    ] = False,
     yes: Annotated[
         bool, typer.Option("--yes", help="Take the default for whatever no option answers.")
     ] = False,
@@ -103,7 +103,7 @@ def setup(
         del os.environ[name]  # a service does not have these variables
     asker = _Asker(yes=yes)
     try:
-        place = _place(config, service=service)
+        place = _place(config, service=not no_service)
         present = _Present(place)
         from hearthlog.tools.service.configuration_file import Answers
 
