@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 .PHONY: install demo test test-fast test-lab test-wheel test-lowest test-3.13 test-ros check docs pictures bench \
-	bench-history bench-check starter dist clean
+	bench-history bench-check starter dist deb clean
 
 # What a machine with a microphone and a screen needs, in .venv.
 install: $(VENV)/.analyzer
@@ -88,6 +88,10 @@ pictures: $(VENV)/.dev
 dist: $(VENV)/.dev
 	rm -rf build/dist
 	$(BIN)/pyproject-build --quiet --outdir build/dist
+
+# build/deb/hearthlog_VERSION_amd64.deb, for Debian 12; ARCH=arm64 for a Raspberry Pi.
+deb: dist
+	ARCH=$(ARCH) PYTHON=$(BIN)/python tools/deb/build
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m hearthlog.tools.lab.bench
