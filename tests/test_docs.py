@@ -125,6 +125,7 @@ def unknown_options(text):
         "mcap",
         "apt",
         "apt-get",
+        "dpkg",
         "systemctl",
         "useradd",
         "podman",
