@@ -1,35 +1,37 @@
-"""`hearthlog setup`: questions that lead from an installation to a running recorder."""
+"""`hearthlog setup`: from an installation to a running recorder."""
 
 import os
-import re
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.tools.cli.setup_questions import (
+    NETWORK,
+    NONE,
+    Asker,
+    Place,
+    Present,
+    SetupError,
+    alerts_of,
+    broker_of,
+    keeps_sound,
+    microphones_of,
+    network_of,
+    node_of,
+    page_of,
+    timezone_of,
+)
 from hearthlog.tools.cli.terminal import print_lines, print_notice, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.bridge.settings import BridgeSettings
-    from hearthlog.recorder.config import Settings
-    from hearthlog.recorder.sources.capture import Device
-    from hearthlog.tools.service.configuration_file import Answers, Broker
+    from hearthlog.tools.service.configuration_file import Answers
 
-_NONE = "none"
-_NETWORK = "yamnet"
 _ACCOUNT = "hearthlog"
 _LEAST_FREE = 100_000_000  # bytes beside what the configuration keeps free: ten hours of logs
 _LABEL_SECONDS = 120.0
-_Value = TypeVar("_Value")
-
-
-class _SetupError(HearthlogError):
-    """The machine lacks something that the recorder needs."""
 
 
 def setup(
@@ -95,29 +97,29 @@ def setup(
     a service of the machine, anybody else a user service that records in the current folder.
     Run again, it changes the answers in an existing configuration and keeps everything else.
     """
-    if mqtt in {None, _NONE} and (mqtt_user is not None or mqtt_password_file is not None):
+    if mqtt in {None, NONE} and (mqtt_user is not None or mqtt_password_file is not None):
         wrong_use("--mqtt-user and --mqtt-password-file need --mqtt HOST")
     if page is not True and page_port is not None:
         wrong_use("--page-port needs --page")
     for name in [name for name in os.environ if name.startswith("HEARTHLOG_")]:
         del os.environ[name]  # a service does not have these variables
-    asker = _Asker(yes=yes)
+    asker = Asker(yes=yes)
     try:
         place = _place(config, service=not no_service)
-        present = _Present(place)
+        present = Present(place)
         from hearthlog.tools.service.configuration_file import Answers
 
         _check_disk(place, present)
         secrets: dict[Path, str] = {}
         answers = Answers(
-            microphones=_microphones(asker, microphone, present, place),
-            node=_node(asker, node, present),
-            timezone=_timezone(asker, timezone, present),
-            keep_sound=_keep_sound(asker, keep_sound, present),
-            network=_network(asker, network, present),
-            page=_page(asker, page, page_port, present, place),
-            broker=_broker(asker, mqtt, (mqtt_user, mqtt_password_file), present, place, secrets),
-            alerts=_alerts(asker, alerts, present, place, secrets),
+            microphones=microphones_of(asker, microphone, present, place),
+            node=node_of(asker, node, present),
+            timezone=timezone_of(asker, timezone, present),
+            keep_sound=keeps_sound(asker, keep_sound, present),
+            network=network_of(asker, network, present),
+            page=page_of(asker, page, page_port, present, place),
+            broker=broker_of(asker, mqtt, (mqtt_user, mqtt_password_file), present, place, secrets),
+            alerts=alerts_of(asker, alerts, present, place, secrets),
             secrets=secrets,
         )
         text = _text(place, present, answers)
@@ -129,76 +131,7 @@ def setup(
     _carry_out(place, answers, text)
 
 
-class _Asker:
-    """Asks on the terminal what no option answers."""
-
-    def __init__(self, *, yes: bool) -> None:
-        self.yes = yes
-        self._is_terminal = sys.stdin.isatty() and sys.stderr.isatty()
-
-    def asks(self, question: str, option: str) -> bool:
-        """Return whether to ask; end with a line if the question cannot be asked."""
-        if not self.yes and not self._is_terminal:
-            wrong_use(f"{question}: there is no terminal to ask on; give {option}, or --yes")
-        return not self.yes
-
-    def text(
-        self, question: str, option: str, default: str, check: Callable[[str], _Value]
-    ) -> _Value:
-        """Ask until the answer passes a check that raises HearthlogError."""
-        if not self.asks(question, option):
-            return _checked(option, default, check)
-        while True:
-            answer = typer.prompt(question, default=default, err=True)
-            try:
-                return check(answer.strip())
-            except HearthlogError as error:
-                print_notice(str(error))
-
-    def confirm(self, question: str, option: str, *, default: bool) -> bool:
-        """Ask a question for yes or no."""
-        if not self.asks(question, option):
-            return default
-        return typer.confirm(question, default=default, err=True)
-
-
-def _checked(option: str, text: str, check: Callable[[str], _Value]) -> _Value:
-    try:
-        return check(text)
-    except HearthlogError as error:
-        wrong_use(f"{option}: {error}")
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where a recorder is set up; `account` is None for a user's."""
-
-    config: Path
-    folder: Path
-    account: str | None
-    has_service: bool
-
-    def unit(self, name: str) -> Path:
-        """Return the path of a unit, of the distribution if nothing replaces it."""
-        from hearthlog.tools.service import unit
-
-        if self.account is None:
-            return unit.user_units() / name
-        return unit.packaged_unit(name) if unit.is_packaged(name) else unit.SYSTEM_UNITS / name
-
-    def is_running(self, name: str) -> bool:
-        """Return whether a service runs now."""
-        import subprocess
-
-        manager = ["systemctl", *(["--user"] if self.account is None else [])]
-        try:
-            done = subprocess.run([*manager, "is-active", "--quiet", name], check=False)  # noqa: S603
-        except OSError:
-            return False
-        return self.has_service and self.unit(name).exists() and done.returncode == 0
-
-
-def _place(config: Path | None, *, service: bool) -> _Place:
+def _place(config: Path | None, *, service: bool) -> Place:
     """Return where to set up, after checking that a service can be installed there."""
     from hearthlog.tools.service import unit
 
@@ -206,7 +139,7 @@ def _place(config: Path | None, *, service: bool) -> _Place:
     config = config or Path("/etc/hearthlog.toml" if is_system else "hearthlog.toml")
     folder = unit.STATE if is_system and service else Path.cwd()
     account = _ACCOUNT if is_system and service else None
-    place = _Place(config.absolute(), folder, account, service)
+    place = Place(config.absolute(), folder, account, service)
     if service:
         for name, verb in ((unit.NAME, "record"), (unit.BRIDGE_NAME, "bridge")):
             there = place.unit(name)
@@ -220,20 +153,7 @@ def _place(config: Path | None, *, service: bool) -> _Place:
     return place
 
 
-class _Present:
-    """The present configuration, of which the answers are the defaults."""
-
-    def __init__(self, place: _Place) -> None:
-        from hearthlog.analyzer.bridge.settings import load_bridge_settings
-
-        self.file = place.config if place.config.exists() else None
-        self.settings: Settings
-        self.bridge: BridgeSettings
-        self.settings, self.bridge = load_bridge_settings(self.file)
-        self.text = None if self.file is None else self.file.read_text("utf-8-sig")
-
-
-def _check_disk(place: _Place, present: _Present) -> None:
+def _check_disk(place: Place, present: Present) -> None:
     from hearthlog.recorder.host import disk_of
     from hearthlog.recorder.retention import size_text
 
@@ -241,309 +161,13 @@ def _check_disk(place: _Place, present: _Present) -> None:
     least = int(present.settings.min_free_space) + _LEAST_FREE
     free = disk_of(logs).free
     if free < least:
-        raise _SetupError(
+        raise SetupError(
             f"{logs}: {size_text(free)} of the disk are free, and the recorder keeps "
             f"{size_text(int(present.settings.min_free_space))} free: make room, {size_text(least)}"
         )
 
 
-def _microphones(
-    asker: _Asker, given: list[str] | None, present: _Present, place: _Place
-) -> list[tuple[str, str]]:
-    """Return devices and rooms, after hearing each device."""
-    from hearthlog.recorder.sources.capture import Device
-    from hearthlog.recorder.sources.process import query_devices
-    from hearthlog.tools.service.unit import NAME
-
-    configured = [(each.device, each.name) for each in present.settings.microphone]
-    chosen = configured if present.file is not None else []
-    ours = [device for device, _ in chosen] if place.is_running(NAME) else []
-    if given:
-        chosen = [_device_and_room(text) for text in given]
-    elif asker.asks("the microphone", "--microphone DEVICE=ROOM"):
-        devices = query_devices()
-        names = {name for each in devices for name in (each.identity, each.name)}
-        # PortAudio does not list a device that the recorder uses.
-        devices += [Device(-1, name, 1, 0.0, False) for name in ours if name not in {*names, ""}]
-        chosen = _chosen_on_terminal(asker, devices, chosen)
-    elif not chosen:
-        chosen = [(_found(query_devices(), "").identity, configured[0][1])]
-    for device, _ in chosen:
-        if device not in ours:
-            _check_heard(device)
-    return chosen
-
-
-def _found(devices: "list[Device]", name: str) -> "Device":
-    """Find a device; the error for a missing one names what uses the microphones."""
-    from hearthlog.recorder.errors import DeviceError
-    from hearthlog.recorder.sources.capture import find_device
-    from hearthlog.tools.cli.level_meter import users_of_microphones
-
-    try:
-        return find_device(devices, name)
-    except DeviceError as error:
-        users = "".join(f"; {each}, end that program" for each in users_of_microphones())
-        raise DeviceError(f"{error}{users}") from error
-
-
-def _device_and_room(text: str) -> tuple[str, str]:
-    device, equals, room = text.rpartition("=")
-    if not equals:
-        wrong_use(
-            f"--microphone {text}: is not DEVICE=ROOM, such as 'USB PnP Sound Device=kitchen'"
-        )
-    return device, _checked("--microphone", room, _room)
-
-
-def _room(text: str) -> str:
-    from hearthlog.schemas.messages.topics import check_microphone_name
-
-    return check_microphone_name(re.sub(r"[\s-]+", "_", text.strip().lower()))
-
-
-def _chosen_on_terminal(
-    asker: _Asker, devices: "list[Device]", configured: list[tuple[str, str]]
-) -> list[tuple[str, str]]:
-    from hearthlog.tools.cli.level_meter import choose_by_level
-
-    default = _found(devices, "")
-    rooms = {device or default.identity: room for device, room in configured}
-    before = [
-        place for place, each in enumerate(devices) if rooms.keys() & {each.identity, each.name}
-    ]
-    chosen = choose_by_level(devices, before or [devices.index(default)])
-    pairs: list[tuple[str, str]] = []
-    for place in chosen:
-        device = devices[place]
-        room = rooms.get(device.identity, "" if len(chosen) > 1 else "mic")
-
-        def check(text: str) -> str:
-            name = _room(text)
-            if name in [other for _, other in pairs]:
-                raise _SetupError(f"{name}: is the room of another microphone; write another name")
-            return name
-
-        question = f"Room of {device.name}, such as kitchen"
-        pairs.append((device.identity, asker.text(question, "--microphone", room or "mic", check)))
-    return pairs
-
-
-def _check_heard(device: str) -> None:
-    from hearthlog.recorder.addresses import is_address
-    from hearthlog.recorder.sources.process import query_devices
-    from hearthlog.tools.cli.level_meter import hear
-
-    if not is_address(device):
-        _found(query_devices(), device)
-        hear(device)
-
-
-def _node(asker: _Asker, given: str | None, present: _Present) -> str:
-    from hearthlog.schemas.logs.files import check_node_name
-
-    if given is not None:
-        return _checked("--node", given, check_node_name)
-    return asker.text("Name of the home", "--node", present.settings.node, check_node_name)
-
-
-def _timezone(asker: _Asker, given: str | None, present: _Present) -> str:
-    from hearthlog.recorder.pause_schedule import check_time_zone
-
-    if given is not None:
-        return _checked("--timezone", given, check_time_zone)
-    default = present.settings.timezone
-    return asker.text("Time zone of the home", "--timezone", default, check_time_zone)
-
-
-def _keep_sound(asker: _Asker, given: bool | None, present: _Present) -> bool:
-    if given is not None:
-        return given
-    question = (
-        "Keep sound? Without it the logs have labels and features only. With it, also clips of "
-        "sounds that the model is unsure of, never of speech, for 30 days, to listen to in a review"
-    )
-    option = "--keep-sound or --no-keep-sound"
-    return asker.confirm(question, option, default=present.settings.keep_audio != "off")
-
-
-def _network(asker: _Asker, given: str | None, present: _Present) -> str:
-    """Return what the configuration says of the network; it is downloaded later."""
-    from hearthlog.analyzer.extras import missing
-    from hearthlog.models.embedding.networks import YAMNET, find_network, missing_modules
-
-    if given not in {None, _NETWORK, _NONE}:
-        wrong_use(f"--network {given}: is neither {_NETWORK} nor {_NONE}")
-    absent = missing_modules(YAMNET.suffix)
-    if given == _NETWORK and absent:
-        raise _SetupError(f"--network {_NETWORK}: {missing(*absent)}")
-    if given is not None:
-        return given if given == _NETWORK or find_network(_NETWORK) else ""
-    now = present.settings.embedding
-    if now or find_network(_NETWORK):
-        return now
-    if not asker.asks("the network", f"--network {_NETWORK} or --network {_NONE}"):
-        return now
-    if absent:
-        print_notice(f"a network would make labels more accurate; {missing(*absent)}; then setup")
-        return now
-    size = YAMNET.files[0].size / 1e6
-    question = (
-        f"Download the network {_NETWORK}, {size:.0f} MB from {YAMNET.files[0].url.split('/')[2]}? "
-        "In homes unknown to the model it doubles the accuracy (macro F1 0.70, without it 0.36)"
-    )
-    return _NETWORK if asker.confirm(question, "--network", default=False) else now
-
-
-def _page(
-    asker: _Asker, given: bool | None, port: int | None, present: _Present, place: _Place
-) -> int | None:
-    from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.http import free_port
-    from hearthlog.tools.service.configuration_file import PAGE_PORT
-    from hearthlog.tools.service.unit import BRIDGE_NAME
-
-    now = present.bridge.page
-    if given is None:
-        given = asker.confirm(
-            "Serve a page of the home, for a browser on this machine",
-            "--page or --no-page",
-            default=now is not None,
-        )
-    if not given:
-        return None
-    before = PAGE_PORT if now is None else now.port
-    bind = "127.0.0.1" if now is None else now.bind
-    is_own = now is not None and place.is_running(BRIDGE_NAME)
-
-    def check(text: str) -> int:
-        if not text.isdecimal() or not 0 < int(text) <= 65_535:
-            raise _SetupError(f"{text}: is no port; write a number such as {PAGE_PORT}")
-        try:
-            return int(text) if is_own and int(text) == before else free_port(int(text), bind)
-        except DataError as error:
-            raise _SetupError(
-                f"port {text} is used by another program; choose another one for the page, "
-                "with --page-port"
-            ) from error
-
-    if port is not None:
-        return _checked("--page-port", str(port), check)
-    try:
-        return check(str(before))
-    except _SetupError as error:
-        if not asker.asks(str(error), "--page-port"):
-            raise
-        return asker.text(str(error), "--page-port", str(before + 1), check)
-
-
-def _broker(
-    asker: _Asker,
-    given: str | None,
-    login: tuple[str | None, Path | None],
-    present: _Present,
-    place: _Place,
-    secrets: dict[Path, str],
-) -> "Broker | None":
-    from hearthlog.analyzer.bridge.settings import MqttSettings
-    from hearthlog.analyzer.extras import require
-    from hearthlog.tools.service.configuration_file import Broker, secret_file
-
-    now: MqttSettings | None = present.bridge.mqtt
-    if given == _NONE or (given is None and not _wanted(asker, "mqtt", now is not None)):
-        return None
-    require("paho")
-    user, password_file = login
-    file = secret_file(place.config, "mqtt-password")
-    old = None if now is None else now.password_file
-    if given is not None:
-        host = _checked("--mqtt", given, _host)
-        user = user if user is not None else "" if now is None else now.user
-        if password_file is not None:
-            secrets[file] = _secret(password_file)
-            old = file
-        return Broker(host, user, old if user else None)
-    host = asker.text(
-        "Broker, such as homeassistant.local", "--mqtt", now.host if now else "", _host
-    )
-    user = asker.text(
-        "User at the broker, empty for none", "--mqtt-user", now.user if now else "", str
-    )
-    if not user:
-        return Broker(host)
-    if asker.yes:
-        return Broker(host, user, old)
-    hint = "Password (not shown)" if old is None else "Password (not shown; empty: as before)"
-    password = typer.prompt(hint, default="", hide_input=True, show_default=False, err=True)
-    if password:
-        secrets[file] = f"{password}\n"
-        old = file
-    return Broker(host, user, old)
-
-
-def _wanted(asker: _Asker, option: str, default: bool) -> bool:
-    questions = {
-        "mqtt": ("Publish to Home Assistant or another MQTT broker", "--mqtt HOST or --mqtt none"),
-        "alerts": (
-            "Send alerts, first of all when the recorder falls silent",
-            "--alerts FILE or --alerts none",
-        ),
-    }
-    return asker.confirm(*questions[option], default=default)
-
-
-def _host(text: str) -> str:
-    from pydantic import ValidationError
-
-    from hearthlog.analyzer.bridge.settings import MqttSettings
-
-    try:
-        return MqttSettings(host=text).host
-    except ValidationError as error:
-        raise _SetupError(error.errors()[0]["msg"].removeprefix("Value error, ")) from error
-
-
-def _secret(file: Path) -> str:
-    try:
-        text = file.read_text("utf-8")
-    except UnicodeDecodeError as error:
-        raise _SetupError(f"{file}: is not text") from error
-    if not text.strip():
-        raise _SetupError(f"{file}: is empty")
-    return text
-
-
-def _alerts(
-    asker: _Asker, given: str | None, present: _Present, place: _Place, secrets: dict[Path, str]
-) -> Path | None:
-    from hearthlog.analyzer.extras import require
-    from hearthlog.tools.service.configuration_file import secret_file
-
-    now = present.bridge.delivery.urls_file
-    file = secret_file(place.config, "alert-urls")
-    if given == _NONE or (given is None and not _wanted(asker, "alerts", now is not None)):
-        return None
-    require("apprise")
-    if given is not None:
-        secrets[file] = _alert_urls(_secret(Path(given)))
-    elif now is not None:
-        return now
-    else:
-        question = "Address for alerts, such as ntfy://ntfy.sh/a-topic-of-yours (Apprise)"
-        secrets[file] = asker.text(question, "--alerts", "", _alert_urls)
-    return file
-
-
-def _alert_urls(text: str) -> str:
-    from apprise import Apprise
-
-    for line in filter(None, map(str.strip, text.splitlines())):
-        if not line.startswith("#") and not Apprise().add(line):
-            raise _SetupError("an address for alerts is none of Apprise's; see docs/alerts.md")
-    return f"{text.strip()}\n"
-
-
-def _text(place: _Place, present: _Present, answers: "Answers") -> str:
+def _text(place: Place, present: Present, answers: "Answers") -> str:
     from hearthlog.recorder.errors import ConfigurationError
     from hearthlog.tools.service.configuration_file import configuration_text
 
@@ -553,9 +177,7 @@ def _text(place: _Place, present: _Present, answers: "Answers") -> str:
         raise ConfigurationError(f"{place.config}: {error}") from error
 
 
-def _confirm(
-    asker: _Asker, place: _Place, present: _Present, answers: "Answers", text: str
-) -> None:
+def _confirm(asker: Asker, place: Place, present: Present, answers: "Answers", text: str) -> None:
     """Show what will be changed, and ask for it."""
     import difflib
 
@@ -593,15 +215,15 @@ def _confirm(
         raise typer.Abort
 
 
-def _carry_out(place: _Place, answers: "Answers", text: str) -> None:
+def _carry_out(place: Place, answers: "Answers", text: str) -> None:
     """Change this machine; after a failure before the start of the service it is as before."""
     from hearthlog.models.embedding.networks import find_network
     from hearthlog.tools.cli.models import fetch
     from hearthlog.tools.service import unit
     from hearthlog.tools.service.configuration_file import written_files
 
-    if answers.network == _NETWORK and find_network(_NETWORK) is None:
-        fetch(_NETWORK, None)
+    if answers.network == NETWORK and find_network(NETWORK) is None:
+        fetch(NETWORK, None)
     is_new = place.account is not None and unit.make_account(place.account)
     failure: unit.StartError | None = None
     is_recording = False
@@ -623,7 +245,7 @@ def _carry_out(place: _Place, answers: "Answers", text: str) -> None:
     _print_next(place, answers)
 
 
-def _check_configuration(place: _Place) -> None:
+def _check_configuration(place: Place) -> None:
     from hearthlog.recorder.errors import ConfigurationError
     from hearthlog.tools.cli.recorder import findings
 
@@ -636,7 +258,7 @@ def _check_configuration(place: _Place) -> None:
         print_notice(line)
 
 
-def _install(place: _Place, answers: "Answers") -> bool:
+def _install(place: Place, answers: "Answers") -> bool:
     """Install the services, and start or restart them; return whether they run."""
     from hearthlog.tools.cli.recorder import install_service
     from hearthlog.tools.service import unit
@@ -656,7 +278,7 @@ def _install(place: _Place, answers: "Answers") -> bool:
     return is_running
 
 
-def _wait_for_labels(place: _Place, answers: "Answers") -> None:
+def _wait_for_labels(place: Place, answers: "Answers") -> None:
     """Wait until each microphone has a label in the log that is being written."""
     from threading import Event
 
@@ -681,20 +303,20 @@ def _wait_for_labels(place: _Place, answers: "Answers") -> None:
                 if not missing or left < 0:
                     break
     if missing:
-        raise _SetupError(
+        raise SetupError(
             f"no label in {logs} of {', '.join(sorted(missing))} in {_LABEL_SECONDS:.0f} s; the "
             f"recorder runs: {_command(place, 'doctor --live', logs)} says what it waits for"
         )
     print_lines([f"{logs}: the labels of {', '.join(r for _, r in answers.microphones)} arrive"])
 
 
-def _command(place: _Place, verb: str, *arguments: object) -> str:
+def _command(place: Place, verb: str, *arguments: object) -> str:
     """Return a command in backticks, of the user who may read the logs."""
     who = "" if place.account is None else f"sudo -u {place.account} "
     return f"`{' '.join([f'{who}hearthlog {verb}', *map(str, arguments)])}`"
 
 
-def _print_next(place: _Place, answers: "Answers") -> None:
+def _print_next(place: Place, answers: "Answers") -> None:
     """Print what to do next."""
     from hearthlog.recorder.config import load_settings
 
