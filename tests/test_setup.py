@@ -8,7 +8,7 @@ import socket
 import subprocess
 import time
 import tomllib
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -52,6 +52,13 @@ class Terminal:
         self.expect(": ")
         self.type(f"{text}\n")
         return before
+
+    def interrupt(self):
+        """Press Ctrl-C, and again where Python was between its check for it and its read."""
+        while self._process.poll() is None:
+            self.type("\x03")
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(timeout=5)
 
     def end(self):
         """Return the exit status, and all that was shown until then."""
@@ -159,7 +166,7 @@ def test_ctrl_c_at_any_question_leaves_nothing_changed(home, last):
             seen.expect(": ")
             seen.type("\n" if place else "1\n")
         seen.expect(QUESTIONS[last])
-        seen.type("\x03")
+        seen.interrupt()
         status, shown = seen.end()
     assert (status, "nothing was changed" in shown) == (130, True), shown
     assert list(folder.iterdir()) == []

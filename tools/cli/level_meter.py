@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _CARDS = Path("/proc/asound")
 _LATENCY = 0.1  # seconds: the bar follows a clap at once
 _FIRST_SECONDS = 5.0  # until a device must have delivered something
+_CLOSE_SECONDS = 5.0
 _POLL_SECONDS = 0.1
 _MOST = 8  # devices that are heard at once: ALSA's lists are long, and a process is for each
 _QUIETEST, _LOUDEST = -70.0, 0.0  # dB of full scale at the ends of a bar
@@ -100,8 +101,8 @@ class _Meter:
             capture.kill()
 
     def join(self) -> None:
-        """Wait until the device is closed."""
-        self._thread.join()
+        """Wait until the device is closed, but not for one that does not answer."""
+        self._thread.join(_CLOSE_SECONDS)
 
     def text(self) -> str:
         """Return the bar, or why there is none."""
