@@ -492,7 +492,7 @@ def test_an_event_from_before_midnight_reaches_into_the_day_and_counts_for_the_n
     assert (lane["today"], lane["night"], lane["told"]) == (
         0,
         1,
-        "Music: never today by the sound of it",
+        "Music: never today, by the sound of it",
     )
 
 
@@ -871,7 +871,7 @@ def test_the_page_says_when_the_box_is_gone_and_goes_on_when_it_is_back(phone, t
         home.log.hears("coughing")
         phone.open(home)
         home.end()
-        phone.shows("#trouble", "There is no connection to the box. What you see is of 12:")
+        phone.shows("#trouble", "There is no connection to the box. What you see is as of 12:")
         home.restart()
         phone.until('document.getElementById("trouble").hidden')
 

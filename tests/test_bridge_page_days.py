@@ -802,7 +802,7 @@ def test_a_phone_that_is_offline_says_so_in_one_line_and_keeps_what_it_shows(pho
         phone.until(lane("Coughing"))
         phone.of("Object.defineProperty(navigator, 'onLine', { get: () => false })")
         home.end()
-        phone.shows("#trouble", "This device is offline. What you see is of 12:")
+        phone.shows("#trouble", "This device is offline. What you see is as of 12:")
         assert phone.of(f"{lane('Coughing')} !== undefined")
         home.restart()
         phone.until("document.getElementById('trouble').hidden")

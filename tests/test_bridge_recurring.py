@@ -17,7 +17,7 @@ from recurring import record_recurring
 from servedhome import PALE_TEXTS, Phone, serving
 from viewers import browsing, patiently
 
-from hearthlog.analyzer.bridge.commands import REVIEWER
+from hearthlog.analyzer.bridge.corrections import REVIEWER
 from hearthlog.analyzer.bridge.page import recurring as group_naming
 from hearthlog.analyzer.bridge.page.recurring import (
     GroupNaming,
@@ -219,7 +219,7 @@ def test_what_came_of_a_name_is_one_line(tmp_path, monkeypatch, acts, says):
     acting(monkeypatch, f"import sys; sys.stdout = sys.stderr; {acts}")
     naming = GroupNaming(tmp_path)
     assert naming.start(KEY, 3, "kettle").startswith("Marking as Kettle.")
-    told = patiently(lambda: naming.said[KEY], lambda text: "Being" not in text)
+    told = patiently(lambda: naming.said[KEY], lambda text: "Marking as" not in text)
     assert says in told
     assert len(told) < 500
 
@@ -319,7 +319,7 @@ def test_one_names_a_sound_on_the_page_and_takes_the_name_back(
         heard_once(home)
         phone.open(home)
         phone.shows("#recurring li:first-child .what", f"Sound {largest.number}")
-        assert f"{largest.times} times on one day" in phone.text("#recurring li:first-child")
+        assert f"{largest.times} times on 1 day" in phone.text("#recurring li:first-child")
         phone.of('document.querySelector("#recurring summary").click()')
         phone.until('document.querySelector("#recurring input[type=text]")')
         phone.of('document.querySelector("#recurring input[type=text]").focus()')
