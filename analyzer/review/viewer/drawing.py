@@ -216,7 +216,7 @@ def draw_requested(number: int, start: int, end: int, question: Question, canvas
     canvas.add_bands(entity, middle, np.ones((1, 1)), end - start, _ASKED_STROKES)
     keys = " · ".join(f"**{_plain(one.cap)}** {_plain(one.text)}" for one in question.keys)
     where = f"{_plain(question.keys_in)}: " if question.keys_in else ""
-    text = f"## {_plain(question.text)} {_plain(question.place)}\n\n{where}{keys}"
+    text = f"**{_plain(question.text)}** {_plain(question.place)}\n\n{where}{keys}"
     canvas.write(ASKED_WORDS, text, rr.MediaType.MARKDOWN)
     canvas.write(ASKED_NAME, "Asked about")
 
@@ -329,14 +329,14 @@ APPLICATION = "hearthlog"
 # The viewer keeps the shared range of linked time axes under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
-_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 28, 50, 90, 140, 26
-_QUESTION_HEIGHT = 112
-_CLOSE_HEIGHT = 100  # of a plot in a close-up
+_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 29, 50, 90, 140, 30
+_QUESTION_HEIGHT = 62
+_CLOSE_HEIGHT = 88  # of a plot in a close-up
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
 # Numbers of the lanes' axis are as wide as those of the plots below: the plots begin at one place.
 LANE_HEIGHT = 0.1
-_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 84
+_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 74
 _SPECTRUM_SHAPE = (128, 1792)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 HOUR_COLUMNS = (2, 11)  # the same, of the hours, whose view has no vertical axis
