@@ -337,7 +337,7 @@ BELOW = 0.5  # height of the time axis, in lanes, until the height of the window
 # Numbers of the lanes' axis are as wide as those of the plots below: the plots begin at one place.
 LANE_HEIGHT = 0.1
 _HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 74
-_SPECTRUM_SHAPE = (128, 1792)  # flatter than any view of it
+_SPECTRUM_SHAPE = (64, 2240)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 HOUR_COLUMNS = (2, 11)  # the same, of the hours, whose view has no vertical axis
 COLUMNS = (2, 10)  # widths of the text and of the plot, until the width of the window is known
