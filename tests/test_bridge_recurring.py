@@ -209,7 +209,7 @@ def acting(monkeypatch, text):
             "print('hearthlog: group 3: 7 marks of a'); print('hearthlog: x: is cut'); sys.exit(3)",
             "7 marks of a; some logs could not be read: x: is cut",
         ),
-        ("print('hearthlog: there is no group 3'); sys.exit(1)", "This failed: there is no group 3"),
+        ("print('hearthlog: no group 3'); sys.exit(1)", "This failed: no group 3"),
         ("sys.exit(4)", "This failed: exit status 4"),
         ("print('x' * 100_000_000); sys.exit(1)", "This failed: xxx"),
         ("import os; os.kill(os.getpid(), 9)", "ended by signal 9"),
