@@ -50,7 +50,7 @@ FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--n
 # a second program, or sound of many collections.
 NOT_HERE = re.compile(
     r"hearthlog( record( --model \S+)?( --keep-audio \w+)?( --config \S+)?$| devices| watch| demo"
-    r"| models fetch yamnet| install-service| bridge|.*--start 2026-03-10 "
+    r"| models fetch yamnet| install-service| setup| bridge|.*--start 2026-03-10 "
     r"|.* s3://|.*tcp:|.* --web"
     r"|.* --microphone USB|.* --folds collection| discover| voices|.* speakers |.* mood.toml"
     r"|.* --live|.*octaves|.*--method (plp|speech-embedding|logistic|forest) |.*--queue spans.csv$"
