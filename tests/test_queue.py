@@ -98,14 +98,14 @@ def test_the_queue_of_a_window_begins_with_what_can_be_heard(heard, display):
     options = ("--queue", "--port", free_port(), "--spans", "10", "--timezone", "UTC")
     with reviewing(heard, *options, DISPLAY=display) as review:
         for number in range(1, 11):
-            review.wait_for(f"{number}/10")
+            review.wait_for(f"{number} of 10: ")
             review.press("n")
         review.process.wait(60)
-    pattern = re.compile(r"/10  \w+ \d+ \w+ (\d\d):(\d\d):(\d\d) \+ ([\d.]+) s  (.*)")
+    pattern = re.compile(r" of 10: (.*)\? \w+ \d+ \w+ (\d\d):(\d\d):(\d\d), ([\d.]+) s; ")
     shown = [found.groups() for found in map(pattern.search, review.lines) if found]
     assert len(shown) == 10
     shares = []
-    for hours, minutes, seconds, length, text in shown:
+    for text, hours, minutes, seconds, length in shown:
         if "minute" in text:
             continue
         clock = (int(hours) * 60 + int(minutes)) * 60 + int(seconds)
