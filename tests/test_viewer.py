@@ -89,12 +89,19 @@ class Picture:
         self.begin_at_cursor(slice(0, self.image.shape[0] * 7 // 10))
 
     def begin_at_cursor(self, rows):
-        """Take the column of the cursor, which is at the start, in these rows."""
+        """Take the column of the cursor, which is at the start, in these rows.
+
+        Returns its ends: the first row of the view, and the one after the last.
+        """
         columns = slice(_NAMES, self.image.shape[1] // 3)
         white = (self.image[rows, columns] > _WHITE).all(axis=2)
-        self._left = _NAMES + int(white.sum(axis=0).argmax())
+        column = int(white.sum(axis=0).argmax())
+        self._left = _NAMES + column
         is_above_ruler = self._left < self.image.shape[1] // 6
         self._right = self.image.shape[1] - _BESIDE_RULER * is_above_ruler
+        found = np.flatnonzero(white[:, column])
+        cursor = max(np.split(found, np.flatnonzero(np.diff(found) > 1) + 1), key=len)
+        return rows.start + int(cursor[0]), rows.start + int(cursor[-1]) + 1
 
     def place(self, time):
         """The number of a column."""
@@ -158,15 +165,16 @@ def check_rows(png, timeline):
     run = max(np.split(silent, np.flatnonzero(np.diff(silent) > 3) + 1), key=len)
     assert rows[-1] == "silence"
     assert len(run) > 8
-    height = (len(run) - 3) / 0.9  # it reaches three pixels into the row above
-    picture.begin_at_cursor(slice(int(run[-1] - height * len(rows)), run[-1]))
+    around = slice(run[-1] - len(run) * len(rows), run[-1] + 1)
+    top, bottom = picture.begin_at_cursor(around)
+    height = (bottom - top) / len(rows)
     checked = set()
     for time, text in blocks_of(timeline):
         place = int(timeline.grid.find(np.array([time]))[0])
         share = values[place - 1 : place + 2, names.index(text)].mean()
         if share > 0.4:
             above = len(rows) - rows.index(text) - 0.5  # rows to its middle, from below
-            row = int(run[-1] - above * height)
+            row = int(bottom - above * height)
             around = picture.image[row - 2 : row + 3, picture.place(time)].mean(axis=0)
             expected = _DARK + share * (np.array(colour(text)) - _DARK)
             assert np.abs(around - expected).max() < 0.25 * 255, (text, share, around)

@@ -69,12 +69,16 @@ class CurrentDoubts:
     ----------
     found : mapping of str to DoubtfulSound
         By the ids of events; replaced when there are more.
+    is_up_to_date : bool
+        Whether every event has been looked for in the logs.
     """
 
     def __init__(self, folder: Path, node: str) -> None:
         self.found: Doubts = {}
+        self.is_up_to_date = False
         self._folder, self._node = folder, node
         self._done: set[str] = set()
+        self._missing: set[str] = set()
         self._thread: Thread | None = None
 
     def update(self, events: Iterable[SoundEvent], now: int) -> None:
@@ -85,6 +89,7 @@ class CurrentDoubts:
         self._done &= current.keys()
         self.found = {name: own for name, own in self.found.items() if name in current}
         new = [e for e in current.values() if now - e.end > _FINAL and e.id not in self._done]
+        self.is_up_to_date = {event.id for event in new} <= self._missing
         if new:
             self._thread = Thread(target=self._read, args=(new, now), daemon=True)
             self._thread.start()
@@ -96,5 +101,6 @@ class CurrentDoubts:
             logs = find_home_logs([self._folder]).between(start - _FINAL, end + _FINAL)
             found = read_doubts([each for each in logs if each.node == self._node], events)
         self._done |= found.keys() | {each.id for each in events if now - each.end > _LATEST}
+        self._missing = {each.id for each in events} - found.keys()
         if found:
             self.found = {**self.found, **found}

@@ -90,6 +90,7 @@ class HomePage:
         self._events: dict[str, SoundEvent] = {}  # of today and the last night, by id
         self._bouts: dict[str, Bout] = {}  # by id
         self._doubtful: list[SoundEvent] = []
+        self.is_settled = False  # whether the views show all that was read from the logs
         self._uncounted: frozenset[str] = frozenset()
         self._events_key: Any = None
         self._recurring = RecurringSounds(home.folder)
@@ -170,6 +171,7 @@ class HomePage:
         self._doubts.update(self._doubtful, news.today.now)
         for view in views:
             self._update_view(view, news)
+        self.is_settled = self._doubts.is_up_to_date and self._doubts.found == doubts
 
     def _update_view(self, view: PageView, news: News) -> None:
         moment, words, started = Moment(news.today.now, news.zone), view.words, self._started

@@ -40,9 +40,11 @@ class ServedPage:
         board = self._page.view(language).board
         deadline = time.monotonic() + _WAIT_SECONDS
         while time.monotonic() < deadline:
+            is_settled = self._page.is_settled
             found = {name: part.content for name, part in board.wait({}, 1.0).items()}
-            if {"now", "day", "events", "health"} <= found.keys():
+            if is_settled and {"now", "day", "events", "health"} <= found.keys():
                 return found
+            time.sleep(0.05)
         raise HearthlogError("the page of the home gets no news")
 
     def get(self, path: str, language: str) -> bytes:
