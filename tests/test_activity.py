@@ -20,7 +20,7 @@ from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.home_state import follow_home
 from hearthlog.analyzer.bridge.output import News, Totals
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
-from hearthlog.analyzer.bridge.prometheus import Metrics
+from hearthlog.analyzer.bridge.prometheus import HomeCollector
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -94,7 +94,7 @@ def test_the_broker_and_the_figures_get_the_counts_of_the_report(logs, followed)
     news = News(followed, [], [], moment, ZONE)
     metrics = {
         metric.name: {sample.labels["label"]: sample.value for sample in metric.samples}
-        for metric in Metrics(news, RecorderAddress(logs, "home", ZONE), []).collect()
+        for metric in HomeCollector(news, RecorderAddress(logs, "home", ZONE), []).collect()
         if metric.name.startswith("hearthlog_events_")
     }
     assert {name: (day or 0, night or 0) for name, (day, night) in counts.items()} == {

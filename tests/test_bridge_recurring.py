@@ -219,9 +219,9 @@ def test_what_came_of_a_name_is_one_line(tmp_path, monkeypatch, acts, says):
     acting(monkeypatch, f"import sys; sys.stdout = sys.stderr; {acts}")
     naming = GroupNaming(tmp_path)
     assert naming.start(KEY, 3, "kettle").startswith("Marking as Kettle.")
-    told = patiently(lambda: naming.said[KEY], lambda text: "Marking as" not in text)
-    assert says in told
-    assert len(told) < 500
+    answer = patiently(lambda: naming.said[KEY], lambda text: "Marking as" not in text)
+    assert says in answer
+    assert len(answer) < 500
 
 
 def test_one_group_is_named_at_a_time_and_an_end_of_the_bridge_is_one_of_that(

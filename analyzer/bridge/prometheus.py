@@ -82,7 +82,7 @@ class PrometheusOutput:
         registry = CollectorRegistry()
         totals = self.totals.count(news.state)
         shown = [total for total in totals if total.label not in news.state.never_tell]
-        registry.register(Metrics(news, self._home, shown))
+        registry.register(HomeCollector(news, self._home, shown))
         text = generate_latest(registry)
         self._made = text, time.monotonic()
         if self._settings.text_file is not None:
@@ -166,8 +166,8 @@ class _Handler(HttpHandler):
                 self.send(HTTPStatus.OK, text, _TEXT)
 
 
-class Metrics(Collector):
-    """Metrics at one moment."""
+class HomeCollector(Collector):
+    """The metrics of a home at one moment."""
 
     def __init__(self, news: News, home: RecorderAddress, totals: Sequence[Total]) -> None:
         self._news = news

@@ -435,12 +435,12 @@ class Key(NamedTuple):
 
     @property
     def cap(self) -> str:
-        """What is on the key."""
+        """The label of the key."""
         return self.shown or self.key
 
 
 class Question(NamedTuple):
-    """What is asked about a span: a few words, which span it is, and the keys that answer."""
+    """A question about a span: its text, its place in a queue, and the keys that answer it."""
 
     text: str
     place: str

@@ -12,7 +12,7 @@ from hearthlog.tools.cli.setup_questions import (
     NETWORK,
     NONE,
     Asker,
-    Place,
+    Installation,
     Present,
     SetupError,
     alerts_of,
@@ -105,33 +105,35 @@ def setup(
         del os.environ[name]  # a service does not have these variables
     asker = Asker(yes=yes)
     try:
-        place = _place(config, service=not no_service)
-        present = Present(place)
+        installation = _installation(config, service=not no_service)
+        present = Present(installation)
         from hearthlog.tools.service.configuration_file import Answers
 
-        _check_disk(place, present)
+        _check_disk(installation, present)
         secrets: dict[Path, str] = {}
         answers = Answers(
-            microphones=microphones_of(asker, microphone, present, place),
+            microphones=microphones_of(asker, microphone, present, installation),
             node=node_of(asker, node, present),
             timezone=timezone_of(asker, timezone, present),
             keep_sound=keeps_sound(asker, keep_sound, present),
             network=network_of(asker, network, present),
-            page=page_of(asker, page, page_port, present, place),
-            broker=broker_of(asker, mqtt, (mqtt_user, mqtt_password_file), present, place, secrets),
-            alerts=alerts_of(asker, alerts, present, place, secrets),
+            page=page_of(asker, page, page_port, present, installation),
+            broker=broker_of(
+                asker, mqtt, (mqtt_user, mqtt_password_file), present, installation, secrets
+            ),
+            alerts=alerts_of(asker, alerts, present, installation, secrets),
             secrets=secrets,
         )
-        text = _text(place, present, answers)
-        _confirm(asker, place, present, answers, text)
+        text = _text(installation, present, answers)
+        _confirm(asker, installation, present, answers, text)
     except (KeyboardInterrupt, EOFError, typer.Abort):
         print(file=sys.stderr)
         print_notice("nothing was changed")
         raise typer.Exit(130) from None
-    _carry_out(place, answers, text)
+    _carry_out(installation, answers, text)
 
 
-def _place(config: Path | None, *, service: bool) -> Place:
+def _installation(config: Path | None, *, service: bool) -> Installation:
     """Return where to set up, after checking that a service can be installed there."""
     from hearthlog.tools.service import unit
 
@@ -139,25 +141,25 @@ def _place(config: Path | None, *, service: bool) -> Place:
     config = config or Path("/etc/hearthlog.toml" if is_system else "hearthlog.toml")
     folder = unit.STATE if is_system and service else Path.cwd()
     account = _ACCOUNT if is_system and service else None
-    place = Place(config.absolute(), folder, account, service)
+    installation = Installation(config.absolute(), folder, account, service)
     if service:
         for name, verb in ((unit.NAME, "record"), (unit.BRIDGE_NAME, "bridge")):
-            there = place.unit(name)
+            there = installation.unit(name)
             if not (is_system and unit.is_packaged(name)):
                 unit.place_of(there.parent, name)
             own = None if is_system or verb == "bridge" else folder
-            unit.check_unit(there, verb, place.config, own)
+            unit.check_unit(there, verb, installation.config, own)
         if is_system:
             unit.check_program_seen()
-            unit.check_seen("the configuration", place.config)
-    return place
+            unit.check_seen("the configuration", installation.config)
+    return installation
 
 
-def _check_disk(place: Place, present: Present) -> None:
+def _check_disk(installation: Installation, present: Present) -> None:
     from hearthlog.recorder.host import disk_of
     from hearthlog.recorder.retention import size_text
 
-    logs = place.folder / present.settings.output
+    logs = installation.folder / present.settings.output
     least = int(present.settings.min_free_space) + _LEAST_FREE
     free = disk_of(logs).free
     if free < least:
@@ -167,17 +169,19 @@ def _check_disk(place: Place, present: Present) -> None:
         )
 
 
-def _text(place: Place, present: Present, answers: "Answers") -> str:
+def _text(installation: Installation, present: Present, answers: "Answers") -> str:
     from hearthlog.recorder.errors import ConfigurationError
     from hearthlog.tools.service.configuration_file import configuration_text
 
     try:
         return configuration_text(present.text, answers)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{place.config}: {error}") from error
+        raise ConfigurationError(f"{installation.config}: {error}") from error
 
 
-def _confirm(asker: Asker, place: Place, present: Present, answers: "Answers", text: str) -> None:
+def _confirm(
+    asker: Asker, installation: Installation, present: Present, answers: "Answers", text: str
+) -> None:
     """Show what will be changed, and ask for it."""
     import difflib
 
@@ -185,7 +189,11 @@ def _confirm(asker: Asker, place: Place, present: Present, answers: "Answers", t
 
     broker = answers.broker
     what = "is unchanged" if present.text == text else "is changed" if present.text else "is new"
-    who = "a user service" if place.account is None else f"of the machine, by {place.account}"
+    who = (
+        "a user service"
+        if installation.account is None
+        else f"of the machine, by {installation.account}"
+    )
     parts = [] if answers.page is None else [f"a page at port {answers.page}"]
     parts += [] if broker is None else [f"MQTT at {broker.host}"]
     parts += [] if answers.alerts is None else ["alerts"]
@@ -198,10 +206,10 @@ def _confirm(asker: Asker, place: Place, present: Present, answers: "Answers", t
         "Sound": "clips are kept" if answers.keep_sound else "none is kept",
         "Network": answers.network or "yamnet where it is installed",
         "Bridge": ", ".join(parts) or "none",
-        "Configuration": f"{place.config} {what}",
+        "Configuration": f"{installation.config} {what}",
         "Secrets": ", ".join(map(str, answers.secrets)),
-        "Logs": str(place.folder / present.settings.output),
-        "Service": who if place.has_service else "none",
+        "Logs": str(installation.folder / present.settings.output),
+        "Service": who if installation.has_service else "none",
     }
     print(file=sys.stderr)
     for name, value in rows.items():
@@ -215,7 +223,7 @@ def _confirm(asker: Asker, place: Place, present: Present, answers: "Answers", t
         raise typer.Abort
 
 
-def _carry_out(place: Place, answers: "Answers", text: str) -> None:
+def _carry_out(installation: Installation, answers: "Answers", text: str) -> None:
     """Change this machine; after a failure before the start of the service it is as before."""
     from hearthlog.models.embedding.networks import find_network
     from hearthlog.tools.cli.models import fetch
@@ -224,14 +232,14 @@ def _carry_out(place: Place, answers: "Answers", text: str) -> None:
 
     if answers.network == NETWORK and find_network(NETWORK) is None:
         fetch(NETWORK, None)
-    is_new = place.account is not None and unit.make_account(place.account)
+    is_new = installation.account is not None and unit.make_account(installation.account)
     failure: unit.StartError | None = None
     is_recording = False
     try:
-        with written_files(place.config, text, answers.secrets, place.account):
-            _check_configuration(place)
+        with written_files(installation.config, text, answers.secrets, installation.account):
+            _check_configuration(installation)
             try:
-                is_recording = place.has_service and _install(place, answers)
+                is_recording = installation.has_service and _install(installation, answers)
             except unit.StartError as error:  # its needs are met: the journal says more
                 failure = error
     except BaseException:
@@ -241,44 +249,46 @@ def _carry_out(place: Place, answers: "Answers", text: str) -> None:
     if failure is not None:
         raise failure
     if is_recording:
-        _wait_for_labels(place, answers)
-    _print_next(place, answers)
+        _wait_for_labels(installation, answers)
+    _print_next(installation, answers)
 
 
-def _check_configuration(place: Place) -> None:
+def _check_configuration(installation: Installation) -> None:
     from hearthlog.recorder.errors import ConfigurationError
     from hearthlog.tools.cli.recorder import findings
 
-    if place.folder.is_dir():
-        os.chdir(place.folder)
-    errors, problems, warnings = findings(place.config)
+    if installation.folder.is_dir():
+        os.chdir(installation.folder)
+    errors, problems, warnings = findings(installation.config)
     if errors or problems:
         raise ConfigurationError(*map(str, errors), *problems)
     for line in warnings:
         print_notice(line)
 
 
-def _install(place: Place, answers: "Answers") -> bool:
+def _install(installation: Installation, answers: "Answers") -> bool:
     """Install the services, and start or restart them; return whether they run."""
     from hearthlog.tools.cli.recorder import install_service
     from hearthlog.tools.service import unit
 
-    is_user = place.account is None
+    is_user = installation.account is None
     is_running = unit.is_user_manager_running() if is_user else unit.is_systemd_running()
     for name in (unit.NAME, unit.BRIDGE_NAME):
         is_bridge = name == unit.BRIDGE_NAME
         if is_bridge and (is_user or not answers.has_bridge()):
-            if place.is_running(name):
+            if installation.is_running(name):
                 unit.stop_unit(name)
-        elif place.account is not None and unit.is_packaged(name):
+        elif installation.account is not None and unit.is_packaged(name):
             unit.start_unit(name, is_running=is_running)
         else:
-            account = place.account if is_bridge else None
-            install_service(user=is_user, config=place.config, account=account, bridge=is_bridge)
+            account = installation.account if is_bridge else None
+            install_service(
+                user=is_user, config=installation.config, account=account, bridge=is_bridge
+            )
     return is_running
 
 
-def _wait_for_labels(place: Place, answers: "Answers") -> None:
+def _wait_for_labels(installation: Installation, answers: "Answers") -> None:
     """Wait until each microphone has a label in the log that is being written."""
     from threading import Event
 
@@ -286,7 +296,7 @@ def _wait_for_labels(place: Place, answers: "Answers") -> None:
     from hearthlog.schemas.logs.follow import follow_messages
     from hearthlog.tools.cli.terminal import share_done
 
-    logs = place.folder / load_settings(place.config, {}, {}).output
+    logs = installation.folder / load_settings(installation.config, {}, {}).output
     end = time.monotonic() + _LABEL_SECONDS
     missing = {f"/{room}/label" for _, room in answers.microphones}
     start = time.time_ns()
@@ -305,31 +315,31 @@ def _wait_for_labels(place: Place, answers: "Answers") -> None:
     if missing:
         raise SetupError(
             f"no label in {logs} of {', '.join(sorted(missing))} in {_LABEL_SECONDS:.0f} s; the "
-            f"recorder runs: {_command(place, 'doctor --live', logs)} says what it waits for"
+            f"recorder runs: {_command(installation, 'doctor --live', logs)} says what it waits for"
         )
     print_lines([f"{logs}: the labels of {', '.join(r for _, r in answers.microphones)} arrive"])
 
 
-def _command(place: Place, verb: str, *arguments: object) -> str:
+def _command(installation: Installation, verb: str, *arguments: object) -> str:
     """Return a command in backticks, of the user who may read the logs."""
-    who = "" if place.account is None else f"sudo -u {place.account} "
+    who = "" if installation.account is None else f"sudo -u {installation.account} "
     return f"`{' '.join([f'{who}hearthlog {verb}', *map(str, arguments)])}`"
 
 
-def _print_next(place: Place, answers: "Answers") -> None:
+def _print_next(installation: Installation, answers: "Answers") -> None:
     """Print what to do next."""
     from hearthlog.recorder.config import load_settings
 
-    logs = place.folder / load_settings(place.config, {}, {}).output
+    logs = installation.folder / load_settings(installation.config, {}, {}).output
     lines = []
-    if not place.has_service:
-        lines.append(f"to record: {_command(place, 'record --config', place.config)}")
-    if answers.has_bridge() and place.account is None:
-        bridge = _command(place, "bridge --config", place.config)
+    if not installation.has_service:
+        lines.append(f"to record: {_command(installation, 'record --config', installation.config)}")
+    if answers.has_bridge() and installation.account is None:
+        bridge = _command(installation, "bridge --config", installation.config)
         lines.append(f"to publish: {bridge}, which prints the address of the page")
     elif answers.page is not None:
         lines.append(f"the page: {_page_address(answers.page)}")
-    lines.append(f"after an hour, what was heard: {_command(place, 'info', logs)}")
+    lines.append(f"after an hour, what was heard: {_command(installation, 'info', logs)}")
     print_lines(lines)
 
 

@@ -68,8 +68,8 @@ def _checked(option: str, text: str, check: Callable[[str], _Value]) -> _Value:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a recorder is set up; `account` is None for a user's."""
+class Installation:
+    """The place where a recorder is set up; `account` is None for a user's."""
 
     config: Path
     folder: Path
@@ -99,10 +99,10 @@ class Place:
 class Present:
     """The present configuration, of which the answers are the defaults."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, installation: Installation) -> None:
         from hearthlog.analyzer.bridge.settings import load_bridge_settings
 
-        self.file = place.config if place.config.exists() else None
+        self.file = installation.config if installation.config.exists() else None
         self.settings: Settings
         self.bridge: BridgeSettings
         self.settings, self.bridge = load_bridge_settings(self.file)
@@ -110,7 +110,7 @@ class Present:
 
 
 def microphones_of(
-    asker: Asker, given: list[str] | None, present: Present, place: Place
+    asker: Asker, given: list[str] | None, present: Present, installation: Installation
 ) -> list[tuple[str, str]]:
     """Return devices and rooms, after hearing each device."""
     from hearthlog.recorder.sources.capture import Device
@@ -119,7 +119,7 @@ def microphones_of(
 
     configured = [(each.device, each.name) for each in present.settings.microphone]
     chosen = configured if present.file is not None else []
-    ours = [device for device, _ in chosen] if place.is_running(NAME) else []
+    ours = [device for device, _ in chosen] if installation.is_running(NAME) else []
     if given:
         chosen = [_device_and_room(text) for text in given]
     elif asker.asks("the microphone", "--microphone DEVICE=ROOM"):
@@ -171,13 +171,11 @@ def _chosen_on_terminal(
 
     default = _found(devices, "")
     rooms = {device or default.identity: room for device, room in configured}
-    before = [
-        place for place, each in enumerate(devices) if rooms.keys() & {each.identity, each.name}
-    ]
+    before = [row for row, each in enumerate(devices) if rooms.keys() & {each.identity, each.name}]
     chosen = choose_by_level(devices, before or [devices.index(default)])
     pairs: list[tuple[str, str]] = []
-    for place in chosen:
-        device = devices[place]
+    for row in chosen:
+        device = devices[row]
         room = rooms.get(device.identity, "" if len(chosen) > 1 else "mic")
 
         def check(text: str) -> str:
@@ -258,7 +256,7 @@ def network_of(asker: Asker, given: str | None, present: Present) -> str:
 
 
 def page_of(
-    asker: Asker, given: bool | None, port: int | None, present: Present, place: Place
+    asker: Asker, given: bool | None, port: int | None, present: Present, installation: Installation
 ) -> int | None:
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.http import free_port
@@ -276,7 +274,7 @@ def page_of(
         return None
     before = PAGE_PORT if now is None else now.port
     bind = "127.0.0.1" if now is None else now.bind
-    is_own = now is not None and place.is_running(BRIDGE_NAME)
+    is_own = now is not None and installation.is_running(BRIDGE_NAME)
 
     def check(text: str) -> int:
         if not text.isdecimal() or not 0 < int(text) <= 65_535:
@@ -304,7 +302,7 @@ def broker_of(
     given: str | None,
     login: tuple[str | None, Path | None],
     present: Present,
-    place: Place,
+    installation: Installation,
     secrets: dict[Path, str],
 ) -> "Broker | None":
     from hearthlog.analyzer.bridge.settings import MqttSettings
@@ -316,7 +314,7 @@ def broker_of(
         return None
     require("paho")
     user, password_file = login
-    file = secret_file(place.config, "mqtt-password")
+    file = secret_file(installation.config, "mqtt-password")
     old = None if now is None else now.password_file
     if given is not None:
         host = _checked("--mqtt", given, _host)
@@ -376,13 +374,17 @@ def _secret(file: Path) -> str:
 
 
 def alerts_of(
-    asker: Asker, given: str | None, present: Present, place: Place, secrets: dict[Path, str]
+    asker: Asker,
+    given: str | None,
+    present: Present,
+    installation: Installation,
+    secrets: dict[Path, str],
 ) -> Path | None:
     from hearthlog.analyzer.extras import require
     from hearthlog.tools.service.configuration_file import secret_file
 
     now = present.bridge.delivery.urls_file
-    file = secret_file(place.config, "alert-urls")
+    file = secret_file(installation.config, "alert-urls")
     if given == NONE or (given is None and not _wanted(asker, "alerts", now is not None)):
         return None
     require("apprise")

@@ -50,7 +50,7 @@ class Broker:
 
 @dataclass(frozen=True)
 class Answers:
-    """What a configuration shall say.
+    """The answers of a person from which a configuration is made.
 
     Attributes
     ----------
