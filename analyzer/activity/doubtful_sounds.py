@@ -68,13 +68,18 @@ class DoubtfulSound(NamedTuple):
 
 
 def perhaps(sounds: Collection[DoubtfulSound], hidden: Collection[str] = ()) -> list[str]:
-    """Return which of `WORRYING` some sounds might be, the most probable first."""
+    """Return which of `WORRYING` some sounds might be, the most probable first.
+
+    A model that lacks one of them gives its probability to the others, so these must be likely.
+    """
+    knows_all = all(name in sound.shares for sound in sounds for name in WORRYING)
+    least = _NAMED if knows_all else _LIKELY
     shares = {
         name: max(sound.shares.get(name, 0.0) for sound in sounds)
         for name in WORRYING
         if name not in hidden
     }
-    return [name for name in sorted(shares, key=lambda n: -shares[n]) if shares[name] >= _NAMED]
+    return [name for name in sorted(shares, key=lambda n: -shares[n]) if shares[name] >= least]
 
 
 def is_doubtful(label: str, confidence: float) -> bool:

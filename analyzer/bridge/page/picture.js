@@ -42,7 +42,7 @@ function choose(chosen) {
     note: make("p", { class: "about" }), hide: close_ };
   close_.addEventListener("click", () => hideClass(open.data().it.label));
   open.panel = make("div", { class: "panel" }, open.heading, open.list, open.note, close_);
-  open.list.addEventListener("toggle", () => { if (open) showTimes(); }, true); // an answered one may go now
+  open.list.addEventListener("toggle", () => { if (open) showTimes(); }, true); // one that was open and counts no more may go now
   open.where(open.panel);
   set(chosen.button, "aria-expanded", "true");
   showTimes();

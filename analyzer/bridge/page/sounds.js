@@ -103,6 +103,7 @@ function form(item, { legend, choices, save }) {
     button.disabled = false;
     if (answer.error) { write(problem, answer.error); return; }
     showAnswer(item, answer.said);
+    item.isAnswered = true;
     item.details.open = false;
     item.summary.focus();
   });
@@ -133,12 +134,14 @@ function begin(question) {
   return item;
 }
 
-// The items of a list in its order, by the ids of what they show; one in which somebody is just
-// saying what it was stays.
+// The items of a list in its order, by the ids of what they show. One stays in which somebody is just
+// saying what it was, and a single time that was answered stays with its answer, though it counts no more.
 function arrange(list, items, entries, begun, show) {
   const ids = new Set(entries.map(({ id }) => id));
+  const stays = ({ details, element, entry, isAnswered }) =>
+    element.isConnected && (details.open || (isAnswered && entry?.isSingle));
   for (const [id, item] of items) {
-    if (ids.has(id) || (item.details.open && item.element.isConnected)) continue;
+    if (ids.has(id) || stays(item)) continue;
     item.element.remove();
     items.delete(id);
   }
@@ -147,7 +150,8 @@ function arrange(list, items, entries, begun, show) {
     let item = items.get(entry.id);
     if (!item) items.set(entry.id, item = begun(entry));
     show(item, entry);
-    const next = before ? before.nextSibling : list.firstChild;
+    let next = before ? before.nextSibling : list.firstChild;
+    while (next && !entries.some(({ id }) => items.get(id)?.element === next)) next = next.nextSibling;
     if (item.element !== next) list.insertBefore(item.element, next);
     before = item.element;
   }
@@ -157,9 +161,10 @@ function beginBout(entry) {
   const item = begin(() => {
     const { id, label, words, time, doubtful, isSingle } = item.entry;
     const others = classes.filter(([name]) => doubtful || name !== label);
+    const isClear = !doubtful && label !== "unknown";
     return {
       legend: say("question", { class: words, time }),
-      choices: [...(doubtful ? [] : [[label, say("right", { class: words })]]), ...others, ["television", say("television")], ["silence", say("silence")]],
+      choices: [...(isClear ? [[label, say("right", { class: words })]] : []), ...others, ["television", say("television")], ["silence", say("silence")]],
       save: (chosen) => send(isSingle ? "mark-one" : "mark", { event: id, label: chosen }),
     };
   });
@@ -175,7 +180,7 @@ function showBout(item, entry) {
   item.entry = entry;
   write(item.often, entry.times ? ` · ${entry.times}` : "");
   write(item.about, entry.isSingle ? entry.about : [entry.time, entry.length, entry.sure, entry.beside, entry.room].filter(Boolean).join(" · "));
-  showAnswer(item, entry.said);
+  if (entry.said || !item.isAnswered) showAnswer(item, entry.said); // the log has an answer later
   write(item.hint, ` (${[entry.words, entry.time, entry.room].filter(Boolean).join(", ")})`);
 }
 

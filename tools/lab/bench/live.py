@@ -31,7 +31,10 @@ _START_SECONDS = 30.0
 _HEARD_SECONDS = 10  # again and again; the device keeps them in memory
 _CPU = Target(0.5, at_most=True)
 _WITH_NETWORK = Target(1.0, at_most=True)
-_NETWORK_LOGS = "logs-network"
+_PROCESSES = ("recorder", "capture")
+_MANY = (2, 4)  # microphones
+_NETWORK = "with the network"
+_UNIT = "% of a core"
 _MEMORY = Target(120.0, at_most=True)
 _HEAVY = ("sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy")
 _NO_HEAVY = Target(0, at_most=True)
@@ -65,43 +68,49 @@ class _Usage:
 
 
 def measure(work: Workload) -> Table:
-    """Record sound for a minute, also with a candidate and a network, and hear it doing nothing."""
+    """Record sound for a minute, also with a candidate, more microphones and a network."""
     size = RBF_LANDMARKS.summary(work.model)
     title = f"live: one microphone for {_SECONDS:.0f} s, {size}"
     try:
         rows = _live(work)
     except (BenchError, ImportError) as error:
         rows = [
-            Row("hearthlog, all processes", None, "% of a core", target=_CPU, note=str(error)),
-            Row("their memory (PSS)", None, "MB", target=_MEMORY, note=str(error)),
+            Row("hearthlog, all processes", None, _UNIT, target=_CPU, note=str(error)),
+            Row("memory (PSS), all processes", None, "MB", target=_MEMORY, note=str(error)),
         ]
     return Table(title, [*rows, _imports(work)])
 
 
 def _live(work: Workload) -> list[Row]:
     env = make_microphone(work.folder, most_sounding(work.samples))
-    models = {"logs-live": work.model_file, "logs-on-trial": _beside_candidate(work)}
+    recorders = [
+        _Recorder("hearthlog", work.model_file),
+        _Recorder("with a candidate", _beside_candidate(work)),
+        *(_Recorder(f"with {count} microphones", work.model_file, count) for count in _MANY),
+    ]
     if find_network(YAMNET.name) is not None:
-        models[_NETWORK_LOGS] = starter_file(with_network(GENERAL))
-    folders = {work.folder / name: model for name, model in models.items()}
+        network = starter_file(with_network(GENERAL))
+        recorders.append(_Recorder(_NETWORK, network, network=YAMNET.name))
     block = round(capture.BLOCK_SECONDS * SAMPLE_RATE)
     latency = capture.LATENCY_SECONDS
     bare = [sys.executable, "-c", _BARE, DEVICE, SAMPLE_RATE, block, latency]
     with ExitStack() as stack:
-        recorders = [
-            stack.enter_context(running(_recorder(model, folder), _environment(env, folder)))
-            for folder, model in folders.items()
-        ]
-        processes = [*recorders, stack.enter_context(running(bare, env))]
-        for recorder, folder in zip(recorders, folders, strict=True):
-            wait_for_log(folder, recorder)
+        running_recorders = []
+        for number, recorder in enumerate(recorders):
+            logs = work.folder / f"logs-{number}"
+            # Without a word, all would listen with the network where it is installed.
+            own = env | {"HEARTHLOG_EMBEDDING": recorder.network}
+            process = stack.enter_context(running(recorder.command(logs), own))
+            running_recorders.append(process)
+            wait_for_log(logs, process)
+        processes = [*running_recorders, stack.enter_context(running(bare, env))]
         time.sleep(_SETTLE_SECONDS)
         before, began = [usage(process) for process in processes], time.monotonic()
         time.sleep(_SECONDS)
         after, seconds = [usage(process) for process in processes], time.monotonic() - began
-        for recorder in recorders:
-            recorder.terminate()
-        ends = [recorder.wait(timeout=_START_SECONDS) for recorder in recorders]
+        for process in running_recorders:
+            process.terminate()
+        ends = [process.wait(timeout=_START_SECONDS) for process in running_recorders]
     if [one.keys() for one in before] != [one.keys() for one in after]:
         raise BenchError("the recorder lost the microphone while it was measured")
     percents = [
@@ -110,17 +119,29 @@ def _live(work: Workload) -> list[Row]:
     ]
     megabytes = [[usage.memory / 1e6 for usage in last.values()] for last in after]
     notes = ["sound was lost: the machine was busy" if end == _GAPS else "" for end in ends]
-    return _rows(percents, megabytes, notes)
+    return _rows(recorders, percents, megabytes, notes)
 
 
-def _environment(env: dict[str, str], logs: Path) -> dict[str, str]:
-    """Let one recorder listen with the network: without a word, all would where it is installed."""
-    network = YAMNET.name if logs.name == _NETWORK_LOGS else NO_NETWORK
-    return env | {"HEARTHLOG_EMBEDDING": network}
+@dataclass(frozen=True)
+class _Recorder:
+    """A recorder to measure."""
 
+    name: str
+    model: Path
+    microphones: int = 1
+    network: str = NO_NETWORK
 
-def _recorder(model: Path, logs: Path) -> list[object]:
-    return [*HEARTHLOG, "record", "--device", DEVICE, "--model", model, "--output", logs]
+    def command(self, logs: Path) -> list[object]:
+        """Return the command that runs it; write its configuration next to its logs."""
+        config = logs.with_suffix(".toml")
+        config.write_text(
+            "".join(
+                f'[[microphone]]\nname = "mic{number}"\ndevice = "{DEVICE}"\n'
+                for number in range(self.microphones)
+            )
+        )
+        files = ["--config", config, "--model", self.model, "--output", logs]
+        return [*HEARTHLOG, "record", *files]
 
 
 def _beside_candidate(work: Workload) -> Path:
@@ -139,28 +160,26 @@ def most_sounding(samples: NDArray[np.int16]) -> NDArray[np.int16]:
     return seconds[sums.argmax() :][:_HEARD_SECONDS].ravel()
 
 
-def _rows(percents: list[list[float]], megabytes: list[list[float]], notes: list[str]) -> list[Row]:
-    """Make rows of what recorders and the bare microphone have used.
-
-    A recorder alone, one with a candidate, and one with a network if it is installed.
-    """
-    unit, names = "% of a core", ("recorder", "capture")
-    alone, on_trial, *network, (bare,) = percents
-    rows = [Row("hearthlog, all processes", sum(alone), unit, target=_CPU, note=notes[0])]
-    rows += [Row(f"  {n}", p, unit) for n, p in zip(names, alone, strict=True)]
-    rows += [
-        Row("with a candidate, all processes", sum(on_trial), unit, note=notes[1]),
-        *(
-            Row("with the network, all processes", sum(used), unit, None, _WITH_NETWORK, note)
-            for used, note in zip(network, notes[2:], strict=True)
-        ),
-        Row("the bare microphone", bare, unit, note="opened alike, sound thrown away"),
-    ]
-    alone, on_trial, *network, (bare,) = megabytes
-    rows += [Row("memory (PSS), all processes", sum(alone), "MB", target=_MEMORY)]
-    rows += [Row(f"  {n}", m, "MB") for n, m in zip(names, alone, strict=True)]
-    rows += [Row("memory with a candidate", sum(on_trial), "MB")]
-    rows += [Row("memory with the network", sum(used), "MB") for used in network]
+def _rows(
+    recorders: list[_Recorder],
+    percents: list[list[float]],
+    megabytes: list[list[float]],
+    notes: list[str],
+) -> list[Row]:
+    """Make rows of the use of recorders and, at the end, of the bare microphone."""
+    *used, (bare,) = percents
+    rows = []
+    for recorder, own, note in zip(recorders, used, notes, strict=True):
+        target = {recorders[0].name: _CPU, _NETWORK: _WITH_NETWORK}.get(recorder.name)
+        rows.append(Row(f"{recorder.name}, all processes", sum(own), _UNIT, None, target, note))
+        if recorder is recorders[0]:
+            rows += [Row(f"  {n}", p, _UNIT) for n, p in zip(_PROCESSES, own, strict=True)]
+    rows.append(Row("the bare microphone", bare, _UNIT, note="opened alike, sound thrown away"))
+    (first, *others), (bare,) = megabytes[:-1], megabytes[-1]
+    rows.append(Row("memory (PSS), all processes", sum(first), "MB", target=_MEMORY))
+    rows += [Row(f"  {n}", m, "MB") for n, m in zip(_PROCESSES, first, strict=True)]
+    for recorder, own in zip(recorders[1:], others, strict=True):
+        rows.append(Row(f"memory {recorder.name}", sum(own), "MB"))
     return [*rows, Row("the bare microphone, memory", bare, "MB")]
 
 
