@@ -663,7 +663,7 @@ def test_one_of_the_times_of_a_count_is_corrected_there_and_no_other(phone, tmp_
             "document.querySelector('.panel form button').click()"
         )
         count = f"{lane('Coughing')}.querySelector('.count').textContent"
-        phone.until(f"{count} === '2×'")
+        phone.until(f"{count}.startsWith('2')")
         phone.shows(".panel li:last-child", "Laughing")  # the answer stays in its place
         assert [(mark.start, mark.label) for mark in served.marks()] == [(starts[0], "laughing")]
         phone.until(lane("Laughing"))
