@@ -1,21 +1,19 @@
 """Rings wait on the disk until everybody was told of them, whatever happens."""
 
-import json
 import signal
 import socket
 import sqlite3
 import subprocess
 import sys
-import threading
 import time
-from contextlib import closing, contextmanager
+from contextlib import closing
 from datetime import UTC
 from functools import partial
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from receivers import server
 from waiting import wait_for
 
 from hearthlog.analyzer.bridge.alerts import output
@@ -46,34 +44,6 @@ def state_in(folder):
 
 def ring(number, due=0):
     return Notification("coughs", number * SECOND, f"alert {number}", is_known=True, due=due)
-
-
-@contextmanager
-def server(port=0, status=200):
-    """A server that takes what is posted to it; yields its port and the texts."""
-    texts = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self):
-            length = int(self.headers["Content-Length"])
-            body = self.rfile.read(length)
-            if status == 200:
-                texts.append(json.loads(body)["message"])
-            self.send_response(status)
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-
-        def log_message(self, *_):
-            pass
-
-    class Server(ThreadingHTTPServer):
-        daemon_threads = True
-        block_on_close = False
-
-    with Server(("127.0.0.1", port), Handler) as own:
-        threading.Thread(target=own.serve_forever, daemon=True).start()
-        yield own.server_port, texts
-        own.shutdown()
 
 
 def addresses(folder, *lines):
