@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
 
+from hearthlog._version import __version__
 from hearthlog.recorder.errors import ConfigurationError
 
 ENVIRONMENT = "HEARTHLOG_"
@@ -235,8 +236,9 @@ def _unknown_key(
     if near:
         return near, f"; is {near} meant?"
     if 0 < len(known) <= _MOST_LISTED:
-        return "", f"; the keys of this table are {', '.join(known)}"
-    return "", "; `hearthlog config schema` lists the keys" if known else ""
+        return "", f"; the keys of this table are {', '.join(known)}, in hearthlog {__version__}"
+    words = f"; `hearthlog config schema` lists the keys of hearthlog {__version__}"
+    return "", words if known else ""
 
 
 def _words(error: Any, place: _Place, key: Key) -> str:

@@ -316,8 +316,9 @@ def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
     there = needed_modules(settings) | {"apprise": True}  # its absence is reported below
     if lacking := [name for name, is_there in there.items() if not is_there]:
         problems.append(missing(*lacking))
-    if (figures := settings.prometheus) is not None and (line := figures.unread_text_file()):
-        warnings.append(line)
+    if (figures := settings.prometheus) is not None:
+        lines = figures.deprecated_readers(), figures.unread_text_file()
+        warnings += [line for line in lines if line]
     if settings.alert and settings.mqtt is None and settings.delivery.urls_file is None:
         problems.append(NO_RECIPIENT)
     for path, step in [*_secret_steps(settings, problems), *_other_steps(settings)]:

@@ -61,14 +61,9 @@ class PrometheusOutput:
         self.totals = Totals(state, since, say)
         self._made = b"", -math.inf  # the metrics, and their time by CLOCK_MONOTONIC
         self._due = 0.0  # by CLOCK_MONOTONIC
-        if settings.text_file is not None and settings.readable_by is None:
-            say(
-                f"bridge.prometheus: every account of this machine may read {settings.text_file}; "
-                'write readable_by = "all" if that is meant, else "owner" or "group": the next '
-                'release uses "owner" by default'
-            )
-        if line := settings.unread_text_file():
-            say(line)
+        for line in (settings.deprecated_readers(), settings.unread_text_file()):
+            if line:
+                say(line)
         self._server: _Server | None = None
         self._open_port()
 

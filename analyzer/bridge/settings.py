@@ -218,6 +218,16 @@ class PrometheusSettings(_Table):
         if self.text_file is None and self.port is None:
             raise BridgeError("bridge.prometheus: has no output; set text_file or port")
 
+    def deprecated_readers(self) -> str:
+        """Return a warning if the readers of the text file are left to the default."""
+        if self.text_file is None or self.readable_by is not None:
+            return ""
+        return (
+            f"bridge.prometheus: every account of this machine may read {self.text_file}; "
+            'write readable_by = "all" if that is meant, else "owner" or "group": hearthlog 0.4.0 '
+            'will use "owner" by default'
+        )
+
     def unread_text_file(self) -> str:
         """Return a warning if the name of the text file keeps node_exporter from reading it."""
         file = self.text_file

@@ -13,11 +13,13 @@ from typing import Generic, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from hearthlog._version import __version__
 from hearthlog.recorder.log.folder_lock import node_locks
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.logs.files import log_name, walk_logs
 from hearthlog.schemas.new_files import create_file, open_lock, private_folder
+from hearthlog.schemas.release import update_advice
 
 
 class BridgeError(HearthlogError):
@@ -52,12 +54,14 @@ def state_folder(configured: Path | None, logs: Path) -> Path:
 
 
 _NAME = "state.sqlite3"
-_VERSION = 1  # of the table; a bridge refuses a later one
+_VERSION = 1  # of the tables; a bridge refuses a later one
 _TABLE = """
     CREATE TABLE entries (
         node TEXT NOT NULL, name TEXT NOT NULL, content TEXT NOT NULL, PRIMARY KEY (node, name)
     ) WITHOUT ROWID
 """
+# The first release that writes this version of the tables, for the error of an older release.
+_WRITER_TABLE = "CREATE TABLE writer (hearthlog TEXT NOT NULL)"
 _AGAIN_SECONDS = 60.0  # between attempts to open a file that could not be opened
 _LARGEST = 4 << 20  # bytes of an entry
 RETAINED = "mqtt"  # name of an entry; below it, with a slash, those of former recorder names
@@ -320,8 +324,9 @@ def _prepare(database: sqlite3.Connection, path: Path) -> None:
     (version,) = database.execute("PRAGMA user_version").fetchone()
     if version > _VERSION:
         raise BridgeError(
-            f"{path}: was written by a later version of hearthlog; update this one, or name "
-            "another folder with `state` in [bridge]"
+            f"{path}: was written by a later version of hearthlog; "
+            f"{update_advice(_written_by(database))}, or name another folder with `state` in "
+            "[bridge]"
         )
     (problem,) = database.execute("PRAGMA quick_check(1)").fetchone()
     if problem != "ok":
@@ -329,7 +334,16 @@ def _prepare(database: sqlite3.Connection, path: Path) -> None:
     if version < _VERSION:
         with _transaction(database):
             database.execute(_TABLE)
+            database.execute(_WRITER_TABLE)
+            database.execute("INSERT INTO writer VALUES (?)", (__version__,))
             database.execute(f"PRAGMA user_version = {_VERSION}")
+
+
+def _written_by(database: sqlite3.Connection) -> object:
+    """Return the release that the database names; None if it names none."""
+    with suppress(sqlite3.Error):
+        return next(iter(database.execute("SELECT hearthlog FROM writer").fetchone() or ()), None)
+    return None
 
 
 @contextmanager

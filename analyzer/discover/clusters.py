@@ -104,7 +104,8 @@ class ClusterKind(Generic[_Header]):
             header = self.header.model_validate_json(text)
         except (safetensors.SafetensorError, KeyError, ValidationError) as error:
             raise DataError(
-                f"{path}: is no file of {self.plural} of this version of hearthlog"
+                f"{path}: is no file of {self.plural} of this version of hearthlog; if a later one "
+                "wrote it, update hearthlog"
             ) from error
         if damaged:
             raise DataError(damaged)

@@ -24,6 +24,7 @@ from hearthlog.schemas.arrays import Float32, Float64, Int32, Int64
 from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.messages.topics import EmbeddingSpace
+from hearthlog.schemas.release import update_advice
 
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # limit of all other strings in a description
 MOST_SPANS = 1000  # forty kilobytes
@@ -316,7 +317,12 @@ def read_description(text: str) -> Description:
 def _in_this_format(content: dict[str, Any]) -> dict[str, Any]:
     number = content.get("format")
     if isinstance(number, int) and number > FORMAT_OF_EMBEDDINGS:
-        raise ModelError(f"is of format {number}, newer than this version of hearthlog: update it")
+        versions = content.get("versions")
+        written_by = versions.get("hearthlog") if isinstance(versions, dict) else None
+        raise ModelError(
+            f"is of format {number}, newer than this version of hearthlog; "
+            f"{update_advice(written_by)}"
+        )
     if number == 2:
         inputs = content.get("inputs", "statistics")
         parameters = {key: content[key] for key in ("cost", "gamma") if key in content}

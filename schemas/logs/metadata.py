@@ -22,6 +22,7 @@ from hearthlog.schemas.messages.topics import (
     check_microphone_name,
     check_scenario_name,
 )
+from hearthlog.schemas.release import update_advice
 
 HEARTHLOG_METADATA = "hearthlog"
 THINNED = "thinned"  # message kinds dropped from a log
@@ -111,7 +112,7 @@ def unknown_version(record: Mapping[str, str]) -> str:
         return ""
     return (
         f"is of schema version {version_text(record)[:20]!r}, and this hearthlog knows up to "
-        f"{SCHEMA_VERSION}: what is newer in it is not read; update hearthlog"
+        f"{SCHEMA_VERSION}: what is newer in it is not read; {update_advice(record.get('version'))}"
     )
 
 
