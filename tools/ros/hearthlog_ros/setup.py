@@ -4,7 +4,7 @@ from setuptools import setup
 
 setup(
     name="hearthlog_ros",
-    version="0.2.0",
+    version="0.3.0",
     packages=["hearthlog_ros"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/hearthlog_ros"]),
