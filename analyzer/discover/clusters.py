@@ -79,15 +79,16 @@ class ClusterKind(Generic[_Header]):
         return f"{self.plural}.safetensors"
 
     def write(self, path: Path, arrays: Mapping[str, NDArray[Any]], header: _Header) -> None:
-        """Write a file, replacing an existing one.
+        """Write a file, replacing an existing one of other content.
 
         Raise `LogError` if it cannot be written.
         """
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         text = header.model_dump_json(exclude_none=True)
         data = write_sealed(contiguous, f"hearthlog_{self.plural}", text)
-        with replaced_file(path, readers=log_readers(path.parent)) as temporary:
-            temporary.write_bytes(data)
+        if not (path.is_file() and path.stat().st_size == len(data) and path.read_bytes() == data):
+            with replaced_file(path, readers=log_readers(path.parent)) as temporary:
+                temporary.write_bytes(data)
 
     def read(self, path: Path) -> tuple[dict[str, NDArray[Any]], _Header] | None:
         """Read a file; None if it does not exist.
