@@ -132,8 +132,8 @@ def _write(path: Path, target: Path) -> None:
             record.metadata["topic_type_hash"] = message_types.type_hash(name)
         elif isinstance(record, Metadata) and record.name == HEARTHLOG_METADATA:
             record.metadata["schema_version"] = str(NEXT)
-            if "input_sha256" in record.metadata:
-                of = target.with_name(record.metadata["log"])
+            of = target.parent / record.metadata.get("log", "")
+            if of.is_file():  # an enrolled sound is of a log elsewhere
                 record.metadata["input_sha256"] = log_digest(of)
     log.write(target)
 

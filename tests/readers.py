@@ -23,6 +23,7 @@ from hearthlog.analyzer.review.live_timeline import LiveTimeline
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.logs.columns import decode, iterate_columns, read_columns
+from hearthlog.schemas.logs.contents import CONTENTS_METADATA
 from hearthlog.schemas.logs.files import find_logs, is_layer
 from hearthlog.schemas.logs.follow import follow_messages
 from hearthlog.schemas.logs.merged_reading import iterate_messages
@@ -39,6 +40,7 @@ def by_info(run: Run) -> Any:
         name: (about["type"], about["messages"], round(about["rate_hz"], 9))
         for name, about in said.pop("topics").items()
     }
+    said["metadata"] = [each for each in said["metadata"] if each != CONTENTS_METADATA]
     return {key: value for key, value in said.items() if key not in sizes} | {"topics": topics}
 
 

@@ -86,7 +86,7 @@ class ClusterKind(Generic[_Header]):
         contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         text = header.model_dump_json(exclude_none=True)
         data = write_sealed(contiguous, f"hearthlog_{self.plural}", text)
-        if not (path.is_file() and path.stat().st_size == len(data) and path.read_bytes() == data):
+        if not _has_content(path, data):
             with replaced_file(path, readers=log_readers(path.parent)) as temporary:
                 temporary.write_bytes(data)
 
@@ -111,6 +111,13 @@ class ClusterKind(Generic[_Header]):
         if damaged:
             raise DataError(damaged)
         return arrays, header
+
+
+def _has_content(path: Path, data: bytes) -> bool:
+    try:
+        return path.stat().st_size == len(data) and path.read_bytes() == data
+    except OSError:
+        return False
 
 
 @contextmanager
