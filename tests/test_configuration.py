@@ -326,7 +326,8 @@ def test_what_the_bridge_refuses_at_its_start_is_refused_all_at_once(hearthlog, 
     }
     for name, more in tables.items():
         text = text.replace(f"[bridge.{name}]\n", f"[bridge.{name}]\n{more}")
-    file.write_text(f'{text}[bridge.prometheus]\ntext_file = "/dev/null/home.prom"\n')
+    figures = 'text_file = "/dev/null/home.prom"\nreadable_by = "owner"\n'
+    file.write_text(f"{text}[bridge.prometheus]\n{figures}")
     file.chmod(0o600)
     result = hearthlog("config", "check", file)
     assert (result.returncode, result.stdout) == (1, "")

@@ -87,7 +87,7 @@ def check(
 
     Exit status 2: it is invalid; 1: a model, a folder or a file in it cannot be used; 3:
     others may read its secrets, a file should be a credential of the service, nobody would
-    read a text file, or an alert can never notify.
+    read a text file, an alert can never notify, or something is deprecated.
     """
     errors, problems, warnings = findings(file)
     for line in [*map(str, errors), *problems, *warnings]:

@@ -23,7 +23,8 @@ variable, or the default. Passwords of addresses are left out. `hearthlog config
 nothing, and says all that is wrong, each in a line with what to write: exit status 2 if a value
 makes no sense, 1 if a model, the folder, a file or a package that is named cannot be used, 3 if
 everybody on this machine may read a file with secrets, a file is not here that may be a credential
-of the service, an [alert](alerts.md) cannot ring, or nobody reads a `text_file`.
+of the service, an [alert](alerts.md) cannot ring, nobody reads a `text_file`, or something is
+deprecated.
 `hearthlog config schema > home.schema.json` writes a JSON schema, by which editors check and
 complete the file if its first line is `#:schema ./home.schema.json`.
 
