@@ -3,7 +3,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 
 .PHONY: install demo test test-fast test-lab test-wheel test-lowest test-3.13 test-ros check docs pictures bench \
-	bench-history bench-check starter dist deb clean
+	bench-history bench-check starter dist deb addon clean
 
 # What a machine with a microphone and a screen needs, in .venv.
 install: $(VENV)/.analyzer
@@ -92,6 +92,10 @@ dist: $(VENV)/.dev
 # build/deb/hearthlog_VERSION_amd64.deb, for Debian 12; ARCH=arm64 for a Raspberry Pi.
 deb: dist
 	ARCH=$(ARCH) PYTHON=$(BIN)/python tools/deb/build
+
+# build/addon, the Home Assistant add-on.
+addon: dist
+	tools/home-assistant/build
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m hearthlog.tools.lab.bench

@@ -17,7 +17,8 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("analyzer", "models", "recorder", "schemas", "tools")
 PACKAGE = PurePosixPath("tools/package/hearthlog")
 DATA = {"page.html", "page.css", "page.js", "voice_space.safetensors"}
-APART = {("tools", "deb"), ("tools", "lab"), ("tools", "ros")}  # measured, or built, by itself
+# Measured, or built, by itself.
+APART = {("tools", "deb"), ("tools", "home-assistant"), ("tools", "lab"), ("tools", "ros")}
 CLIPS = PurePosixPath("tools/home/clips")
 STARTERS = "models/starter"
 EMBEDDING = "models/embedding"

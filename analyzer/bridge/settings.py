@@ -141,6 +141,16 @@ def _check_bind(address: str) -> str:
     return address
 
 
+def _check_ingress(address: str) -> str:
+    found = ip_of(address)
+    if found is None or found.is_multicast or found.is_unspecified or found.is_loopback:
+        raise ValueError(
+            f"{address[:64]!r} is not the address of one other machine or container; write one "
+            "such as 172.30.32.2"
+        )
+    return str(found)
+
+
 class MqttSettings(_Table):
     """An MQTT broker and its connection."""
 
@@ -261,6 +271,12 @@ class PageSettings(_Table):
         default=[],
         description='Origins that may embed the page, such as ["http://homeassistant.local:8123"].',
     )
+    ingress: Annotated[str, AfterValidator(_check_ingress)] | None = Field(
+        default=None,
+        examples=["172.30.32.2"],
+        description="Address of a proxy that logs its users in, such as the ingress of Home "
+        "Assistant; then nobody else may open the page, and it needs no token.",
+    )
     sound: bool = Field(
         default=False, description="Play kept sound of events to those who may open the page."
     )
@@ -270,6 +286,12 @@ class PageSettings(_Table):
         examples=["de"],
         description="Language of the page; empty: that of the browser, English or German.",
     )
+
+    @model_validator(mode="after")
+    def _check_ingress_alone(self) -> Self:
+        if self.ingress and (self.token_file or self.frames):
+            raise ValueError("token_file and frames have no effect with ingress; leave them out")
+        return self
 
 
 class PingSettings(_Table):

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import date
-from ipaddress import ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from typing import Any
 
@@ -104,8 +104,17 @@ class HomePage:
         self.view(self.words("").language)
         token = page_token(settings.token_file, state)
         names = frozenset(settings.names)
-        admission = PageAdmission(settings.bind, settings.port, token, cookie_key(state), names)
+        key, ingress = cookie_key(state), settings.ingress or ""
+        admission = PageAdmission(settings.bind, settings.port, token, key, names, ingress)
         self._server = PageServer(admission, self, settings.frames)
+        if ingress:
+            say(f"the page of the home: port {settings.port}, for the ingress at {ingress} alone")
+        else:
+            self._say_address(bind, token, state)
+
+    def _say_address(self, bind: IPv4Address | IPv6Address, token: str, state: Path) -> None:
+        """Keep and print the address with the token, without the token where others may read."""
+        settings, say = self._settings, self._say
         host = f"[{settings.bind}]" if bind.version == 6 else settings.bind
         address = f"http://{host}:{settings.port}/"
         whole = f"{address}?token={token}"

@@ -48,6 +48,8 @@ class PageAdmission:
         Key that signs passes.
     names : frozenset of str
         Host names under which the page may be requested, with or without a port.
+    ingress : str, optional
+        Address of a proxy that has checked its users: the only client, which needs no token.
     """
 
     bind: str
@@ -55,6 +57,7 @@ class PageAdmission:
     token: str
     key: bytes
     names: frozenset[str] = frozenset()
+    ingress: str = ""
 
     def cookie(self) -> str:
         """Return the `Set-Cookie` value with a pass for a year.
@@ -83,10 +86,16 @@ class PageAdmission:
         fields: Mapping[str, Sequence[str]],
         *,
         changes: bool,
+        client: str = "",
         has_pass: bool = False,
         words: Words = ENGLISH,
     ) -> str:
         """Check a request.
+
+        Parameters
+        ----------
+        client : str
+            Address of the other end of the connection, which no header field can change.
 
         Returns
         -------
@@ -94,7 +103,10 @@ class PageAdmission:
             Reason of a refusal and its remedy; empty if the request is admitted.
         """
         origins = fields["Origin"]
-        if not self._is_named(host):
+        if self.ingress and client != self.ingress:
+            return words.text("refusal.ingress")
+        # The ingress has a login under each of its names, so a name of another site gains nothing.
+        if not host or not (self.ingress or self._is_named(host)):
             name = host_name(f"//{host}")
             key = "refusal.name" if _PLAIN.fullmatch(name) else "refusal.host"
             return words.text(key, name=name)
@@ -103,7 +115,8 @@ class PageAdmission:
         if origins and not self._is_own(origins[0].lower(), host):
             return words.text("refusal.origin")
         cookies = self._cookies(fields["Cookie"])
-        if has_pass or has_token(target, self.token) or any(map(self.is_pass, cookies)):
+        is_known = has_pass or has_token(target, self.token) or any(map(self.is_pass, cookies))
+        if self.ingress or is_known:
             return ""
         reasons = ["refusal.address"]
         if target.startswith("/?token="):
@@ -293,11 +306,12 @@ class PageServer(HttpServer):
         self.admission, self.content = admission, content
         self.is_ended = False
         self.has_frames = bool(frames)
-        ancestors = " ".join(frames) or "'none'"
+        # The panel of the proxy frames the page, from the same origin.
+        ancestors = " ".join(frames) or ("'self'" if admission.ingress else "'none'")
         policy = f"{_POLICY}; frame-ancestors {ancestors}"
         self.fields = {**_FIELDS, "Content-Security-Policy": policy}
         if not frames:
-            self.fields["X-Frame-Options"] = "DENY"
+            self.fields["X-Frame-Options"] = "SAMEORIGIN" if admission.ingress else "DENY"
         self.streams = threading.BoundedSemaphore(_MOST_STREAMS)
         self.start()
 
@@ -333,7 +347,8 @@ class _Handler(HttpHandler):
         if not self._is_admitted(changes=False):
             return
         path, _, query = self._path.partition("?")
-        if has_token(self.path, self._server.admission.token):
+        admission = self._server.admission
+        if not admission.ingress and has_token(self.path, admission.token):
             self._send_entrance()
         elif self._path == "/events":
             self._stream()
@@ -422,7 +437,13 @@ class _Handler(HttpHandler):
         fields = {name: self.headers.get_all(name, []) for name in ("Origin", "Cookie")}
         self._path, has_pass = self._without_pass()
         refusal = self._server.admission.refusal(
-            self.path, self.host, fields, changes=changes, has_pass=has_pass, words=self._words
+            self.path,
+            self.host,
+            fields,
+            changes=changes,
+            client=str(self.client_address[0]),
+            has_pass=has_pass,
+            words=self._words,
         )
         if refusal:
             self.send_text(HTTPStatus.FORBIDDEN, refusal)
