@@ -201,11 +201,108 @@ def test_a_cookie_is_void_with_another_key_token_or_port_or_after_a_year(monkeyp
         ({"frames": ["http://x; script-src *"]}, "is not the origin of a web page"),
         ({"frames": ["http://ha.local/lovelace"]}, "without a path"),
         ({"frames": ["*"]}, "is not the origin of a web page"),
+        ({"ingress": "127.0.0.1"}, "not the address of one other machine"),
+        ({"ingress": "0.0.0.0"}, "not the address of one other machine"),
+        ({"ingress": "172.30.32.0/24"}, "not the address of one other machine"),
+        ({"ingress": "172.30.32.2", "frames": ["http://ha.local"]}, "no effect with ingress"),
     ],
 )
-def test_names_and_frames_that_are_none_are_refused(table, what):
+def test_names_frames_and_an_ingress_that_are_none_are_refused(table, what):
     with pytest.raises(ValidationError, match=what):
         PageSettings.model_validate(table)
+
+
+INGRESS = "127.0.0.9"
+
+
+class FakeContent:
+    """Content that notes what is changed."""
+
+    def __init__(self):
+        self.acts = []
+
+    def words(self, _accepted):
+        return ENGLISH
+
+    def boards(self):
+        return []
+
+    def act(self, *arguments):
+        self.acts.append(arguments[:3])
+        return "done"
+
+
+@pytest.fixture
+def behind_ingress():
+    """A page that only the address of an ingress may open, and a way to ask it."""
+    port, content = free_port(), FakeContent()
+    admission = PageAdmission("0.0.0.0", port, "x" * 20, b"key", ingress=INGRESS)
+    page = server.PageServer(admission, content)
+
+    def ask(client, method, path, body=None, **fields):
+        connection = HTTPConnection("127.0.0.1", port, 30, source_address=(client, 0))
+        named = {name.replace("_", "-"): value for name, value in fields.items()}
+        connection.request(method, path, body, {"Host": "ha.example:8123"} | named)
+        answer = connection.getresponse()
+        found = answer.status, answer.headers, answer.read().decode()
+        connection.close()
+        return found
+
+    yield SimpleNamespace(ask=ask, content=content, admission=admission)
+    page.end()
+
+
+MARK = json.dumps({"event": "x", "label": "music"})
+
+
+def test_the_ingress_opens_the_page_without_a_token_and_frames_it(behind_ingress):
+    status, fields, text = behind_ingress.ask(INGRESS, "GET", "/", Host="any.name:1")
+    assert status == 200
+    assert "<html" in text
+    assert "frame-ancestors 'self'" in fields["Content-Security-Policy"]
+    assert fields["X-Frame-Options"] == "SAMEORIGIN"
+    own = JSON | {"Origin": "https://ha.example:8123"}
+    assert behind_ingress.ask(INGRESS, "POST", "/mark", MARK, **own)[0] == 200
+    assert behind_ingress.content.acts == [("/mark", "x", "music")]
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {},
+        {"Host": INGRESS},
+        {"X_Ingress_Path": "/api/hassio_ingress/x"},
+        {"X_Forwarded_For": INGRESS},
+        {"X_Real_IP": INGRESS, "Forwarded": f"for={INGRESS}"},
+        {"Via": "1.1 supervisor", "X_Remote_User_Id": "1"},
+    ],
+)
+def test_nobody_else_passes_for_the_ingress_not_even_with_the_token(behind_ingress, forged):
+    admission = behind_ingress.admission
+    own = {"Cookie": admission.cookie().partition(";")[0], "Origin": "http://ha.example:8123"}
+    for path in ("/", f"/?token={admission.token}", "/page.js", f"/{admission.new_pass()}/"):
+        for client in ("127.0.0.1", "127.0.0.90"):
+            status, fields, text = behind_ingress.ask(client, "GET", path, **own, **forged)
+            assert status == 403
+            assert "opens only in Home Assistant" in text
+            assert "Set-Cookie" not in fields
+    assert behind_ingress.ask("127.0.0.1", "POST", "/mark", MARK, **JSON, **own, **forged)[0] == 403
+    assert behind_ingress.content.acts == []
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"Origin": "null"},
+        {"Origin": "https://evil.example"},
+        {"Origin": "http://", "Host": ""},
+        {"Origin": "https://evil.example", "X_Forwarded_Host": "evil.example"},
+    ],
+)
+def test_another_page_changes_nothing_through_the_ingress(behind_ingress, fields):
+    assert behind_ingress.ask(INGRESS, "POST", "/mark", MARK, **JSON, **fields)[0] == 403
+    assert behind_ingress.content.acts == []
 
 
 def test_two_hosts_get_nothing(served):

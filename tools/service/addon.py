@@ -115,6 +115,10 @@ class Service:
             self._process.kill()
             self._process.wait()
 
+    def close(self) -> None:
+        """Stop listening to the process."""
+        self.reports.close()
+
     def _start(self) -> None:
         self._reported = None
         person = None if self._account is None else pwd.getpwnam(self._account)
@@ -143,8 +147,9 @@ class Addon:
         self._broker_problem = ""
         self._broker_due = 0.0
         self._is_ended = False
-        self._broker = self._find_broker()
+        self._broker, problem = self._found_broker()
         write_configuration(options, self._broker, folders, account)
+        self._report(problem)
         _make_folders(options, folders, account)
         config = ["--config", str(folders.configuration)]
         program = module_command("hearthlog.tools.cli.main")
@@ -169,29 +174,35 @@ class Addon:
             service.end()
         for service in services:
             service.wait(until - time.monotonic())
+            service.close()
 
     def _end(self, _number: int, _frame: FrameType | None) -> None:
         self._is_ended = True
 
-    def _find_broker(self) -> AddonBroker | None:
+    def _found_broker(self) -> tuple[AddonBroker | None, str]:
+        """Return the broker, or None and the reason."""
         self._broker_due = time.monotonic() + _BROKER_SECONDS
         try:
-            return find_broker(self._options, self._supervisor, self._token)
+            return find_broker(self._options, self._supervisor, self._token), ""
         except BrokerError as error:
-            if str(error) != self._broker_problem:
-                self._broker_problem = str(error)
-                _say(f"{error}; the recorder and the page run without it")
-            return None
+            return None, str(error)
+
+    def _report(self, problem: str) -> None:
+        """Print a problem of the broker when it is new."""
+        if problem and problem != self._broker_problem:
+            _say(f"{problem}; the recorder and the page run without it")
+        self._broker_problem = problem
 
     def _take_broker(self) -> None:
         """Restart the bridge with a broker that has been installed meanwhile."""
-        broker = self._find_broker()
+        broker, problem = self._found_broker()
+        self._report(problem)
         if broker is None:
             return
         try:
             write_configuration(self._options, broker, self._folders, self._account)
         except HearthlogError as error:
-            _say(str(error))
+            self._report(str(error))
             return
         self._broker = broker
         _say(f"the MQTT broker is {broker.host}")
@@ -201,7 +212,7 @@ class Addon:
 def _make_folders(options: AddonOptions, folders: AddonFolders, account: str | None) -> None:
     """Make the folders that the services write to, also where a backup changed their owner."""
     for folder in (folders.logs(options), folders.state, folders.data / "home"):
-        make_folders(folder, 0o755 if folder.parent == folders.shared else 0o700)
+        make_folders(folder, 0o755 if folder.is_relative_to(folders.share) else 0o700)
         if account is not None and folder.stat().st_uid != pwd.getpwnam(account).pw_uid:
             for path in (folder, *folder.rglob("*")):
                 if not path.is_symlink():
@@ -216,13 +227,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the add-on; end with status 2 and a line for each wrong option."""
     parser = argparse.ArgumentParser("hearthlog.tools.service.addon", description=__doc__)
     parser.add_argument("--data", type=Path, default=Path("/data"))
-    parser.add_argument("--shared", type=Path, default=Path("/config"))
+    parser.add_argument("--config", type=Path, default=Path("/config"))
+    parser.add_argument("--share", type=Path, default=Path("/share"))
     parser.add_argument("--supervisor", default="http://supervisor")
     parser.add_argument("--account", help="account of the recorder and the bridge")
     given = parser.parse_args(arguments)
     try:
         options = read_options(given.data / "options.json")
-        folders = AddonFolders(given.data, given.shared)
+        folders = AddonFolders(given.data, given.config, given.share)
         Addon(options, folders, given.account, given.supervisor).run()
     except ConfigurationError as error:
         for line in error.lines:

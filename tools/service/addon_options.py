@@ -83,10 +83,21 @@ class AddonOptions(_Options):
 
 @dataclass(frozen=True)
 class AddonFolders:
-    """Folders that the Supervisor mounts: one of the add-on alone, and one that users open."""
+    """Folders that the Supervisor mounts.
+
+    Attributes
+    ----------
+    data : Path
+        Of the add-on alone; the restoration of a backup empties it.
+    config : Path
+        Of the add-on, for files of the user.
+    share : Path
+        Of the whole home, which no backup of the add-on touches.
+    """
 
     data: Path
-    shared: Path
+    config: Path
+    share: Path
 
     @property
     def configuration(self) -> Path:
@@ -96,7 +107,7 @@ class AddonFolders:
     @property
     def own_keys(self) -> Path:
         """The user's file of further keys, which need not exist."""
-        return self.shared / "hearthlog.toml"
+        return self.config / "hearthlog.toml"
 
     @property
     def state(self) -> Path:
@@ -105,7 +116,7 @@ class AddonFolders:
 
     def logs(self, options: AddonOptions) -> Path:
         """Return the folder of the logs."""
-        return (self.shared if options.share_logs else self.data) / "logs"
+        return (self.share / "hearthlog" if options.share_logs else self.data) / "logs"
 
 
 @dataclass(frozen=True)
@@ -216,7 +227,13 @@ def write_configuration(
     if broker is not None and broker.password:
         secrets[password] = f"{broker.password}\n"
     with written_files(folders.configuration, new, secrets, account):
-        load_bridge_settings(folders.configuration)
+        try:
+            load_bridge_settings(folders.configuration)
+        except ConfigurationError as error:  # the user's file was right by itself
+            place = re.compile(rf"{re.escape(str(folders.configuration))}(, line \d+)?: ")
+            raise ConfigurationError(*(place.sub("options: ", each) for each in error.lines)) from (
+                error
+            )
 
 
 def _fill(
