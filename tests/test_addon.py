@@ -162,16 +162,12 @@ class Addon:
             f"addon_options.INGRESS_PORT = {self.port}\n"
             "addon.main()\n"
         )
+        return [sys.executable, "-c", code, *self.options()]
+
+    def options(self):
         names = ("data", "config", "share")
         folders = [f"--{name}={getattr(self.folders, name)}" for name in names]
-        return [sys.executable, "-c", code, *folders, f"--supervisor={self._supervisor.address}"]
-
-    def refused(self):
-        """Return what it says and ends with."""
-        done = subprocess.run(
-            self.command(), env=self._env, capture_output=True, text=True, check=False, timeout=60
-        )
-        return done.returncode, done.stderr.splitlines()
+        return [*folders, f"--supervisor={self._supervisor.address}"]
 
     @contextmanager
     def running(self):
@@ -207,6 +203,14 @@ def addon(tmp_path, supervisor, labmic):
     return Addon(tmp_path, supervisor, labmic.env)
 
 
+def refusal(addon, capfd):
+    """Return the lines with which it ends before anything runs."""
+    with pytest.raises(SystemExit) as end:
+        addon_program.main(addon.options())
+    assert end.value.code == 2
+    return capfd.readouterr().err.splitlines()
+
+
 @pytest.mark.parametrize(
     ("options", "line"),
     [
@@ -220,10 +224,12 @@ def addon(tmp_path, supervisor, labmic):
         ({"hidden_sounds": ["a", 3]}, "hidden_sounds"),
     ],
 )
-def test_a_wrong_option_is_one_line_and_nothing_is_written(addon, options, line):
+def test_a_wrong_option_is_one_line_and_nothing_is_written(
+    tmp_path, supervisor, options, line, capfd
+):
+    addon = Addon(tmp_path, supervisor)
     addon.set(**options)
-    status, lines = addon.refused()
-    assert status == 2
+    lines = refusal(addon, capfd)
     assert len(lines) == 1, lines
     assert re.match(f"hearthlog: .*{line}", lines[0]), lines
     assert [path.name for path in addon.folders.data.iterdir()] == ["options.json"]
@@ -269,11 +275,11 @@ def test_options_and_a_file_of_further_keys_make_a_configuration(
     assert check.returncode == 0, check.stderr
 
 
-def test_a_wrong_key_of_the_own_file_is_named_with_its_line(addon):
+def test_a_wrong_key_of_the_own_file_is_named_with_its_line(tmp_path, supervisor, capfd):
+    addon = Addon(tmp_path, supervisor)
     addon.set()
     addon.folders.own_keys.write_text("\nquiet_houers = []\n")
-    status, lines = addon.refused()
-    assert status == 2
+    lines = refusal(addon, capfd)
     assert len(lines) == 1, lines
     assert f"{addon.folders.own_keys}, line 2: unknown key 'quiet_houers'" in lines[0]
 
