@@ -28,7 +28,8 @@ from hearthlog.tools.service.addon_options import AddonFolders, AddonOptions, Mi
 ADDON = Path(__file__).parents[1] / "tools/home-assistant"
 TOKEN = "the-token-of-the-supervisor"
 # Keys of an add-on that the Supervisor of 2026.08 knows, as far as this one uses or may use them,
-# after https://developers.home-assistant.io/docs/apps/configuration; it drops any other in silence.
+# after https://developers.home-assistant.io/docs/add-ons/configuration.
+# It drops any other key in silence.
 KEYS = {
     **dict.fromkeys(("name", "slug", "description", "panel_icon", "panel_title"), str),
     **dict.fromkeys(("url", "watchdog", "image", "ingress_entry"), str),
