@@ -768,10 +768,10 @@ def test_every_sound_is_a_strip_in_the_lane_of_its_class_and_in_its_colour(recor
         (shade,) = set(fixed(recording, entity, "SeriesLines:colors"))
         red, green, blue = shade >> 24, shade >> 16 & 255, shade >> 8 & 255
         place = (len(names) - int(number) - 0.5) * LANE_HEIGHT
-        for lines in heights[1:3]:
+        for lines in heights[2:4]:
             assert np.mean(lines) == pytest.approx(place)
             assert 0.45 * LANE_HEIGHT < np.ptp(lines) < 0.55 * LANE_HEIGHT
-        for start, end in zip(times[1::4].tolist(), times[2::4].tolist(), strict=True):
+        for start, end in zip(times[2::6].tolist(), times[3::6].tolist(), strict=True):
             drawn.add((labelling, names[int(number)], start, end, text, (red, green, blue)))
     expected = {
         (lane.labelling or "all", lane.name, start, end, text, lane.colours[text])

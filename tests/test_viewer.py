@@ -86,6 +86,7 @@ class Picture:
     def __init__(self, png, timeline):
         self.image = pixels(png)
         self._grid = timeline.grid
+        self._width = 0
         self.begin_at_cursor(slice(0, self.image.shape[0] * 7 // 10))
 
     def begin_at_cursor(self, rows):
@@ -97,10 +98,13 @@ class Picture:
         white = (self.image[rows, columns] > _WHITE).all(axis=2)
         column = int(white.sum(axis=0).argmax())
         self._left = _NAMES + column
+        # Above the ruler all views have its scale, wherever they begin.
         is_above_ruler = self._left < self.image.shape[1] // 6
-        self._right = self.image.shape[1] - _BESIDE_RULER * is_above_ruler
+        right = self._left + self._width if is_above_ruler and self._width else self.image.shape[1]
+        self._right = right - _BESIDE_RULER * (is_above_ruler and not self._width)
+        self._width = self._right - self._left
         found = np.flatnonzero(white[:, column])
-        cursor = max(np.split(found, np.flatnonzero(np.diff(found) > 1) + 1), key=len)
+        cursor = max(np.split(found, np.flatnonzero(np.diff(found) > 4) + 1), key=len)
         return rows.start + int(cursor[0]), rows.start + int(cursor[-1]) + 1
 
     def place(self, time):

@@ -86,7 +86,8 @@ def patiently(operation, is_enough=lambda _: True):
             answer = operation()
             if is_enough(answer):
                 return answer
-        assert time.monotonic() < deadline, answer
+        shown = "another picture is shown" if isinstance(answer, bytes) else answer
+        assert time.monotonic() < deadline, shown
         time.sleep(0.1)
 
 
