@@ -75,22 +75,27 @@ def is_asked(picture, start, end):
 
 
 def rows_of_classes(picture, names):
-    """The row of pixels in the middle of each class, by the names of the lowest plot."""
+    """The row of pixels in the middle of each class, by the lowest row, as it may be rounded."""
     bright = np.abs(picture[:, _LANES:] - np.array(colour(names[-1]))).max(axis=2) <= _NEAR
     lowest = np.flatnonzero(bright[len(picture) // 2 :].mean(axis=1) > 0.02) + len(picture) // 2
     run = max(np.split(lowest, np.flatnonzero(np.diff(lowest) > 3) + 1), key=len)
     assert len(run) > 5
-    height = (len(run) - 3) / 0.9  # it reaches three pixels into the row above
-    return [
-        round(run[-1] + 1 - (len(names) - number - 0.5) * height) for number in range(len(names))
-    ]
+    above = len(names) - np.arange(len(names)) - 0.5
+    for off in np.linspace(-1.0, 1.0, 9):
+        height = (len(run) + off - 3) / 0.9  # it reaches three pixels into the row above
+        yield np.rint(run[-1] + 1 - above * height).astype(int).tolist()
 
 
 def right_columns(picture, timeline, first, last):
-    """Whether the brightest row of some columns is that of the most probable class."""
+    """The share of columns whose brightest row is that of the most probable class."""
+    names = ordered(timeline.microphones["mic"].plots[SHARES, "live"].names)
+    every = rows_of_classes(picture, names)
+    return max(right_in_rows(picture, timeline, first, last, rows) for rows in every)
+
+
+def right_in_rows(picture, timeline, first, last, rows):
     shares = timeline.microphones["mic"].plots[SHARES, "live"]
     names = ordered(shares.names)
-    rows = rows_of_classes(picture, names)
     colours = np.array([colour(name) for name in names])
     right = []
     for share in np.linspace(0.05, 0.95, 90):
@@ -99,7 +104,7 @@ def right_columns(picture, timeline, first, last):
         if max(values) < 0.8:
             continue
         x = _LANES + int(share * (picture.shape[1] - _LANES))
-        seen = np.stack([picture[y - 2 : y + 3, x].mean(axis=0) for y in rows])
+        seen = np.stack([picture[y - 1 : y + 2, x].mean(axis=0) for y in rows])
         light = ((seen - 13) * (colours - 13)).sum(axis=1) / ((colours - 13) ** 2).sum(axis=1)
         # The round ends of a piece reach three pixels into the next one.
         near = shares.values[max(place - 1, 0) : place + 2].argmax(axis=1)
