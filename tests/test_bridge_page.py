@@ -484,6 +484,7 @@ def test_an_address_of_the_network_comes_with_a_warning(place, tmp_path):
     said = []
     settings = PageSettings(port=free_port(), bind="0.0.0.0")
     HomePage(settings, place, tmp_path, said.append).close()
+    assert f" http://127.0.0.1:{settings.port}/?token=" in said[0]  # which a browser can open
     assert "unencrypted" in said[1]
 
 

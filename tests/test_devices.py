@@ -1,6 +1,9 @@
 """A microphone is found by its name, or where two have one name, by where it is plugged in."""
 
+import os
+import tempfile
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +12,7 @@ from hearthlog.recorder.sources import process
 from hearthlog.recorder.sources.capture import (
     Device,
     UsbPlace,
+    closed_card,
     find_device,
     list_devices,
     usb_place,
@@ -118,3 +122,21 @@ def test_a_card_that_is_plugged_in_ends_the_wait_for_one(tmp_path, monkeypatch):
     plug.start()
     assert process.cards_change(threading.Event(), 60.0)
     assert not process.cards_change(threading.Event(), 0.1)
+
+
+def test_a_card_of_a_group_that_is_not_the_accounts_is_named_with_the_group():
+    account, nobody = os.geteuid(), 65_534
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        node = Path(folder, "pcmC0D0c")
+        node.touch()
+        assert closed_card(Path(folder)) == ""
+        node.chmod(0)
+        if account == 0:  # who may open anything
+            os.seteuid(nobody)
+        try:
+            found = closed_card(Path(folder))
+        finally:
+            os.seteuid(account)
+        group = node.stat().st_gid
+    assert found.startswith(f"this account may not open {node}: add it to the group {group};")

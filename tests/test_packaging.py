@@ -18,7 +18,7 @@ FOLDERS = ("analyzer", "models", "recorder", "schemas", "tools")
 PACKAGE = PurePosixPath("tools/package/hearthlog")
 DATA = {"page.html", "page.css", "page.js", "voice_space.safetensors"}
 # Measured, or built, by itself.
-APART = {("tools", "deb"), ("tools", "home-assistant"), ("tools", "lab"), ("tools", "ros")}
+APART = {("tools", name) for name in ("deb", "home-assistant", "image", "lab", "ros")}
 CLIPS = PurePosixPath("tools/home/clips")
 STARTERS = "models/starter"
 EMBEDDING = "models/embedding"

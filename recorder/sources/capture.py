@@ -17,6 +17,7 @@ import sys
 import time
 from array import array
 from collections import deque
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from math import ceil, inf
 from pathlib import Path
@@ -116,6 +117,8 @@ def usb_place(card: int, cards: Path = _CARDS) -> UsbPlace:
     return UsbPlace(f"usb:{device.name}", f"serial:{serial}" if serial else "")
 
 
+_NODES = Path("/dev/snd")
+_NO_MICROPHONE = "no microphone found: connect one and check `hearthlog devices`"
 _CARD_NUMBER = re.compile(r" ?\((?:hw|plughw):(\d+),\d+\)$")
 
 
@@ -200,7 +203,7 @@ def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Dev
         If there is no microphone, or none or several match; then the message lists all of them.
     """
     if not devices:
-        raise DeviceError("no microphone found: connect one and check `hearthlog devices`")
+        raise DeviceError(closed_card() or _NO_MICROPHONE)
     if not name:
         defaults = [device for device in devices if device.is_default]
         return (defaults or devices)[0]
@@ -212,6 +215,22 @@ def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Dev
     listed = ", ".join(repr(device.name) for device in devices)
     what = "no microphone" if not matching else "more than one microphone"
     raise DeviceError(f"{what} is called {name!r}; there are {listed}")
+
+
+def closed_card(folder: Path = _NODES) -> str:
+    """Return why sound cards that are there cannot be opened by this account; empty if they can.
+
+    ALSA leaves such cards out of its list, as if there were none.
+    """
+    for node in sorted(folder.glob("pcmC*D*c")):
+        with suppress(OSError):
+            if not os.access(node, os.R_OK | os.W_OK, effective_ids=True):
+                group = node.stat().st_gid
+                return (
+                    f"this account may not open {node}: add it to the group {group}; in a "
+                    f"container, set AUDIO_GROUP={group}"
+                )
+    return ""
 
 
 def _device(info: dict[str, Any], *, is_default: bool) -> Device:

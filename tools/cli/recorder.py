@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 def devices(*, as_json: Json = False) -> None:
     """List the microphones by the names that `hearthlog record --device` accepts."""
+    from hearthlog.recorder.sources.capture import closed_card
     from hearthlog.recorder.sources.process import query_devices
 
     microphones = query_devices()
@@ -51,7 +52,7 @@ def devices(*, as_json: Json = False) -> None:
         rate = f"{device.default_rate:.0f} Hz"
         print(f"{device.name}  {device.channels} channels, {rate}{place}{default}")
     if not microphones:
-        print_notice("no microphone found")
+        print_notice(closed_card() or "no microphone found")
         raise typer.Exit(1)
 
 

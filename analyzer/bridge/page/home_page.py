@@ -115,7 +115,9 @@ class HomePage:
     def _say_address(self, bind: IPv4Address | IPv6Address, token: str, state: Path) -> None:
         """Keep and print the address with the token, without the token where others may read."""
         settings, say = self._settings, self._say
-        host = f"[{settings.bind}]" if bind.version == 6 else settings.bind
+        loopback = "::1" if bind.version == 6 else "127.0.0.1"
+        opened = loopback if bind.is_unspecified else settings.bind  # 0.0.0.0 opens nowhere
+        host = f"[{opened}]" if bind.version == 6 else opened
         address = f"http://{host}:{settings.port}/"
         whole = f"{address}?token={token}"
         try:
