@@ -73,6 +73,8 @@ def _installer() -> str:
     prefix, program = Path(sys.prefix), Path(sys.executable)
     if (prefix / "pipx_metadata.json").exists():
         return "pipx install --force"
+    if (prefix / "uv-receipt.toml").exists():
+        return "uv tool install"
     if find_spec("pip") is None:
         command = f"uv pip install --python {shlex.quote(sys.executable)}"
     elif (pip := program.with_name("pip")).exists():

@@ -267,3 +267,5 @@ def test_what_is_missing_is_installed_as_hearthlog_was(origin, command, tmp_path
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     (tmp_path / "pipx_metadata.json").touch()
     assert "try: pipx install --force " in missing("sklearn")
+    (tmp_path / "pipx_metadata.json").rename(tmp_path / "uv-receipt.toml")
+    assert "try: uv tool install " in missing("sklearn")
