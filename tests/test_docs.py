@@ -39,12 +39,10 @@ PAGES = sorted(
 TEXT = "\n".join(path.read_text("utf-8") for path in PAGES)
 CODE = re.compile(r"^(?P<fence>```)(?P<language>\w*)\n(?P<fenced>.*?)^```|`(?P<inline>[^`\n]+)`|"
                   r"^ {4}(?P<indented>\S[^\n]*)$", re.DOTALL | re.MULTILINE)  # fmt: skip
-# Options of dask, rerun, mcap, systemd and podman that pages name alone.
+# Options of dask, rerun, mcap and systemd that pages name alone.
 FOREIGN = {"--host", "--dashboard-address", "--no-dashboard", "--nworkers", "--nthreads"} | {
     "--memory-limit",
     "--base-paths",
-    "--group-add",
-    "--volume",
 }
 # What is in a code block and cannot run here: it wants a microphone, a screen, a cluster, a bucket,
 # a second program, or sound of many collections.
@@ -128,6 +126,8 @@ def unknown_options(text):
         "dpkg",
         "systemctl",
         "useradd",
+        "docker",
+        "pactl",
         "podman",
     }
     foreign = {
