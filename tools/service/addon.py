@@ -213,10 +213,12 @@ def _make_folders(options: AddonOptions, folders: AddonFolders, account: str | N
     """Make the folders that the services write to, also where a backup changed their owner."""
     for folder in (folders.logs(options), folders.state, folders.data / "home"):
         make_folders(folder, 0o755 if folder.is_relative_to(folders.share) else 0o700)
-        if account is not None and folder.stat().st_uid != pwd.getpwnam(account).pw_uid:
+        if account is None:
+            continue
+        owner = pwd.getpwnam(account)
+        if folder.stat().st_uid != owner.pw_uid:
             for path in (folder, *folder.rglob("*")):
-                if not path.is_symlink():
-                    shutil.chown(path, account, account)
+                os.chown(path, owner.pw_uid, owner.pw_gid, follow_symlinks=False)
 
 
 def _say(text: str) -> None:

@@ -189,11 +189,11 @@ def find_broker(options: AddonOptions, supervisor: str, token: str) -> AddonBrok
                 error
             )
         raise BrokerError(
-            f"the Supervisor does not tell its MQTT broker (status {error.code})"
+            f"the Supervisor does not name its MQTT broker (status {error.code})"
         ) from error
     except (OSError, HTTPException, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = printable(str(getattr(error, "reason", None) or error))
-        raise BrokerError(f"the Supervisor does not tell its MQTT broker ({reason})") from error
+        raise BrokerError(f"the Supervisor does not name its MQTT broker ({reason})") from error
 
 
 def write_configuration(
