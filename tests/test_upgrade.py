@@ -154,6 +154,7 @@ def test_a_bridge_goes_on_with_its_totals_and_tells_nobody_twice(broker):
         with following("2026-03-01T23:20:00", broker.port) as bridge:
             wait_for(lambda: not_told, what=lambda: bridge.said)
             wait_for(lambda: not bridge.state.names("outbox/"))
+            wait_for(figures.exists)
             wait_for(lambda: "hearthlog_events_total{" in figures.read_text())
             families = list(text_string_to_metric_families(figures.read_text()))
     assert told == []
