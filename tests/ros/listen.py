@@ -43,7 +43,9 @@ def main():
         node.create_subscription(
             getattr(import_module(f"{package}.{kind}"), message), topic, take, profile, raw=True
         )
-    while not [name for name in node.get_node_names() if name.startswith("hearthlog")]:
+    is_labelled = any(topic.endswith("label_info") for topic in names[::2])
+    awaited = "hearthlog_label" if is_labelled else "hearthlog"  # else the first frames pass it by
+    while not [name for name in node.get_node_names() if name.startswith(awaited)]:
         time.sleep(0.1)
     time.sleep(1.0)  # all that is there of it
     print("listening", flush=True)
