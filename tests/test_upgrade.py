@@ -81,7 +81,7 @@ def home(version, tmp_path, monkeypatch) -> Path:
 
 @pytest.fixture
 def run(capfd):
-    """Run a command that must do what it is asked; return what came of it."""
+    """Run a command that must succeed; return its result."""
 
     def run(*arguments: object) -> Result:
         done = run_here(capfd, *arguments)
@@ -107,8 +107,8 @@ def contents(folder: Path) -> dict[str, tuple[str, int]]:
 def test_all_of_a_home_is_read_and_nothing_is_written_anew(home, run):
     before = contents(home)
     for arguments in [*READING, *(READING_OF_HOMES if CONFIGURATION.exists() else [])]:
-        said = run(*arguments).stderr
-        assert not re.search("damaged|newer|cannot|version", said), (arguments, said)
+        warnings = run(*arguments).stderr
+        assert not re.search("damaged|newer|cannot|version", warnings), (arguments, warnings)
         assert contents(home) == before, arguments
 
 
@@ -145,21 +145,21 @@ def test_names_of_recurring_sounds_and_earlier_champions_are_known(run):
 
 @of_every_home
 @pytest.mark.usefixtures("home")
-def test_a_bridge_goes_on_with_its_totals_and_tells_nobody_twice(broker):
+def test_a_bridge_goes_on_with_its_totals_and_delivers_no_alert_twice(broker):
     before, token = entries(Path("bridge")), Path("bridge/page-token").read_text()
     (waiting,) = (json.loads(before[name]) for name in before if name.startswith("outbox/"))
     figures = Path("home.prom")
-    with server() as (one, told), server() as (two, not_told):
+    with server() as (one, delivered), server() as (two, waiting_target):
         write_secrets(one, two)
         with following("2026-03-01T23:20:00", broker.port) as bridge:
-            wait_for(lambda: not_told, what=lambda: bridge.said)
+            wait_for(lambda: waiting_target, what=lambda: bridge.said)
             wait_for(lambda: not bridge.state.names("outbox/"))
             wait_for(figures.exists)
             wait_for(lambda: "hearthlog_events_total{" in figures.read_text())
             families = list(text_string_to_metric_families(figures.read_text()))
-    assert told == []
-    assert len(not_told) == 1
-    assert waiting["text"] in not_told[0]
+    assert delivered == []
+    assert len(waiting_target) == 1
+    assert waiting["text"] in waiting_target[0]
     samples = (sample for family in families for sample in family.samples)
     totals = [
         [each.labels["microphone"], each.labels["label"], each.value]

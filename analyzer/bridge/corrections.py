@@ -144,6 +144,11 @@ class EventCorrections:
         self._reading = threading.Thread(target=read, daemon=True, name="corrections")
         self._reading.start()
 
+    def wait(self, seconds: float) -> None:
+        """Wait until the reading that `refresh` began has ended, at most so long."""
+        if self._reading is not None:
+            self._reading.join(seconds)
+
     def read_back(self) -> None:
         """Read the marks in the review layers of the newest logs, if a layer has changed.
 

@@ -515,6 +515,7 @@ _EVERY = {message_types.SEGMENT, message_types.GAP}  # types whose old messages 
 _LATEST = 60 * NANOSECONDS  # older labels and diagnostics have no effect on the state
 _WAIT_SECONDS = 1.0
 _TICK_SECONDS = 0.5
+_REVIEWS_SECONDS = 10.0  # longest wait for the reviews of the newest logs at the start
 
 
 def follow_home(
@@ -559,6 +560,8 @@ def follow_home(
                 state.sources, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
                 state.corrections.refresh(say)
+                if not state.caught_up:  # no count is published that a review would change
+                    state.corrections.wait(_REVIEWS_SECONDS)
                 _hide(state, home, say)
                 state.caught_up = True
                 yielded = time.monotonic()
