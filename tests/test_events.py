@@ -137,6 +137,24 @@ def test_a_review_corrects_what_is_listed(home, hearthlog):
     ]
 
 
+def test_a_class_that_only_people_marked_is_listed_apart_from_the_counts(home, hearthlog):
+    (log,) = [
+        path for path in find_logs(home) if not is_layer(path) and "home_20260302T09" in path.name
+    ]
+    begin = midnight(DAY) + int(at("09:30")) * NANOSECONDS
+    for start in (begin, begin + 60 * NANOSECONDS):
+        write_marks(log, [Mark("kitchen", start, start + 2 * NANOSECONDS, "doorbell")])
+    bells = found(hearthlog, home, "--day", DAY, "--label", "Doorbell")
+    assert [event["start"][11:16] for event in bells["events"]] == ["10:30", "10:31"]
+    assert (bells["counts"], bells["marked"]) == ({}, {"doorbell": 2})
+    day = found(hearthlog, home, "--day", DAY)
+    assert day["marked"] == {"doorbell": 2}
+    assert "doorbell" not in day["counts"]
+    lines = hearthlog("events", home, "--day", DAY).stdout.splitlines()
+    words = "only what people marked: the model does not know it"
+    assert lines[-1] == f"Doorbell on Monday, 2026-03-02: 2, {words}"
+
+
 def test_a_cough_from_the_television_is_counted_no_more(home, hearthlog):
     (log,) = [
         path for path in find_logs(home) if not is_layer(path) and "home_20260302T02" in path.name
@@ -158,7 +176,7 @@ def test_a_sound_that_two_rooms_hear_is_one_and_names_both(home, hearthlog):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--label", "cugh"], "the model of these logs knows no 'cugh'; it knows "),
+        (["--label", "cugh"], "no class 'cugh' in these logs; there is coughing"),
         (["--day", "2026-04-01"], "no logs of 2026-04-01"),
         (["--day", "soon"], "--day soon: not a day such as 2026-03-01"),
         (["--labels", "none"], "no labelling 'none' beside these logs"),

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from datetime import date, tzinfo
 from functools import reduce
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +22,11 @@ from hearthlog.analyzer.logs.spans import (
     lengths,
     rows_at,
 )
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import SILENCE, TELEVISION, UNKNOWN, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 
+_NO_EVENTS = {SILENCE, TELEVISION, UNKNOWN}
 _BEFORE = 3600 * NANOSECONDS  # an event that goes on at midnight, and a television, begin earlier
 
 
@@ -84,6 +86,16 @@ def read_day_totals(logs: HomeLogs, day: date, zone: tzinfo) -> dict[str, EventT
     start, end = day_span(day, zone)
     data = read_home(logs, LIVE, start - _BEFORE, (start, end))
     return event_totals(whole_home(data), start, end)
+
+
+def marked_classes(data: HomeData) -> list[str]:
+    """Return the classes that have marks of people only, because the model does not know them.
+
+    A report has no row for them, because they are not complete.
+    """
+    marked = {name for own in data.segments.values() for name in np.unique(own.labels).tolist()}
+    labelled = set(chain.from_iterable(data.classes.values()))
+    return ordered(marked - labelled - data.never_told - _NO_EVENTS)
 
 
 def home_events(

@@ -78,7 +78,7 @@ def events(
         wrong_use("--play and --json exclude each other")
     from hearthlog.analyzer.activity.daily_metrics import whole_home
     from hearthlog.analyzer.activity.home_data import read_home
-    from hearthlog.analyzer.activity.home_events import event_totals, home_events
+    from hearthlog.analyzer.activity.home_events import event_totals, home_events, marked_classes
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone, midnight
 
@@ -89,9 +89,11 @@ def events(
     with share_done("reading the labels") as progress:
         data = read_home(home_logs, labels, before, span[:2], progress)
     metrics = whole_home(data)
-    classes = _chosen_classes(metrics.classes, label or (), data.never_told)
+    marked = marked_classes(data)
+    classes = _chosen_classes([*metrics.classes, *marked], label or (), data.never_told)
     found = home_events(data, metrics, classes, *span[:2])
-    missing = _not_listened(metrics, classes, span, every=bool(label))
+    labelled = [name for name in classes if name not in marked] or metrics.classes
+    missing = _not_listened(metrics, labelled, span, every=bool(label))
     if as_json:
         print_json(
             {
@@ -109,10 +111,15 @@ def events(
                     for name, total in event_totals(metrics, *span[:2]).items()
                     if name in classes
                 },
+                "marked": {
+                    name: sum(event.label == name for event in found)
+                    for name in classes
+                    if name in marked
+                },
             }
         )
     else:
-        _print(found, span, classes, missing, zone)
+        _print(found, span, classes, marked, missing, zone)
     if play:
         _play(found, home_logs, zone)
     end_with_warnings(data.losses)
@@ -191,8 +198,8 @@ def _chosen_classes(
         if len(meant) != 1:
             there = ", ".join(in_words(name).lower() for name in sounds)
             raise DataError(
-                f"the model of these logs knows no {label[:64]!r}; it knows {there}. Another model "
-                "may: `hearthlog models list`, then `hearthlog relabel`"
+                f"no class {label[:64]!r} in these logs; there is {there}. Another model may know "
+                "it: `hearthlog models list`, then `hearthlog relabel`"
             )
         chosen += meant
     return list(dict.fromkeys(chosen))
@@ -230,6 +237,7 @@ def _print(
     found: Sequence["HomeEvent"],
     span: ListedSpan,
     classes: Sequence[str],
+    marked: Collection[str],
     missing: "Spans",
     zone: tzinfo,
 ) -> None:
@@ -274,7 +282,8 @@ def _print(
             continue
         apart = sum(event.television for event in own)
         beside = f", and {apart} while something like a television sounded" if apart else ""
-        print(f"{in_words(name)} {span.words}: {len(own) - apart or 'none'}{beside}")
+        by_hand = ", only what people marked: the model does not know it" * (name in marked)
+        print(f"{in_words(name)} {span.words}: {len(own) - apart or 'none'}{beside}{by_hand}")
     pauses = [
         f"{local_time(start, zone):{form[:-3]}} to {local_time(end, zone):{form[:-3]}}"
         for start, end in zip(missing.starts.tolist(), missing.ends.tolist(), strict=True)
