@@ -56,6 +56,12 @@ def same_time(monkeypatch):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", EPOCH["SOURCE_DATE_EPOCH"])
 
 
+# What works on files, processes and machines, whatever the sounds and the labels are.
+of_one_kind = pytest.mark.parametrize(
+    ("sounds", "model"), [("real household", "smoothed")], indirect=True
+)
+
+
 @pytest.fixture(scope="module", params=["merged", "smoothed"])
 def model(request, model_file, hmm_file):
     return model_file if request.param == "merged" else hmm_file
@@ -124,6 +130,7 @@ def test_the_model_of_the_recording_says_the_same_again(model, logs):
         assert anew.metadata.get("probabilities_names") == live.metadata.get("probabilities_names")
 
 
+@of_one_kind
 def test_the_logs_are_not_touched(recording, model, logs):
     relabelled(model, logs)
     for log in recorded_logs(recording):
@@ -173,6 +180,7 @@ def test_logs_that_come_late_change_what_was_open_in_all_behind_them(model, nigh
     assert written(late) == written(whole)
 
 
+@of_one_kind
 def test_what_is_there_is_left_alone(model, logs, layers):
     relabelled(model, logs)
     times = {path: path.stat().st_mtime_ns for path in find_logs(logs)}
@@ -228,6 +236,7 @@ def test_layers_stay_when_logs_beside_theirs_are_deleted(model, logs, layers):
     assert written(logs) == kept
 
 
+@of_one_kind
 def test_a_run_that_is_killed_goes_on_where_it_was(model, logs, layers):
     command = [*HEARTHLOG, "relabel", str(logs), "--model", str(model), "--workers", "2"]
     for _ in range(3):
@@ -262,6 +271,7 @@ def opened(process):
         return []
 
 
+@of_one_kind
 def test_two_runs_at_once_do_not_hinder_each_other(model, logs, layers):
     with ThreadPoolExecutor(2) as pool:
         both = list(pool.map(lambda _: relabelled(model, logs, workers=2), range(2)))
@@ -269,6 +279,7 @@ def test_two_runs_at_once_do_not_hinder_each_other(model, logs, layers):
     assert written(logs) == layers
 
 
+@of_one_kind
 def test_a_layer_says_what_made_it(model, logs):
     relabelled(model, logs)
     log, behind = recorded_logs(logs)[:2]
@@ -363,6 +374,7 @@ def frames_of_layer(log, model):
     return columns["frame"].astype(np.int64)
 
 
+@of_one_kind
 @pytest.mark.parametrize("place", [-1, 1])
 def test_logs_behind_a_damaged_one_do_not_depend_on_how_they_are_done(model, logs, place, tmp_path):
     log = recorded_logs(logs)[0]
@@ -388,6 +400,7 @@ def test_a_log_that_is_cut_off_is_labelled_up_to_there(model, logs, capfd):
     assert len(frames_of_layer(log, model)) > 200
 
 
+@of_one_kind
 def test_a_log_that_is_being_written_is_left_for_later(model, logs, capfd):
     *_, last = recorded_logs(logs)
     last.rename(last.with_name(last.name + ".active"))
@@ -396,6 +409,7 @@ def test_a_log_that_is_being_written_is_left_for_later(model, logs, capfd):
     assert "1 log still being written" in done.stdout
 
 
+@of_one_kind
 def test_one_that_is_no_log_costs_nothing_else(model, logs, layers, capfd):
     bad = recorded_logs(logs)[0].with_name("note.mcap")
     bad.write_bytes(b"this is no log" * 100)
@@ -406,6 +420,7 @@ def test_one_that_is_no_log_costs_nothing_else(model, logs, layers, capfd):
     assert set(written(logs)) == set(layers)
 
 
+@of_one_kind
 def test_a_layer_of_another_model_of_that_name_is_kept(model, logs, tmp_path, capfd):
     relabelled(model, logs)
     before = written(logs)
@@ -419,6 +434,7 @@ def test_a_layer_of_another_model_of_that_name_is_kept(model, logs, tmp_path, ca
     assert written(logs) == before
 
 
+@of_one_kind
 def test_a_layer_of_another_log_of_that_name_is_kept(model, logs, capfd):
     first, second = recorded_logs(logs)[:2]
     relabelled(model, first)
@@ -430,6 +446,7 @@ def test_a_layer_of_another_log_of_that_name_is_kept(model, logs, capfd):
     assert written(logs) == before
 
 
+@of_one_kind
 def test_what_is_no_layer_is_kept(model, logs, capfd):
     log = recorded_logs(logs)[0]
     layer = relabel_path(log, load_model(model).name)
@@ -441,6 +458,7 @@ def test_what_is_no_layer_is_kept(model, logs, capfd):
     assert layer.read_bytes() == data
 
 
+@of_one_kind
 def test_a_layer_is_no_log_to_label(model, logs, capfd):
     relabelled(model, logs)
     layer = relabel_path(recorded_logs(logs)[0], load_model(model).name)
@@ -449,6 +467,7 @@ def test_a_layer_is_no_log_to_label(model, logs, capfd):
     assert done.stderr.endswith(f"{layer}: is a layer; name the log that it speaks of\n")
 
 
+@of_one_kind
 def test_where_a_layer_cannot_be_made_those_behind_it_are_as_ever(model, logs, night):
     name = load_model(model).name
     for folder in (logs, Path(shutil.copytree(night, logs.parent / "night"))):
@@ -461,6 +480,7 @@ def test_where_a_layer_cannot_be_made_those_behind_it_are_as_ever(model, logs, n
         assert written(folder) == written(whole) | {bad.name: b"no layer"}
 
 
+@of_one_kind
 def test_logs_follow_each_other_by_name_or_else_by_time(recording, tmp_path):
     first, second = recorded_logs(recording)[:2]
     shutil.copy(first, tmp_path / "b.mcap")
@@ -469,6 +489,7 @@ def test_logs_follow_each_other_by_name_or_else_by_time(recording, tmp_path):
     assert ([path.name for path in chain.logs], list(chain.asked)) == (["b.mcap", "a.mcap"], [1])
 
 
+@of_one_kind
 def test_homes_are_apart_and_so_are_folders_that_only_look_like_days(recording, tmp_path):
     log = recorded_logs(recording)[0]
     places = ["anna/2026/03/01", "anna/2026/03/02", "berta/2026/03/01", "anna/20/3/1", "anna"]
@@ -576,6 +597,7 @@ def test_a_microphone_of_other_features_is_left_out_and_named(model, day, tmp_pa
     assert {topic.split("/")[1] for topic in topics} == {"bath"}
 
 
+@of_one_kind
 def test_logs_without_features_are_named(model, tmp_path, recording, capfd):
     log = recorded_logs(recording)[0]
     done = run(capfd, "cut", log, "-o", tmp_path / "cut.mcap", "--topics", "/mic/segment")
@@ -586,6 +608,7 @@ def test_logs_without_features_are_named(model, tmp_path, recording, capfd):
     assert written(tmp_path) == {}
 
 
+@of_one_kind
 def test_a_log_that_cannot_be_labelled_costs_nothing_but_its_own_layer(
     model, logs, layers, tmp_path, capfd
 ):
@@ -623,6 +646,7 @@ def test_a_log_that_kills_its_worker_costs_nothing_but_its_own_layer(model, nigh
     assert written(logs) == {k: v for k, v in written(whole).items() if k != layer}
 
 
+@of_one_kind
 def test_a_full_disk_leaves_nothing_half_written(model, recording, tmp_path, capfd):
     with small_disk(tmp_path / "disk", "3m") as disk:
         for log in recorded_logs(recording)[:3]:
@@ -636,6 +660,7 @@ def test_a_full_disk_leaves_nothing_half_written(model, recording, tmp_path, cap
         assert sorted(p.name for p in disk.iterdir() if "relabel" in p.name) == []
 
 
+@of_one_kind
 def test_logs_of_two_nodes_in_one_folder_are_two_sounds(model, logs, layers):
     for log in recorded_logs(logs):
         shutil.copy(log, log.with_name(log.name.replace("home_", "attic_")))
@@ -651,6 +676,7 @@ def test_no_logs_are_one_line(model, tmp_path, capfd):
     assert f"{tmp_path}: no log" in done.stderr
 
 
+@of_one_kind
 @pytest.mark.parametrize("store", ["bucket", "in_memory"])
 def test_logs_in_a_store_are_relabelled_where_they_are(request, recording, model, layers, store):
     folder = put(recording, request.getfixturevalue(store))
@@ -663,6 +689,7 @@ def test_logs_in_a_store_are_relabelled_where_they_are(request, recording, model
     assert (len(again.current), again.failed) == (len(layers), {})
 
 
+@of_one_kind
 def test_workers_find_logs_and_the_model_in_a_store(recording, model, layers, bucket, hearthlog):
     folder = put(recording, bucket)
     there = folder / "models" / model.name
@@ -680,6 +707,7 @@ def scheduler(tmp_path_factory):
         yield address
 
 
+@of_one_kind
 def test_a_cluster_gives_the_same_bytes(model, logs, layers, scheduler, hearthlog):
     done = hearthlog("relabel", logs, "--model", model, "--scheduler", scheduler, env=EPOCH)
     assert done.returncode == 0, done.stderr
@@ -694,6 +722,7 @@ def drop_made(layers):
     }
 
 
+@of_one_kind
 def test_a_scheduler_that_is_not_there_is_one_line(model, logs, hearthlog):
     done = hearthlog("relabel", logs, "--model", model, "--scheduler", "tcp://127.0.0.1:9")
     assert done.returncode == 1
@@ -703,6 +732,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(model, logs, hearthlog):
     assert written(logs) == {}
 
 
+@of_one_kind
 def test_after_the_scheduler_went_away_a_run_completes_what_is_left(model, logs, layers, tmp_path):
     with scheduler_in(tmp_path) as (address, scheduler), worker_of(address):
         command = [*HEARTHLOG, "relabel", str(logs), "--model", str(model), "--scheduler", address]
