@@ -294,7 +294,8 @@ def kept_of_people_not_learned_from(all_household, tmp_path_factory):
     scenario = load_scenario("general")
     clips = read_manifest(all_household / "manifest.csv", scenario.labels)
     unseen = "devi-harikaa/scream-detector-project"
-    data = build_dataset([c for c in clips if c.source != unseen], scenario, lambda *_: None)
+    others = [clip for clip in clips if clip.source != unseen]
+    data = build_dataset(others[::4], scenario, lambda *_: None)
     model = tmp_path / "model.safetensors"
     save_model(train_model(data, scenario, lambda *_: None), model)
     share = {}

@@ -193,11 +193,13 @@ def test_a_segment_without_copies_is_learned_from_as_it_is(tmp_path):
 
 @pytest.fixture(scope="module")
 def household_model(all_household):
-    """A model of all clips of silence, and of a fifth of the others."""
+    """A model of a fifth of the clips of silence, and of about six of each other class."""
     scenario = load_scenario("general")
     clips = read_manifest(all_household / "manifest.csv", scenario.labels)
-    others = [clip for clip in clips if clip.label != "silence"]
-    chosen = [clip for clip in clips if clip.label == "silence"] + others[::5]
+    by_label = {label: [c for c in clips if c.label == label] for label in scenario.labels}
+    chosen = by_label.pop("silence")[::5]
+    for own in by_label.values():
+        chosen += own[:: max(len(own) // 6, 1)]
     data = build_dataset(chosen, scenario, ignore_progress, rooms=ROOM.rooms)
     return train_model(data, scenario, ignore_progress, ROOM)
 
