@@ -292,7 +292,7 @@ def home(tmp_path_factory):
 
 
 def make_home(folder):
-    write_training_set(folder / "clips", clips_per_class=5, seed=1)
+    write_training_set(folder / "clips", clips_per_class=3, seed=1)
     rows = (folder / "clips" / "manifest.csv").read_text()
     (folder / "clips" / "test.csv").write_text(rows)
     head, *lines = rows.splitlines()
