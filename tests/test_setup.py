@@ -6,6 +6,7 @@ import re
 import select
 import socket
 import subprocess
+import termios
 import time
 import tomllib
 from contextlib import contextmanager, suppress
@@ -13,6 +14,7 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 from conftest import FRESH_HEARTHLOG
+from spliced import small_disk
 from systemd import PREFIX, PROGRAM
 from test_service import LOGS, UNIT, machine, service, wait_for_labels
 
@@ -60,6 +62,9 @@ class Terminal:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(timeout=5)
 
+    def settings(self):
+        return termios.tcgetattr(self._screen)
+
     def end(self):
         """Return the exit status, and all that was shown until then."""
         shown = self.shown
@@ -89,18 +94,22 @@ def dialogue(folder, env, *options):
         os.close(screen)
 
 
-QUESTIONS = (
-    "Number, or several",
-    "Room of nullsink",
-    "Name of the home",
-    "Time zone of the home",
-    "Keep sound?",
-    "Download the network yamnet",
-    "Serve a page",
-    "MQTT broker",
-    "Send alerts",
-    "Do this",
-)
+QUESTIONS = {  # all of them, and answers that lead to the next
+    "Number, or several": "1",
+    "Room of nullsink": "",
+    "Name of the home": "",
+    "Time zone of the home": "",
+    "Keep sound?": "",
+    "Download the network yamnet": "",
+    "Serve a page": "y",
+    "Publish to": "y",
+    "Broker, such as": "broker.lan",
+    "User at the broker": "anna",
+    "Password (not shown)": "secret",
+    "Send alerts": "y",
+    "Address for alerts": "json://127.0.0.1:9",
+    "Do this": "",
+}
 
 
 @pytest.fixture
@@ -157,18 +166,23 @@ def test_a_clap_moves_the_bar_and_the_answers_are_written(home, pulse_microphone
     assert [path for path in folder.rglob("*") if path.stat().st_mode & 0o077] == []
 
 
-@pytest.mark.parametrize("last", [0, 2, 4, 9])
+@pytest.mark.parametrize("last", QUESTIONS)
 def test_ctrl_c_at_any_question_leaves_nothing_changed(home, last):
     folder, env = home
     with dialogue(folder, env, "--no-service", "--config", "home.toml") as seen:
-        for place, question in enumerate(QUESTIONS[:last]):
+        before = seen.settings()
+        for question, answer in QUESTIONS.items():
             seen.expect(question)
+            if question == last:
+                break
             seen.expect(": ")
-            seen.type("\n" if place else "1\n")
-        seen.expect(QUESTIONS[last])
+            seen.type(f"{answer}\n")
         seen.interrupt()
+        assert seen.settings() == before  # what is typed is shown again
         status, shown = seen.end()
-    assert (status, "nothing was changed" in shown) == (130, True), shown
+    lines = [line for line in shown.splitlines() if line.startswith("hearthlog:")]
+    assert (status, lines) == (130, ["hearthlog: nothing was changed"]), shown
+    assert "Traceback" not in shown
     assert list(folder.iterdir()) == []
 
 
@@ -321,6 +335,26 @@ def test_a_full_disk_is_refused_with_one_line(home):
     folder, env = home
     (folder / "home.toml").write_text('min_free_space = "900T"\n')
     assert "of the disk are free, and the recorder keeps" in refused(folder, env, *DEFAULTS)
+
+
+@pytest.mark.parametrize("pages", range(5))
+def test_a_disk_that_is_full_in_the_middle_keeps_the_configuration(home, pages):
+    folder, env = home
+    (folder / "password").write_text("secret\n")
+    before = 'node = "anna"\n' + "# a comment\n" * 400  # two pages of memory
+    with small_disk(folder / "disk", "64k") as disk:
+        config = disk / "home.toml"
+        config.write_text(before)
+        page = os.sysconf("SC_PAGE_SIZE")
+        (disk / "film").write_bytes(bytes((os.statvfs(disk).f_bavail - pages) * page))
+        line = refused(
+            folder, env, "--no-service", "--yes", "--config", str(config), "--node", "berta",
+            "--mqtt", "broker.lan", "--mqtt-user", "anna", "--mqtt-password-file", "password",
+        )  # fmt: skip
+        assert "No space left on device" in line
+        assert str(disk) in line
+        assert config.read_text() == before
+        assert sorted(path.name for path in disk.iterdir()) == ["film", "home.toml"]
 
 
 def test_a_configuration_that_cannot_be_used_is_taken_back(home):

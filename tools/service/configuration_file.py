@@ -253,8 +253,12 @@ def _copied(path: Path) -> Path | None:
         return None
     copy = path.with_name(f".{path.name}.before")
     copy.unlink(missing_ok=True)
-    copy.touch(0o600, exist_ok=False)
-    shutil.copy2(path, copy)
-    status = path.stat()
-    os.chown(copy, status.st_uid, status.st_gid)
+    try:
+        copy.touch(0o600, exist_ok=False)
+        shutil.copy2(path, copy)
+        status = path.stat()
+        os.chown(copy, status.st_uid, status.st_gid)
+    except BaseException:
+        copy.unlink(missing_ok=True)
+        raise
     return copy
