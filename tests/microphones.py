@@ -83,6 +83,10 @@ class LabMicrophone:
     def unplug(self):
         self._become("unplug")
 
+    def occupy(self):
+        """Let it be in use by another program; who has it keeps it."""
+        self._become("busy")
+
     def freeze(self):
         self._become("freeze")
 

@@ -304,6 +304,21 @@ def test_a_machine_without_microphones_is_refused_with_one_line(home):
     assert "no microphone found: connect one" in refused(folder, env, *DEFAULTS)
 
 
+def test_a_microphone_that_another_program_uses_is_refused_with_one_line(labmic, tmp_path):
+    labmic.beside("other")
+    labmic.occupy()
+    answers = (*DEFAULTS, "--microphone", "labmic=kitchen")
+    result = run(tmp_path, labmic.env, *answers)
+    assert result.returncode == 1
+    assert list(tmp_path.iterdir()) == []
+    assert result.stderr == (
+        "hearthlog: no microphone is called 'labmic'; there are 'other'; one that another program "
+        "uses is not listed, end that program\n"
+    )
+    labmic.restore()
+    assert run(tmp_path, labmic.env, *answers).returncode == 0
+
+
 def test_a_missing_microphone_names_what_uses_the_cards(tmp_path):
     for card, status in (
         ("card0", "closed\n"),

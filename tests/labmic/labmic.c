@@ -14,8 +14,9 @@
  *
  * Samples come in pieces of `burst` at once; by default as they are taken.
  *
- * The control file says "unplug" (the device is gone: -ENODEV) or "freeze" (it is there and
- * delivers nothing); absent or empty means normal. The environment variable LABMIC_PPM goes before
+ * The control file says "unplug" (the device is gone: -ENODEV), "busy" (another program has it: it
+ * cannot be opened, -EBUSY) or "freeze" (it is there and delivers nothing); absent or empty means
+ * normal. The environment variable LABMIC_PPM goes before
  * the field `ppm`.
  */
 #include <alsa/asoundlib.h>
@@ -34,7 +35,7 @@
 #define TICKS_PER_PERIOD 4
 #define LEAST_TICK 1000000LL /* nanoseconds */
 
-enum condition { NORMAL, UNPLUGGED, FROZEN };
+enum condition { NORMAL, UNPLUGGED, BUSY, FROZEN };
 
 struct settings {
     long rate;
@@ -70,7 +71,7 @@ static enum condition condition_of(const labmic_t *mic)
     close(file);
     if (length != 1)
         return NORMAL;
-    return first == 'u' ? UNPLUGGED : first == 'f' ? FROZEN : NORMAL;
+    return first == 'u' ? UNPLUGGED : first == 'b' ? BUSY : first == 'f' ? FROZEN : NORMAL;
 }
 
 /* long double: after months of uptime a double no longer tells neighbouring samples apart
@@ -331,6 +332,8 @@ SND_PCM_PLUGIN_DEFINE_FUNC(labmic)
         return -ENOMEM;
     if (condition_of(mic) == UNPLUGGED)
         error = -ENODEV;
+    else if (condition_of(mic) == BUSY)
+        error = -EBUSY;
     else if (settings.data && (error = load_data(mic, settings.data)) < 0)
         SNDERR("labmic: cannot read samples from %s", settings.data);
     if (error >= 0)

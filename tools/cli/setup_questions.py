@@ -88,12 +88,13 @@ class Installation:
         """Return whether a service runs now."""
         import subprocess
 
-        manager = ["systemctl", *(["--user"] if self.account is None else [])]
-        try:
-            done = subprocess.run([*manager, "is-active", "--quiet", name], check=False)  # noqa: S603
-        except OSError:
+        if not self.has_service or not self.unit(name).exists():
             return False
-        return self.has_service and self.unit(name).exists() and done.returncode == 0
+        manager = ["systemctl", *(["--user"] if self.account is None else [])]
+        done = subprocess.run(  # noqa: S603
+            [*manager, "is-active", "--quiet", name], stderr=subprocess.DEVNULL, check=False
+        )
+        return done.returncode == 0
 
 
 class Present:
@@ -139,14 +140,17 @@ def microphones_of(
 def _found(devices: "list[Device]", name: str) -> "Device":
     """Find a device; the error for a missing one names what uses the microphones."""
     from hearthlog.recorder.errors import DeviceError
-    from hearthlog.recorder.sources.capture import find_device
+    from hearthlog.recorder.sources.capture import closed_card, find_device
     from hearthlog.tools.cli.level_meter import users_of_microphones
 
     try:
         return find_device(devices, name)
     except DeviceError as error:
-        users = "".join(f"; {each}, end that program" for each in users_of_microphones())
-        raise DeviceError(f"{error}{users}") from error
+        users = users_of_microphones()
+        if not users and not closed_card():
+            users = ["one that another program uses is not listed"]
+        hints = "".join(f"; {each}, end that program" for each in users)
+        raise DeviceError(f"{error}{hints}") from error
 
 
 def _device_and_room(text: str) -> tuple[str, str]:
