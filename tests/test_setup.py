@@ -16,7 +16,7 @@ import pytest
 from conftest import FRESH_HEARTHLOG
 from spliced import small_disk
 from systemd import PREFIX, PROGRAM
-from test_service import LOGS, UNIT, machine, service, wait_for_labels
+from test_service import LOGS, UNIT, USER_ID, machine, service, wait_for_labels
 
 from hearthlog.analyzer.http import free_port
 from hearthlog.tools.cli.level_meter import users_of_microphones
@@ -420,6 +420,23 @@ def test_root_sets_up_a_service_that_records(unset):
     assert "-[bridge.page]" in result.stderr
     assert unset.shows("MainPID") not in {before, "0"}
     assert unset.shows("ActiveState", unit="hearthlog-bridge") == "inactive"
+
+
+def test_a_user_sets_up_a_service_that_records_in_the_current_folder(unset):
+    unset.run("systemctl", "start", f"user@{USER_ID}")
+    env = {"XDG_RUNTIME_DIR": f"/run/user/{USER_ID}", "HOME": "/home/anna"}
+    how = {"user": "anna", "env": env, "seconds": 300}
+    command = f"{PROGRAM} setup --yes --microphone labmic=kitchen"
+    result = unset.run("sh", "-c", f"mkdir ~/hearing && cd ~/hearing && {command}", **how)
+    assert "/home/anna/hearing/logs: the labels of kitchen arrive\n" in result.stdout
+    assert "loginctl enable-linger" in result.stderr
+    result = unset.run("sh", "-c", f"cd && {command}", check=False, **how)
+    assert result.stderr.endswith(
+        "records in /home/anna/hearing; run `hearthlog setup` in that folder\n"
+    )
+    assert unset.run("ls", "/home/anna").stdout == "hearing\n"
+    unset.run("systemctl", "--user", "disable", "--now", "hearthlog", **how)
+    unset.run("rm", "-r", "/home/anna/hearing", "/home/anna/.config/systemd")
 
 
 def test_a_service_of_another_installation_is_left_alone(unset):
