@@ -38,6 +38,7 @@ KEYS = {
     **dict.fromkeys(("options", "schema"), dict),
     **dict.fromkeys(("timeout", "ingress_port"), int),
     "version": str,
+    "homeassistant": re.compile(r"20\d\d\.\d{1,2}\.\d+"),
     "startup": re.compile("initialize|system|services|application|once"),
     "stage": re.compile("stable|experimental|deprecated"),
     "backup": re.compile("hot|cold"),
@@ -77,6 +78,7 @@ def test_the_supervisor_knows_every_key_and_type():
     assert all(re.fullmatch("(mqtt|mysql):(provide|want|need)", each) for each in addon["services"])
     assert all(map(ELEMENT.fullmatch, elements(addon["schema"])))
     assert addon["version"] == __version__
+    assert [int(part) for part in addon["homeassistant"].split(".")] >= [2026, 3]  # test_ingress.py
     assert read("repository.yaml").keys() <= {"name", "url", "maintainer"}
 
 
@@ -104,7 +106,7 @@ class Supervisor(ThreadingHTTPServer):
     def __init__(self):
         super().__init__(("127.0.0.1", 0), _Answers)
         self.broker = None
-        self.asked = []
+        self.paths = []
 
     @property
     def address(self):
@@ -113,7 +115,7 @@ class Supervisor(ThreadingHTTPServer):
 
 class _Answers(BaseHTTPRequestHandler):
     def do_GET(self):
-        self.server.asked.append(self.path)
+        self.server.paths.append(self.path)
         broker, status = self.server.broker, 200
         answer = {"result": "ok", "data": broker}
         if self.headers["Authorization"] != f"Bearer {TOKEN}":
@@ -150,7 +152,7 @@ class Addon:
         env = {**os.environ, "TZ": "Europe/Vienna", "SUPERVISOR_TOKEN": TOKEN, **(env or {})}
         env.pop("HEARTHLOG_MODEL", None)
         self._env = env
-        self._said = place / "said"
+        self._log = place / "log"
 
     def set(self, **options):
         content = read("config.yaml")["options"] | options
@@ -172,22 +174,22 @@ class Addon:
 
     @contextmanager
     def running(self):
-        with self._said.open("wb") as said:
+        with self._log.open("wb") as log:
             command = [*DIES_WITH_PARENT, *self.command()]
-            self.process = subprocess.Popen(command, env=self._env, stdout=said, stderr=said)
+            self.process = subprocess.Popen(command, env=self._env, stdout=log, stderr=log)
         try:
             yield
             self.process.terminate()
-            assert self.process.wait(timeout=60) == 0, self.said()
+            assert self.process.wait(timeout=60) == 0, self.log()
         finally:
             self.process.kill()
             self.process.wait()
 
-    def said(self):
-        return self._said.read_text()
+    def log(self):
+        return self._log.read_text()
 
-    def says(self, text):
-        wait_for(lambda: text in self.said(), 60, self.said)
+    def wait_for_line(self, text):
+        wait_for(lambda: text in self.log(), 60, self.log)
 
     def child(self, verb):
         """Return the process of a service, or 0."""
@@ -252,7 +254,7 @@ def test_options_and_a_file_of_further_keys_make_a_configuration(
     own = 'quiet_hours = ["22:00-07:00"]\n[[bridge.alert]]\nname = "a"\nrule = "recorder_silent"\n'
     addon.folders.own_keys.write_text(own)
     with addon.running():
-        wait_for((addon.folders.share / "hearthlog/logs").exists, 30, addon.said)
+        wait_for((addon.folders.share / "hearthlog/logs").exists, 30, addon.log)
     found = addon.configuration()
     own = tomllib.loads(own)
     assert found["quiet_hours"] == own["quiet_hours"]
@@ -288,8 +290,8 @@ def test_a_wrong_key_of_the_own_file_is_named_with_its_line(tmp_path, supervisor
 def test_it_records_without_a_broker_and_publishes_when_one_comes(addon, supervisor, broker):
     addon.set(microphones=[{"room": "kitchen"}])
     with addon.running(), Listener(broker.port) as listener:
-        addon.says("there is no MQTT broker; install the add-on Mosquitto broker")
-        addon.says(f"the page of the home: port {addon.port}, for the ingress")
+        addon.wait_for_line("there is no MQTT broker; install the add-on Mosquitto broker")
+        addon.wait_for_line(f"the page of the home: port {addon.port}, for the ingress")
         for fields in ({}, {"X-Forwarded-For": "172.30.32.2", "X-Ingress-Path": "/x"}):
             request = urllib.request.Request(f"http://127.0.0.1:{addon.port}/", headers=fields)
             with pytest.raises(urllib.error.HTTPError, match="403"):
@@ -299,8 +301,8 @@ def test_it_records_without_a_broker_and_publishes_when_one_comes(addon, supervi
         listener.wait_for("hearthlog/home/kitchen/listening", "online")
         listener.wait_for("hearthlog/home/kitchen/heard")
         assert addon.child("record") == recorder
-        assert addon.said().count("there is no MQTT broker") == 1
-        assert {*supervisor.asked} == {"/services/mqtt"}
+        assert addon.log().count("there is no MQTT broker") == 1
+        assert {*supervisor.paths} == {"/services/mqtt"}
         environment = Path(f"/proc/{recorder}/environ").read_bytes()
         assert TOKEN.encode() not in environment
     assert [*addon.folders.data.rglob("*.mcap")]
@@ -335,9 +337,9 @@ def test_a_service_that_hangs_or_is_killed_is_started_again(tmp_path, monkeypatc
     service.end()
     service.wait(60)
     service.close()
-    said = capfd.readouterr().err.splitlines()
-    assert "hearthlog: the recorder hangs; ending it" in said
-    assert "hearthlog: the recorder ended with signal 9; starting it again" in said
+    lines = capfd.readouterr().err.splitlines()
+    assert "hearthlog: the recorder hangs; ending it" in lines
+    assert "hearthlog: the recorder ended with signal 9; starting it again" in lines
 
 
 def test_without_a_microphone_a_line_says_so_and_the_page_runs(tmp_path, supervisor):
@@ -346,5 +348,5 @@ def test_without_a_microphone_a_line_says_so_and_the_page_runs(tmp_path, supervi
     addon = Addon(tmp_path, supervisor, {"ALSA_CONFIG_PATH": str(silent)})
     addon.set()
     with addon.running():
-        addon.says("no microphone found")
-        addon.says("the page of the home")
+        addon.wait_for_line("no microphone found")
+        addon.wait_for_line("the page of the home")
