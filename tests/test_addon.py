@@ -208,8 +208,10 @@ def addon(tmp_path, supervisor, labmic):
 
 def refusal(addon, capfd):
     """Return the lines with which it ends before anything runs."""
-    with pytest.raises(SystemExit) as end:
-        addon_program.main(addon.options())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(addon_program.Addon, "run", lambda _: pytest.fail("it runs"))
+        with pytest.raises(SystemExit) as end:
+            addon_program.main(addon.options())
     assert end.value.code == 2
     return capfd.readouterr().err.splitlines()
 
