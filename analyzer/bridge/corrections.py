@@ -125,10 +125,15 @@ class EventCorrections:
         self._due = 0.0  # by CLOCK_MONOTONIC
         self._reading: threading.Thread | None = None
 
-    def refresh(self, say: Callable[[str], None]) -> None:
+    def refresh(self, say: Callable[[str], None], wait: float = 0.0) -> None:
         """Read marks made elsewhere, such as in a review, in a thread of its own.
 
         A call within a minute of the last reading does nothing.
+
+        Parameters
+        ----------
+        wait : float
+            Longest time to wait for the thread, in seconds.
         """
         is_reading = self._reading is not None and self._reading.is_alive()
         if is_reading or time.monotonic() < self._due:
@@ -143,11 +148,7 @@ class EventCorrections:
 
         self._reading = threading.Thread(target=read, daemon=True, name="corrections")
         self._reading.start()
-
-    def wait(self, seconds: float) -> None:
-        """Wait until the reading that `refresh` began has ended, at most so long."""
-        if self._reading is not None:
-            self._reading.join(seconds)
+        self._reading.join(wait)
 
     def read_back(self) -> None:
         """Read the marks in the review layers of the newest logs, if a layer has changed.

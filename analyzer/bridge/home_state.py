@@ -559,9 +559,8 @@ def follow_home(
             if current != described and (names := _labelling_sources(current)) is not None:
                 state.sources, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
-                state.corrections.refresh(say)
-                if not state.caught_up:  # no count is published that a review would change
-                    state.corrections.wait(_REVIEWS_SECONDS)
+                # No count is published first that a review would change.
+                state.corrections.refresh(say, 0.0 if state.caught_up else _REVIEWS_SECONDS)
                 _hide(state, home, say)
                 state.caught_up = True
                 yielded = time.monotonic()
