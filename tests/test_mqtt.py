@@ -300,6 +300,18 @@ def test_home_assistant_is_told_everything_again_when_it_starts(home, broker):
         assert {*listener.payloads(DISCOVERY)[1:]} <= {""}  # what it was told before is cleared
 
 
+def test_a_folder_without_a_log_is_waited_for_without_a_problem(tmp_path, broker):
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    with Listener(broker.port) as listener, Bridged(logs, broker) as bridged:
+        listener.wait_for(f"{ROOT}/bridge", "online")
+        home = LiveHome(logs)
+        home.hears("coughing")
+        listener.wait_for(f"{COUGHING}/on", "ON")
+        home.close()
+    assert bridged.said == []
+
+
 def test_a_folder_that_is_not_there_yet_is_waited_for(tmp_path, broker):
     with (
         Listener(broker.port) as listener,

@@ -559,9 +559,7 @@ def follow_home(
             if current != described and (names := _labelling_sources(current)) is not None:
                 state.sources, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
-                # No count is published first that a review would change.
-                state.corrections.refresh(say, 0.0 if state.caught_up else _REVIEWS_SECONDS)
-                _hide(state, home, say)
+                _renew(state, home, say, has_log=current != folder)
                 state.caught_up = True
                 yielded = time.monotonic()
                 yield state, [], []
@@ -575,6 +573,15 @@ def follow_home(
             yield state, *_push(state, path, batch, say)
         if stop.is_set():
             return
+
+
+def _renew(
+    state: HomeState, home: RecorderAddress, say: Callable[[str], None], *, has_log: bool
+) -> None:
+    """Read again what people have corrected and hidden; the first counts wait for it."""
+    if has_log:
+        state.corrections.refresh(say, 0.0 if state.caught_up else _REVIEWS_SECONDS)
+    _hide(state, home, say)
 
 
 def _hide(state: HomeState, home: RecorderAddress, say: Callable[[str], None]) -> None:
