@@ -19,7 +19,7 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECON
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.topics import topic
-from hearthlog.tools.lab.bench.labmic import DEVICE, SECOND_DEVICE, make_microphone
+from hearthlog.tools.lab.bench.labmic import DEVICES, make_microphone
 from hearthlog.tools.lab.bench.live import most_sounding, running, usage, wait_for_log
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.bench.timing import HEARTHLOG, BenchError
@@ -145,7 +145,7 @@ def _decisions(labels: Columns) -> NDArray[np.float64]:
 def _configuration(folder: Path, model: Path, port: int) -> str:
     microphones = [
         f'[[microphone]]\nname = "{name}"\ndevice = "{device}"\n'
-        for name, device in zip(_MICROPHONES, (DEVICE, SECOND_DEVICE), strict=True)
+        for name, device in zip(_MICROPHONES, DEVICES, strict=False)
     ]
     bridge = f'[bridge.mqtt]\nhost = "127.0.0.1"\nport = {port}\n'
     head = f'output = "{folder}/logs"\nmodel = "{model}"\ntimezone = "UTC"\n'

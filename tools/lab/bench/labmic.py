@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.lab.bench.timing import BenchError
 
-DEVICE, SECOND_DEVICE = "labmic", "second"
+TYPE = "labmic"
+DEVICES = TYPE, "second", "third", "fourth"
 _SOURCE = Path(__file__).resolve().parents[3] / "tests" / "labmic" / "labmic.c"
 _ALSA_CONFIGURATION = Path("/usr/share/alsa/alsa.conf")
 
@@ -23,7 +24,7 @@ def make_microphone(folder: Path, samples: NDArray[np.int16]) -> dict[str, str]:
     Returns
     -------
     dict of str to str
-        Environment of a process that shall see it, under the names `DEVICE` and `SECOND_DEVICE`.
+        Environment of a process that shall see it, under the names `DEVICES`.
 
     Raises
     ------
@@ -60,10 +61,10 @@ def make_microphone(folder: Path, samples: NDArray[np.int16]) -> dict[str, str]:
     configuration = folder / "asound.conf"
     configuration.write_text(
         f"<{_ALSA_CONFIGURATION}>\n"
-        f'pcm_type.{DEVICE} {{ lib "{plugin}" }}\n'
+        f'pcm_type.{TYPE} {{ lib "{plugin}" }}\n'
         + "".join(
-            f'pcm.{device} {{ type {DEVICE} rate {SAMPLE_RATE} data "{recording}" }}\n'
-            for device in (DEVICE, SECOND_DEVICE)
+            f'pcm.{device} {{ type {TYPE} rate {SAMPLE_RATE} data "{recording}" }}\n'
+            for device in DEVICES
         )
     )
     return {**os.environ, "ALSA_CONFIG_PATH": str(configuration)}

@@ -20,7 +20,7 @@ from hearthlog.models.starter import GENERAL, starter_file, with_network
 from hearthlog.recorder.labelling.embedder_probe import NO_NETWORK
 from hearthlog.recorder.sources import capture
 from hearthlog.schemas.frames import SAMPLE_RATE
-from hearthlog.tools.lab.bench.labmic import DEVICE, make_microphone
+from hearthlog.tools.lab.bench.labmic import DEVICES, make_microphone
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.bench.timing import HEARTHLOG, BenchError
 from hearthlog.tools.lab.bench.workload import Workload
@@ -93,7 +93,7 @@ def _live(work: Workload) -> list[Row]:
         recorders.append(_Recorder(_NETWORK, network, network=YAMNET.name))
     block = round(capture.BLOCK_SECONDS * SAMPLE_RATE)
     latency = capture.LATENCY_SECONDS
-    bare = [sys.executable, "-c", _BARE, DEVICE, SAMPLE_RATE, block, latency]
+    bare = [sys.executable, "-c", _BARE, DEVICES[0], SAMPLE_RATE, block, latency]
     with ExitStack() as stack:
         running_recorders = []
         for number, recorder in enumerate(recorders):
@@ -136,8 +136,8 @@ class _Recorder:
         config = logs.with_suffix(".toml")
         config.write_text(
             "".join(
-                f'[[microphone]]\nname = "mic{number}"\ndevice = "{DEVICE}"\n'
-                for number in range(self.microphones)
+                f'[[microphone]]\nname = "{device}"\ndevice = "{device}"\n'
+                for device in DEVICES[: self.microphones]
             )
         )
         files = ["--config", config, "--model", self.model, "--output", logs]
