@@ -16,7 +16,7 @@ demo: $(VENV)/.analyzer
 # SEED=7 tries other examples of what tests draw at random; without it they are the same every time.
 # Three at once, for many tests wait for sound.
 test: $(VENV)/.dev
-	$(BIN)/pytest -n 3 $(if $(SEED),--hypothesis-seed=$(SEED))
+	$(BIN)/pytest -n 3 --dist worksteal $(if $(SEED),--hypothesis-seed=$(SEED))
 
 # What developers measure with: a short form of each.
 test-lab: $(VENV)/.dev
