@@ -77,7 +77,7 @@ def hidden_address() -> str:
     return address
 
 
-def is_asked_in_digits(bind: str, host: str) -> bool:
+def is_numeric_host(bind: str, host: str) -> bool:
     """Whether the `Host` of a request is a numeric address of this machine or `localhost`.
 
     This blocks DNS rebinding: the owner of a host name can point the name at any address, so that

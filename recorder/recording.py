@@ -145,7 +145,7 @@ def recording_problems(settings: Settings) -> list[HearthlogError]:
 
     for device in (name for each in settings.microphone for name in (each.device, each.fallback)):
         check(partial(check_device, device))
-    sources = {each.name: _Unheard(each.device) for each in settings.microphone}
+    sources = {each.name: _NoSound(each.device) for each in settings.microphone}
     with ExitStack() as stack:
         for name in sources:
             check(partial(open_models, settings, [name], None, stack))
@@ -166,7 +166,7 @@ def _check_session(
 
 
 @dataclass
-class _Unheard:
+class _NoSound:
     """A source without events."""
 
     device: str

@@ -243,7 +243,7 @@ def test_what_was_switched_off_under_any_name_of_a_recorder_stays_off(tmp_path, 
     topics = RetainedTopics(first, pytest.fail)
     assert topics.muted() == ["coughing", "speech"]
     assert first.names("mqtt") == ["mqtt", "mqtt/attic"]  # until the next time it is saved
-    topics.switch("speech", is_told=True)
+    topics.switch("speech", is_published=True)
     topics.save()
     assert first.names("mqtt") == ["mqtt"]
     first.close()

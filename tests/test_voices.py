@@ -38,8 +38,8 @@ from hearthlog.analyzer.discover.voices import (
     merged_voices,
     same_voice,
     save_voices,
+    separate_voices,
     summed,
-    tell_apart,
     voice_space,
     window_starts,
 )
@@ -397,8 +397,8 @@ def test_a_few_words_of_nobody_else_go_to_who_else_speaks():
     where, _ = points(1, 2, 40)
     where[40:] = where[:40].mean(axis=0)
     where[60:64] += 12.0
-    assert tell_apart(where, 10).max() == 0
-    assert tell_apart(where, 2).max() == 1
+    assert separate_voices(where, 10).max() == 0
+    assert separate_voices(where, 2).max() == 1
 
 
 def test_a_louder_voice_is_the_same_voice(clips):

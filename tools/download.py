@@ -231,12 +231,12 @@ def _opened(url: str, have: int) -> Any:
         response = _opener().open(Request(url, headers=headers), timeout=_TIMEOUT_SECONDS)  # noqa: S310  its scheme was checked
     except HTTPError as error:
         error.close()
-        said = f"{error.code} {error.reason}"[:100]
+        answer = f"{error.code} {error.reason}"[:100]
         if error.code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and have:
             raise _StartOverError from error
         if error.code in _TRANSIENT:
-            raise _TransientError(f"the server says {said}") from error
-        raise DownloadError(f"{url}: is not there (the server says {printable(said)})") from error
+            raise _TransientError(f"the server says {answer}") from error
+        raise DownloadError(f"{url}: is not there (the server says {printable(answer)})") from error
     except (OSError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", error)
         if isinstance(reason, ssl.SSLCertVerificationError):

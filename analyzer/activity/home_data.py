@@ -288,8 +288,8 @@ def _name_classes(home: HomeData, entries: Iterable[HomeLog], labelling: str) ->
                 common = common_names_of(entry.path, own)
                 names[node, microphone] |= dict.fromkeys(common.get(n, n) for n in own)
     for source, segments in home.segments.items():
-        said = set(home.labelled[source].labels.tolist()) or set(segments.labels.tolist())
-        names[source] |= dict.fromkeys(sorted(said))
+        labels = set(home.labelled[source].labels.tolist()) or set(segments.labels.tolist())
+        names[source] |= dict.fromkeys(sorted(labels))
         classes = [class_name(name) for name in names[source] if CLASS_NAME.fullmatch(name)]
         home.classes[source] = list(dict.fromkeys(classes))[:MOST_CLASSES]
 

@@ -243,7 +243,7 @@ class SegmentCollector:
         covered.add(start, end, FRAME_NANOSECONDS)
         self._written.add(start, end, _PAUSE)  # a long segment has one message, at its end
         name = class_name(label)
-        if not _is_told(source, name):
+        if not _is_reported(source, name):
             return
         row = start, end, confidence, source_microphone(source)
         self._rows[name, is_of_scenario(source)].add(*row)
@@ -289,7 +289,7 @@ class SegmentCollector:
             written = union(written, span, pause=_PAUSE)
             coverage[source] = union(spans, span, pause=FRAME_NANOSECONDS)
             name = class_name(label)
-            if _is_told(source, name):
+            if _is_reported(source, name):
                 more, key = _Rows(), (name, is_of_scenario(source))
                 more.add(start, end, confidence, source_microphone(source))
                 sounds[key] = sounds_of([sounds.get(key, NO_SOUNDS), more.sounds()])
@@ -311,7 +311,7 @@ class SegmentCollector:
             own.forget_before(time)
 
 
-def _is_told(source: str, name: str) -> bool:
+def _is_reported(source: str, name: str) -> bool:
     """Whether a rule may apply to a class."""
     return name not in (OF_EVERY_SCENARIO if is_of_scenario(source) else {SILENCE})
 

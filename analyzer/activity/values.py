@@ -90,7 +90,7 @@ class Count(_Quantity):
     @staticmethod
     def show(number: float) -> str:
         """Format a number of events, rounded."""
-        return f"{whole(number)}"
+        return f"{rounded(number)}"
 
 
 def exactly(number: int) -> Count:
@@ -115,7 +115,7 @@ class Duration(_Quantity):
     @staticmethod
     def show(number: float) -> str:
         """Format a duration in minutes: `2 h 05 min`."""
-        hours, minutes = divmod(whole(number), 60)
+        hours, minutes = divmod(rounded(number), 60)
         if hours:
             return f"{hours} h {minutes:02} min"
         return "under 1 min" if not minutes and number > 0 else f"{minutes} min"
@@ -142,7 +142,7 @@ class Clock(_Quantity):
 Value = Count | Duration | Clock
 
 
-def whole(number: float) -> int:
+def rounded(number: float) -> int:
     """Round to a whole number, halves upwards: 2.5 is 3."""
     return math.floor(number + 0.5)
 
@@ -186,6 +186,6 @@ def compared(value: Value, baseline: UsualRange) -> int:
     int
         1: above the highest day, or later; -1: below the lowest, or earlier; 0: usual.
     """
-    if whole(value.middle) > whole(baseline.highest):
+    if rounded(value.middle) > rounded(baseline.highest):
         return 1
-    return -1 if whole(value.middle) < whole(baseline.lowest) else 0
+    return -1 if rounded(value.middle) < rounded(baseline.lowest) else 0

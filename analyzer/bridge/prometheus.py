@@ -20,7 +20,7 @@ from hearthlog.analyzer.bridge.output import News, Total, Totals
 from hearthlog.analyzer.bridge.secret_files import figures_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
-from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, is_asked_in_digits
+from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, is_numeric_host
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -141,7 +141,7 @@ class _Handler(HttpHandler):
         """Send the metrics."""
         server = cast(_Server, self.server)
         shown = self.headers.get("Authorization", "").encode("utf-8", "replace")
-        if not is_asked_in_digits(HOST, self.host) or "Origin" in self.headers:
+        if not is_numeric_host(HOST, self.host) or "Origin" in self.headers:
             self.send_text(
                 HTTPStatus.FORBIDDEN, "request it by IP address, and not from a web page"
             )

@@ -180,7 +180,7 @@ def room(microphone: str) -> str:
     return shortened(microphone.replace("_", " ").capitalize(), _LONGEST_NAME)
 
 
-def told(text: str) -> str:
+def one_line(text: str) -> str:
     """Return a text from a log on one line of limited length."""
     return shortened(" ".join(printable(text).split()), _LONGEST)
 

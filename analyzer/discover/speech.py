@@ -25,8 +25,8 @@ from hearthlog.analyzer.discover.voices import (
     no_evidence,
     recognised,
     same_voice,
+    separate_voices,
     summed,
-    tell_apart,
     voice_space,
     window_starts,
     with_new_voices,
@@ -388,7 +388,7 @@ def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, VoiceEviden
         Of each voice.
     """
     points = voice_space().points(describe_speech(values, names))
-    of = tell_apart(points, LEAST_WINDOWS)
+    of = separate_voices(points, LEAST_WINDOWS)
     return of, summed(points, of, int(of.max()) + 1)
 
 

@@ -148,7 +148,7 @@ def merged_voices(evidence: VoiceEvidence) -> Int64:
     return of.astype(np.int64)
 
 
-def tell_apart(points: Float64, least: int) -> Int64:
+def separate_voices(points: Float64, least: int) -> Int64:
     """Separate the voices of a conversation.
 
     Parameters

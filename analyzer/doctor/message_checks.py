@@ -220,10 +220,10 @@ class MessageChecks:
         """Report each problem in the recorder's diagnostics once."""
         for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
             for status in statuses:
-                said = f"{status['name']}: {status['message']}"
-                if status["level"] and said not in self._troubles:
-                    self._troubles.add(said)
-                    self._findings.warning("health", said, time=time)
+                trouble = f"{status['name']}: {status['message']}"
+                if status["level"] and trouble not in self._troubles:
+                    self._troubles.add(trouble)
+                    self._findings.warning("health", trouble, time=time)
 
     def _check_infos(self, columns: Columns, microphone: str) -> None:
         """Store the info of a microphone; a repeated info starts another recording."""

@@ -29,7 +29,7 @@ from hearthlog.analyzer.http import (
     hidden_address,
     host_name,
     ip_of,
-    is_asked_in_digits,
+    is_numeric_host,
 )
 from hearthlog.schemas.errors import HearthlogError
 
@@ -83,7 +83,7 @@ class Admission:
         """
         target, fields = _parse(head)
         origin = fields.get("origin")
-        if not is_asked_in_digits(self.bind, fields.get("host", "")):
+        if not is_numeric_host(self.bind, fields.get("host", "")):
             raise RefusedError("refused: the request used a host name; connect by IP address")
         if origin is not None and origin not in _ORIGINS | self.origins and not _is_local(origin):
             shown = origin[:_LONGEST]

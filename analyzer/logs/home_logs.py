@@ -11,7 +11,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
 from hearthlog.analyzer.logs.local_time import day_span, local_time
-from hearthlog.analyzer.logs.never_tell import list_beside, recorded_list
+from hearthlog.analyzer.logs.never_tell import list_of_log, recorded_list
 from hearthlog.analyzer.logs.recorder_info import (
     NO_MODEL,
     LabelledBy,
@@ -115,7 +115,7 @@ class HomeLogs:
         """
         logs = self.between()
         last = next(self.records(), {})
-        return recorded_list(last) | (list_beside(logs[-1].path) if logs else frozenset())
+        return recorded_list(last) | (list_of_log(logs[-1].path) if logs else frozenset())
 
     def records(self) -> Iterator[Mapping[str, str]]:
         """Yield the `hearthlog` records of the logs, latest log first."""

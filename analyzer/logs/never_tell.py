@@ -49,7 +49,7 @@ def recorded_list(record: Mapping[str, str]) -> frozenset[str]:
     return frozenset(map(class_name, filter(None, record.get(NEVER_TELL, "").split(","))))
 
 
-def list_beside(log: Path) -> frozenset[str]:
+def list_of_log(log: Path) -> frozenset[str]:
     """Return the classes of the list in the folder of logs that a log is in.
 
     Raise `LogError` if the list is damaged.

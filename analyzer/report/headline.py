@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
-from hearthlog.analyzer.activity.values import Count, whole
+from hearthlog.analyzer.activity.values import Count, rounded
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import common, one
 from hearthlog.analyzer.report.report_data import counted_events
@@ -111,7 +111,7 @@ def _day(day: DayMetrics) -> str:
     """Return whether a day was quiet, and how much of it is known."""
     name = weekday(day.day)
     hours = day.coverage.length / HOUR
-    whole_hours = whole(day.span.length / HOUR)
+    whole_hours = rounded(day.span.length / HOUR)
     if not _is_known(day):
         if hours < 1:
             return f"Less than an hour of {name} was recorded."

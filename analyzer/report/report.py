@@ -143,7 +143,7 @@ def read_account(
         earlier=[day for day in past if any(map(day.comparable, metrics.classes))],
         judged={day: routines.judge(day) for day in days},
         beside={day: len(routines.earlier(day)) for day in days},
-        unheard=_unheard(data, *span),
+        unheard=_unrecorded(data, *span),
         gaps=_within(data.gaps, span),
         troubles=_within(data.troubles, span),
         doubts=_doubts(logs, data, labelling, shown),
@@ -193,7 +193,7 @@ def _scenarios(
     return read_scenario_minutes(logs, spans, data.lose, data.never_told)
 
 
-def _unheard(data: HomeData, start: int, end: int) -> dict[str, float]:
+def _unrecorded(data: HomeData, start: int, end: int) -> dict[str, float]:
     """Return the hours without coverage of each microphone."""
     whole = end - start
     hours: dict[str, float] = {}

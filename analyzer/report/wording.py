@@ -16,7 +16,7 @@ from hearthlog.analyzer.activity.day_profile import (
     STRETCHES,
     DayFigure,
 )
-from hearthlog.analyzer.activity.values import Clock, Count, Duration, whole
+from hearthlog.analyzer.activity.values import Clock, Count, Duration, rounded
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import find_class, in_words
 from hearthlog.schemas.arrays import Int64
@@ -120,7 +120,7 @@ def rarity_text(judged: DayAnomaly) -> str:
     """Return the return period of such a day: `one such day in 40`."""
     if judged.once_in >= LONGEST:
         return "less than one such day in a year"
-    return f"one such day in {whole(judged.once_in)}"
+    return f"one such day in {rounded(judged.once_in)}"
 
 
 def differences_text(judged: DayAnomaly) -> str:

@@ -433,9 +433,9 @@ def looked_at(
     return reviewed
 
 
-def unasked(asked: Sequence[ReviewSpan], marks: Iterable[Mark]) -> list[Mark]:
+def outside_requests(requested: Sequence[ReviewSpan], marks: Iterable[Mark]) -> list[Mark]:
     """Return the marks outside all requested spans."""
-    return [mark for mark in marks if not any(_answers(mark, span) for span in asked)]
+    return [mark for mark in marks if not any(_answers(mark, span) for span in requested)]
 
 
 def _answers(mark: Mark, span: ReviewSpan) -> bool:

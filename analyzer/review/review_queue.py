@@ -215,5 +215,5 @@ def _text(span: ReviewSpan) -> str:
     label, other = (in_words(name).lower() for name in (span.label_a, span.label_b))
     if span.reason == RANDOM:
         return f"{old}: mostly {label}; drag over each wrong sound and press its key"
-    said = f", {new}: {other or 'nothing'}" if span.b else ""
-    return f"{old}: {label}{said}, {_WHY[span.reason]}"
+    second = f", {new}: {other or 'nothing'}" if span.b else ""
+    return f"{old}: {label}{second}, {_WHY[span.reason]}"

@@ -366,12 +366,12 @@ class ReviewSession:
             return
         item = self.items[self._at]
         place = f"{self._at + 1} of {len(self.items)}"
-        self.say(f"{place}: {_asked(item)} {self._text(item.start, item.end)}; {item.text}")
+        self.say(f"{place}: {_question(item)} {self._text(item.start, item.end)}; {item.text}")
         margin = _margin(item.start, item.end)
         with self._unless_silent():
             self.look_closely(item.start - margin, item.end + margin)
             text = f"{place}, {self._text(item.start, item.end)}"
-            self.screen.ask(item.start, item.end, Question(_asked(item), text, self._answers()))
+            self.screen.ask(item.start, item.end, Question(_question(item), text, self._answers()))
             # A minute has several sounds: what is named in it is selected by hand.
             self.screen.show(item.start, item.end, margin, select=item.chosen != RANDOM)
 
@@ -397,7 +397,7 @@ class ReviewSession:
         return [yes, *(named[key] for key in others), *more]
 
 
-def _asked(item: ReviewItem) -> str:
+def _question(item: ReviewItem) -> str:
     if item.chosen == RANDOM:
         return "Is all of this minute labelled right?"
     return f"{in_words(item.label)}?"

@@ -334,7 +334,7 @@ def read_timeline(
         for name, one in collected.items()
     }
     for name, microphone in microphones.items():
-        microphone.gaps = _unheard(microphone, coverage[name], grid)
+        microphone.gaps = _unrecorded(microphone, coverage[name], grid)
     home = str(home_zone(zone, latest_records(file.path for file in files)))
     return Timeline(grid, microphones, reader.lines(), home, coverage, reader.every, losses)
 
@@ -374,7 +374,7 @@ def read_frames(
         yield part
 
 
-def _unheard(
+def _unrecorded(
     microphone: MicrophoneTimeline, coverage: Coverage, grid: TimelineGrid
 ) -> LabelledSpans:
     """Add the recorder's off times, up to now, to its gaps."""

@@ -244,16 +244,16 @@ def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
     return process
 
 
-def explain(address: str, said: str) -> str:
+def explain(address: str, message: str) -> str:
     """Return why ffmpeg found no sound.
 
     Parameters
     ----------
-    said : str
+    message : str
         Its standard error, which may contain the address.
     """
-    said = said.replace(address, "")
-    found = next((meaning for text, meaning in _MEANINGS.items() if re.search(text, said)), None)
+    message = message.replace(address, "")
+    found = next((meaning for text, meaning in _MEANINGS.items() if re.search(text, message)), None)
     if found == "":
         found = (
             "refuses the user name or the password"

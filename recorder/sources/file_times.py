@@ -461,10 +461,10 @@ def doubts(paths: Sequence[Path], times: Sequence[FileTime | None]) -> list[str]
             lines.setdefault(GUESS, []).append((path, text))
         elif found.remark:
             lines.setdefault(found.remark, []).append((path, f"{found.remark}; say --start"))
-    said = []
+    warnings = []
     for (first, text), *others in lines.values():
         more = f" (and so of {len(others)} more)" if others else ""
-        said.append(f"{first}: {text}{more}")
+        warnings.append(f"{first}: {text}{more}")
     if follows:
-        said.append(f"{follows} of {len(paths)} files say no time: they follow without a gap")
-    return said
+        warnings.append(f"{follows} of {len(paths)} files say no time: they follow without a gap")
+    return warnings

@@ -156,10 +156,10 @@ class LogContents:
                     unsure.update({"segments": 1, "seconds": durations[row]})
 
     def _add_health(self, columns: Columns) -> None:
-        said = list(statuses_of(columns))
-        self.last |= {status.name: status for status in said}
-        said += [] if self.health is None else [self.health]
-        self.health = max(said, key=lambda status: (status.level, status.time), default=None)
+        statuses = list(statuses_of(columns))
+        self.last |= {status.name: status for status in statuses}
+        statuses += [] if self.health is None else [self.health]
+        self.health = max(statuses, key=lambda status: (status.level, status.time), default=None)
 
 
 def is_review(microphone: str) -> bool:

@@ -47,7 +47,7 @@ class FolderChanges:
             self._mask = changes | flags.DELETE_SELF | flags.MOVE_SELF | flags.ONLYDIR
 
     @property
-    def tells(self) -> bool:
+    def has_events(self) -> bool:
         """Whether the system reports changes."""
         return self._inotify is not None
 
@@ -280,8 +280,8 @@ class _News:
     def may_be_there(self, stop: Event) -> bool:
         """Wait for at most a fifth of a second; return whether to poll."""
         self._was_told = self._changes.wait(_POLL_SECONDS, stop)
-        tells = self._changes.tells and self._missed < _MOST_MISSED
-        return self._was_told or not tells or time.monotonic() >= self._due or stop.is_set()
+        has_events = self._changes.has_events and self._missed < _MOST_MISSED
+        return self._was_told or not has_events or time.monotonic() >= self._due or stop.is_set()
 
     def close(self) -> None:
         """Stop watching."""

@@ -107,9 +107,9 @@ def import_labels(
     from hearthlog.analyzer.review.review_list import (
         check_scenario,
         looked_at,
+        outside_requests,
         queue_file,
         read_list,
-        unasked,
     )
 
     log, labels = _log_and_labels(log, labels)
@@ -133,8 +133,8 @@ def import_labels(
     losses = list(_losses(left_out))
     if not by_log:
         _end_without_labels(losses)
-    said = [mark for marks in by_log.values() for mark in marks]
-    looked = looked_at(spans, said, coverage, name, now)
+    every_mark = [mark for marks in by_log.values() for mark in marks]
+    looked = looked_at(spans, every_mark, coverage, name, now)
     taken: list[Mark] = []
     seen: list[ReviewedSpan] = []
     for path in sorted(by_log.keys() | looked.keys()):
@@ -160,7 +160,7 @@ def import_labels(
             f"looked at, by {asked}: {number(len(seen) - minutes, 'span')} of the queue, "
             f"{number(minutes, 'minute')} drawn at random"
         )
-        if others := unasked(spans, taken):
+        if others := outside_requests(spans, taken):
             print_notice(
                 f"{number(len(others), 'mark')} outside the spans of {asked}: your own choice"
             )

@@ -118,7 +118,7 @@ def _unmute(state: "BridgeState", classes: list[str], say: "Callable[[str], None
         there = f"muted: {listed(muted, 'and')}" if muted else "no class is muted"
         wrong_use(f"--unmute {others[0]}: this class is published; {there}")
     for name in classes:
-        topics.switch(name, is_told=True)
+        topics.switch(name, is_published=True)
     topics.save()
 
 

@@ -73,7 +73,7 @@ def info(
     day = _last_day(summary, logs, zone)
     if as_json:
         checked = None if accuracy is None else accuracy.as_json()
-        said = {
+        more = {
             "scenarios": [one._asdict() for one in scenarios],
             "checked": checked,
             "next": following,
@@ -84,7 +84,7 @@ def info(
                 "counts": {name: total._asdict() for name, total in day[1].items()},
             },
         }
-        print(json.dumps(_as_json(summary) | said, indent=2))
+        print(json.dumps(_as_json(summary) | more, indent=2))
     else:
         overview = Overview(summary, zone, hidden)
         print_lines(overview.lines(following))

@@ -105,7 +105,7 @@ def findings(file: Path) -> "tuple[list[HearthlogError], list[str], list[str]]":
 
     Raise `ConfigurationError` if the configuration is invalid.
     """
-    from hearthlog.analyzer.bridge.alerts.rule_checks import rule_doubts, unheard_classes
+    from hearthlog.analyzer.bridge.alerts.rule_checks import rule_doubts, unknown_class_problems
     from hearthlog.analyzer.bridge.bridge import exposed_files, output_problems
     from hearthlog.analyzer.bridge.settings import configured_microphones, load_bridge_settings
     from hearthlog.recorder.config import exposed_passwords
@@ -117,7 +117,7 @@ def findings(file: Path) -> "tuple[list[HearthlogError], list[str], list[str]]":
     errors = recording_problems(settings)
     problems, warnings = output_problems(bridge)
     warnings += rule_doubts(bridge.alert, settings, microphones)
-    warnings += unheard_classes(bridge.alert, settings, microphones)
+    warnings += unknown_class_problems(bridge.alert, settings, microphones)
     warnings += [*exposed_passwords(settings, file), *exposed_files(bridge, file, bridge.state)]
     return errors, problems, warnings
 

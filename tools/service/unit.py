@@ -335,8 +335,8 @@ def _systemctl(*arguments: str, env: dict[str, str] | None = None) -> None:
         check=False,
     )
     if result.returncode:
-        said = " ".join(result.stderr.split()) or f"status {result.returncode}"
-        raise ServiceError(f"systemctl {' '.join(arguments)}: {said}")
+        failure = " ".join(result.stderr.split()) or f"status {result.returncode}"
+        raise ServiceError(f"systemctl {' '.join(arguments)}: {failure}")
 
 
 def check_root() -> None:

@@ -211,13 +211,13 @@ class Target:
         """Deliver within the timeout of the address; return the reason of a failure."""
         import apprise  # noqa: PLC0415  takes half a second, and few need it
 
-        with apprise.LogCapture(level=logging.WARNING, fmt=_FORM) as said:
+        with apprise.LogCapture(level=logging.WARNING, fmt=_FORM) as captured:
             done = self._plugin.notify(
                 title=title, body=text, notify_type=apprise.NotifyType.WARNING
             )
             if done:
                 return ""
-            lines = said.getvalue().splitlines()
+            lines = captured.getvalue().splitlines()
         return _reason("\n".join(line for line in lines if line.startswith(f"{get_ident()} ")))
 
 
@@ -230,12 +230,12 @@ def _scheme_and_host(plugin: Any, address: str) -> str:
     return f"{scheme}://{host}" if is_host and is_sure else scheme
 
 
-def _reason(said: str) -> str:
+def _reason(failure: str) -> str:
     """Summarize a failure without Apprise's own words, which contain topics and paths."""
-    code = _CODE.search(said)
+    code = _CODE.search(failure)
     if code:
         return f"error {code[1]}"
-    is_away = "connection error" in said.lower()
+    is_away = "connection error" in failure.lower()
     return "no connection" if is_away else "`apprise -v -b test ADDRESS` says why"
 
 

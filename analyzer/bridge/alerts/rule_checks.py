@@ -144,7 +144,7 @@ def unkept_days(rule: AlertRule, settings: Settings) -> str:
     )
 
 
-def unheard_classes(
+def unknown_class_problems(
     rules: Sequence[AlertRule], settings: Settings, microphones: Sequence[str]
 ) -> Iterator[str]:
     """Report rules with a class that no model has, or with a microphone without a model."""
@@ -156,8 +156,8 @@ def unheard_classes(
     classes: dict[str, set[str]] = {}
     for name, (model, scenarios) in models.items():
         if model != NO_MODEL and (own := _classes_of(model, network)):
-            beside = (_classes_of(each, network) for each in _beside(model))
-            classes[name] = own.union(*beside)
+            others = (_classes_of(each, network) for each in _neighbours(model))
+            classes[name] = own.union(*others)
         for scenario, file in scenarios.items():
             if own := _classes_of(file, network) - OF_EVERY_SCENARIO:
                 classes[source_name(name, scenario)] = own
@@ -181,7 +181,7 @@ def _classes_of(path: Path, network: str) -> set[str]:
         return set()
 
 
-def _beside(path: Path) -> list[Path]:
+def _neighbours(path: Path) -> list[Path]:
     """Return the models in the folder of a model, any of which may be promoted."""
     folder = path.parent if path.suffix == SUFFIX else DEFAULT_FOLDER
     try:

@@ -215,7 +215,7 @@ def _words(names: Sequence[str]) -> dict[str, str]:
     """Return unique readable names of classes; Home Assistant rejects triggers of equal name."""
     words = {name: in_words(name) for name in names}
     times = Counter(words.values())
-    return {name: said if times[said] == 1 else f"{said} ({name})" for name, said in words.items()}
+    return {name: word if times[word] == 1 else f"{word} ({name})" for name, word in words.items()}
 
 
 def _of_class(topics: Topics, microphone: str, name: str, words: str) -> dict[str, Component]:

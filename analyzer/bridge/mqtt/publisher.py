@@ -133,7 +133,7 @@ class MqttPublisher:
         self._send_events("event", events, news)
         for event in events:
             self._announced.note_event(event)
-            if self._announced.is_told(event.label):
+            if self._announced.is_published(event.label):
                 place = Place("last_event", event.microphone)
                 self._keep(place, json.dumps(event_fields(event, news)))
 
@@ -144,7 +144,7 @@ class MqttPublisher:
         return recent
 
     def _send_events(self, kind: str, events: Sequence[SoundEvent], news: News) -> None:
-        for event in (each for each in events if self._announced.is_told(each.label)):
+        for event in (each for each in events if self._announced.is_published(each.label)):
             topic = self._topics.at(kind, event.microphone)
             self._connection.send(topic, json.dumps(event_fields(event, news)))
 
@@ -211,7 +211,7 @@ class MqttPublisher:
         """Mute the classes that an earlier bridge had muted."""
         for label in self._off.intersection(classes):
             self._off.discard(label)
-            self._announced.switch(label, is_told=False)
+            self._announced.switch(label, is_published=False)
             self._has_said_muted = False
 
     def _discovery_topic(self, device: str) -> str:
@@ -301,7 +301,7 @@ class MqttPublisher:
             return
         confidence = round(microphone.confidence, 3)
         label = microphone.shown_label
-        label = label if self._announced.is_told(label) else UNKNOWN
+        label = label if self._announced.is_published(label) else UNKNOWN
         say("heard", json.dumps({"label": label, "confidence": confidence}))
         say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
@@ -312,12 +312,12 @@ class MqttPublisher:
             "night_start": iso_time(news.today.night, news.zone),
         }
         for label in (each for each in microphone.classes if each != SILENCE):
-            is_told = self._announced.is_told(label)
+            is_published = self._announced.is_published(label)
             if self._settings.commands:
-                self._keep(Place(TOLD, label=label), _ON[is_told])
+                self._keep(Place(TOLD, label=label), _ON[is_published])
             of_day, of_night = counts[label]
             values = {
-                "on": _ON[microphone.heard.is_heard(label) and is_told],
+                "on": _ON[microphone.heard.is_heard(label) and is_published],
                 "counts": json.dumps({"today": of_day, "night": of_night, **began}),
                 "count_today": str(of_day),
                 "count_night": str(of_night),

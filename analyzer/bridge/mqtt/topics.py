@@ -149,15 +149,15 @@ class RetainedTopics:
         with self._lock:
             return sorted(self._muted)
 
-    def is_told(self, label: str) -> bool:
+    def is_published(self, label: str) -> bool:
         """Whether events of a class are published."""
         with self._lock:
             return label not in self._muted
 
-    def switch(self, label: str, is_told: bool) -> None:  # noqa: FBT001  passed as a callback
+    def switch(self, label: str, is_published: bool) -> None:  # noqa: FBT001  passed as a callback
         """Unmute or mute a class."""
         with self._lock:
-            (self._muted.discard if is_told else self._muted.add)(label)
+            (self._muted.discard if is_published else self._muted.add)(label)
             self._is_changed = True
 
     def new_events(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:

@@ -12,7 +12,7 @@ from typing import IO, Any, NamedTuple, cast
 from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import READ_ONLY, REVIEWER
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import ENGLISH, Words, room, told
+from hearthlog.analyzer.bridge.wording import ENGLISH, Words, one_line, room
 from hearthlog.analyzer.discover.summary import (
     SUMMARY,
     GroupsSummary,
@@ -215,7 +215,7 @@ def _read(stream: IO[str], wanted: str) -> tuple[str, str]:
         last = line.removeprefix(_PREFIX)
         if line.startswith(wanted):
             result = line.removeprefix(wanted)
-    return told(result), told(last)
+    return one_line(result), one_line(last)
 
 
 def _outcome(status: int, result: str, last: str, words: Words) -> str:
@@ -303,4 +303,4 @@ class RecurringSounds:
         try:
             self._summary = load_summary(self._file)
         except HearthlogError as error:
-            self._summary, self.problem = None, told(str(error))
+            self._summary, self.problem = None, one_line(str(error))

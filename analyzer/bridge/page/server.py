@@ -26,7 +26,7 @@ from hearthlog.analyzer.http import (
     HttpServer,
     has_token,
     host_name,
-    is_asked_in_digits,
+    is_numeric_host,
 )
 from hearthlog.schemas.errors import HearthlogError
 
@@ -129,7 +129,7 @@ class PageAdmission:
         """Whether the host of a request is allowed."""
         if host in self.names or host_name(f"//{host}") in self.names:
             return True
-        return bool(host) and is_asked_in_digits(self.bind, host)
+        return bool(host) and is_numeric_host(self.bind, host)
 
     def _is_own(self, origin: str, host: str) -> bool:
         """Whether an origin is that of the page itself."""

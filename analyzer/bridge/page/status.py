@@ -8,7 +8,7 @@ from hearthlog.analyzer.activity.events import ANY_SOUND, HOLD_SECONDS
 from hearthlog.analyzer.activity.sources import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import News
-from hearthlog.analyzer.bridge.wording import ENGLISH, Words, reason, room, told
+from hearthlog.analyzer.bridge.wording import ENGLISH, Words, one_line, reason, room
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
@@ -49,7 +49,7 @@ class RoomStatus:
         since_words = words.when(last.since, news.today.now, news.zone) if last.since else ""
         health = news.state.health.get(microphone.name)
         is_listening = microphone.is_listening()
-        why = reason(told(health.text)) if health is not None and not is_listening else ""
+        why = reason(one_line(health.text)) if health is not None and not is_listening else ""
         sentence = sound
         if since_words:
             sentence = words.text("now.since", words=sentence, time=since_words)
@@ -149,7 +149,7 @@ def _lines(news: News, node: str, started: int, words: Words) -> Iterator[Any]:
     )
     for subject, health in sorted(state.health.items()):
         if subject not in state.microphones:
-            level, text = min(health.level, _WRONG), words.translated(told(health.text))
+            level, text = min(health.level, _WRONG), words.translated(one_line(health.text))
             yield _line(_thing(subject, node, words), level, text)
     since = words.when(started, news.today.now, news.zone)
     yield _line(words.text("health.bridge"), _WELL, words.text("health.follows", time=since))
@@ -157,7 +157,7 @@ def _lines(news: News, node: str, started: int, words: Words) -> Iterator[Any]:
 
 def _of_microphone(microphone: LiveMicrophone, state: HomeState, words: Words) -> Any:
     health = state.health.get(microphone.name)
-    text, level = ("", _WELL) if health is None else (told(health.text), health.level)
+    text, level = ("", _WELL) if health is None else (one_line(health.text), health.level)
     is_alone = len(state.present()) == 1
     key = "health.microphone" if is_alone else "health.microphone of"
     what = words.text(key, room=room(microphone.name))
@@ -173,7 +173,7 @@ def _thing(subject: str, node: str, words: Words) -> str:
     whose, _, part = subject.partition(" ")
     if whose == node and part in _THINGS:
         return words.text(_THINGS[part])
-    return told(subject.replace("_", " ")).capitalize()
+    return one_line(subject.replace("_", " ")).capitalize()
 
 
 def scenario_lines(news: News, words: Words = ENGLISH) -> list[Any]:
