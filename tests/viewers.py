@@ -10,6 +10,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from contextlib import contextmanager, suppress
@@ -86,9 +87,16 @@ def patiently(operation, is_enough=lambda _: True):
             answer = operation()
             if is_enough(answer):
                 return answer
-        shown = "another picture is shown" if isinstance(answer, bytes) else answer
-        assert time.monotonic() < deadline, shown
+        if time.monotonic() > deadline:
+            pytest.fail(_kept(answer) if isinstance(answer, bytes) else str(answer))
         time.sleep(0.1)
+
+
+def _kept(picture):
+    """Write a picture that was not the wanted one to a file; return where it is."""
+    with tempfile.NamedTemporaryFile(suffix=".png", delete=False) as file:
+        file.write(picture)
+    return f"another picture is shown: {file.name}"
 
 
 def pixels(picture):
