@@ -39,7 +39,7 @@ CLASSES = (
     "tap_water",
 )
 _PIECE = 100  # seconds of a file
-_CLIPS = 12  # of each class that the model learns from
+_CLIPS = 6  # of each class that the model learns from
 _LOST = 60  # blocks of 10 s after which nothing is heard, in the second half
 _LOST_FRAMES = 12_000
 _PLAN = (  # until which hour, what; the rest of the day is silent

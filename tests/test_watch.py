@@ -337,7 +337,7 @@ def test_a_window_hardly_grows_with_what_it_paints(display, monkeypatch):
     ):
         server.show([Plot(FEATURES, "mic", "", names, seconds, shades)])
         window, process = Window(display, run.port), psutil.Process(run._process.pid)
-        for number in range(1, 121):
+        for number in range(1, 61):
             later = seconds[-1:] + number * SECOND
             server.show([Plot(FEATURES, "mic", "", names, later, shades[number : number + 1])])
             window.mouse(f"mousemove {300 + number} 300")
