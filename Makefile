@@ -24,7 +24,7 @@ test-lab: $(VENV)/.dev
 
 # A little of every room, in two minutes.
 test-fast: $(VENV)/.dev
-	$(BIN)/pytest -n 2 -m fast $(if $(SEED),--hypothesis-seed=$(SEED))
+	$(BIN)/pytest -n 2 --dist worksteal -m fast $(if $(SEED),--hypothesis-seed=$(SEED))
 
 # Every verb of the wheel, in an environment of its own: the recorder alone, without Rerun, and with it.
 test-wheel: dist
@@ -49,13 +49,13 @@ test-lowest: dist
 		--extra analyzer --extra bridge --extra cluster --resolution lowest-direct -o build/lowest/versions.txt
 	build/lowest/bin/uv pip install --quiet --python build/lowest/bin/python \
 		"$$(ls build/dist/*.whl)[dev]" --constraint build/lowest/versions.txt
-	build/lowest/bin/pytest -n 2 -m fast
+	build/lowest/bin/pytest -n 2 --dist worksteal -m fast
 
 test-3.13: dist
 	python=$$(.ci/python 3.13) && $$python -m venv --clear build/3.13
 	build/3.13/bin/pip install --quiet uv
 	build/3.13/bin/uv pip install --quiet --python build/3.13/bin/python "$$(ls build/dist/*.whl)[dev]"
-	build/3.13/bin/pytest -n 2 -m fast
+	build/3.13/bin/pytest -n 2 --dist worksteal -m fast
 
 # The nodes of tools/ros and topics as microphones, on two distributions of ROS 2 that come from PyPI.
 test-ros: $(VENV)/.dev
