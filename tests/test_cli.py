@@ -299,6 +299,7 @@ def test_the_demo_goes_from_sound_to_a_timeline(hearthlog, tmp_path):
     assert re.search(r"\d+ sounds, of \d+ recordings; made up: \d+", result.stdout)
     track = (folder / "day.txt").read_text().splitlines()
     assert track[-1].split("\t")[1] == "240.000000"
+    assert "(a whole day in 4 minutes is as dense as the sound of a television" in result.stdout
     again = hearthlog("demo", "--output", folder)
     assert again.returncode == 1
     assert again.stderr.startswith(f"hearthlog: {folder}: already exists")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 _START = "2026-03-01T00:00:00"
 _SEED = 1
+_DENSE_MINUTES = 240  # shortest day that is not taken for a television
 _POLL_SECONDS = 0.2
 
 
@@ -77,6 +78,11 @@ def demo(
 
     _say(f"3. hearthlog info {logs}")
     info(logs)
+    if minutes < _DENSE_MINUTES:
+        print(
+            f"(a whole day in {minutes:g} minutes is as dense as the sound of a television, and is "
+            "counted as that; a real day is not)"
+        )
 
     _say(f"4. hearthlog review {logs} --save {timeline}")
     save_timeline(read_timeline([logs]), timeline)
