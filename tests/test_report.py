@@ -240,6 +240,14 @@ def test_minutes_and_events_are_those_of_the_segments_that_a_recorder_wrote(reco
     assert not re.search("of these: [^.]*not sure", text)
 
 
+def test_the_headline_and_the_text_name_the_same_length_of_what_was_recorded(tmp_path):
+    missing = [(at("10:00"), 0.5, "overrun")]  # of the only hour
+    write_day(tmp_path, DAY, [(at("10:30"), 60, "speech", 0.8)], hours=[10], gaps=missing)
+    text = text_of(page_of(tmp_path, tmp_path))
+    assert "Only 1 of the 24 hours of Sunday was recorded." in text
+    assert "Recorded: 1 h 00 min of the day" in text
+
+
 # What nobody listened to
 
 

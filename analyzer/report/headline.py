@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
+from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Count, rounded
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import common, one
@@ -110,7 +111,7 @@ _REPEATED = {1: "once", 2: "twice"}
 def _day(day: DayMetrics) -> str:
     """Return whether a day was quiet, and how much of it is known."""
     name = weekday(day.day)
-    hours = day.coverage.length / HOUR
+    hours = rounded(day.coverage.length / MINUTE) / 60  # as the page says it
     whole_hours = rounded(day.span.length / HOUR)
     if not _is_known(day):
         if hours < 1:
