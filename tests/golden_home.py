@@ -193,14 +193,14 @@ class Following:
 
     Attributes
     ----------
-    said : list of str
+    problems : list of str
     state : BridgeState
     """
 
     state: BridgeState
 
     def __init__(self, now: str) -> None:
-        self.said: list[str] = []
+        self.problems: list[str] = []
         self.set_clock(now)
 
     def set_clock(self, now: str) -> None:
@@ -230,7 +230,7 @@ def following(now: str, broker: int) -> Iterator[Following]:
             time_zone(settings.timezone),
             frozenset(settings.never_tell),
         )
-        say, stop = ProblemReporter(own.said.append), Flag()
+        say, stop = ProblemReporter(own.problems.append), Flag()
         own.state = state = BridgeState(state_folder(outputs_of.state, home.folder), home.node, say)
         state.claim(home.folder)
         outputs, since = open_outputs(_with_ports(outputs_of, broker), home, state, say)
@@ -363,7 +363,7 @@ def _follow() -> None:
         logs.rmdir()
         aside.rename(logs)
         with following("2026-03-01T07:02:00", broker.port) as bridge:
-            wait_for(lambda: received, what=lambda: bridge.said)
+            wait_for(lambda: received, what=lambda: bridge.problems)
             wait_for(lambda: "coughing" in (bridge.state.read("mqtt") or ""))
             bridge.set_clock("2026-03-01T23:10:00")
             wait_for(lambda: "coughing" in (bridge.state.read("totals") or ""))

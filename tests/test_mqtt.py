@@ -42,15 +42,15 @@ class Bridged:
     def __init__(
         self, folder: Path, broker: Broker, outputs=(), node="home", state=None, **settings
     ):
-        self.said = []
+        self.problems = []
         place = RecorderAddress(folder, node, midday_zone())
         mqtt = MqttSettings(**({"host": "127.0.0.1", "port": broker.port} | settings))
         state = state or folder.parent / "bridge"
-        self.state = BridgeState(state, node, self.said.append)
+        self.state = BridgeState(state, node, self.problems.append)
         self.state.claim(folder)
-        self.publisher = MqttPublisher(mqtt, place, self.state, self.said.append)
+        self.publisher = MqttPublisher(mqtt, place, self.state, self.problems.append)
         everybody = dict(outputs) | {"mqtt": self.publisher}
-        self._following = following(place, everybody, self.said)
+        self._following = following(place, everybody, self.problems)
 
     def __enter__(self):
         self._following.__enter__()
@@ -309,7 +309,7 @@ def test_a_folder_without_a_log_is_waited_for_without_a_problem(tmp_path, broker
         home.hears("coughing")
         listener.wait_for(f"{COUGHING}/on", "ON")
         home.close()
-    assert bridged.said == []
+    assert bridged.problems == []
 
 
 def test_a_folder_that_is_not_there_yet_is_waited_for(tmp_path, broker):
@@ -321,7 +321,7 @@ def test_a_folder_that_is_not_there_yet_is_waited_for(tmp_path, broker):
         home = LiveHome(tmp_path / "logs")
         home.hears("silence")
         listener.wait_for(f"{ROOT}/mic/listening", "online")
-    assert bridged.said == [f"{tmp_path}/logs: no such folder yet; waiting for a recorder"]
+    assert bridged.problems == [f"{tmp_path}/logs: no such folder yet; waiting for a recorder"]
     home.close()
 
 
@@ -340,7 +340,7 @@ def test_an_output_that_fails_stops_no_other(home, broker):
         Bridged(home.folder, broker, {"page": _Failing()}) as bridged,
     ):
         listener.wait_for(f"{ROOT}/mic/listening", "online")
-    assert set(bridged.said) == {"page: ZeroDivisionError: on purpose"}
+    assert set(bridged.problems) == {"page: ZeroDivisionError: on purpose"}
 
 
 def test_no_event_ends_before_it_begins(home, broker):
@@ -431,7 +431,7 @@ def test_what_somebody_left_at_the_broker_silences_nothing_where_no_commands_are
             broker.start()
             home.hears("silence")
             listener.wait_for(f"{COUGHING}/on")
-    assert not any(line.startswith("mqtt:") for line in bridged.said)
+    assert not any(line.startswith("mqtt:") for line in bridged.problems)
 
 
 def test_what_was_switched_off_stays_so_without_commands_and_one_is_told_how_to_undo_it(
@@ -448,7 +448,7 @@ def test_what_was_switched_off_stays_so_without_commands_and_one_is_told_how_to_
             home.heard("coughing", 0.1)
             home.heard("speech", 0.1)
             assert json.loads(listener.wait_for(f"{ROOT}/mic/event"))["event_type"] == "speech"
-        (line,) = bridged.said
+        (line,) = bridged.problems
         assert line.startswith("mqtt: not published: coughing; ")
         assert line.endswith("start the bridge once with --unmute coughing")
         config = home.folder.parent / "home.toml"
@@ -479,7 +479,9 @@ def test_a_class_that_is_hidden_leaves_the_broker_until_it_is_shown_again(home, 
         listener.wait_for(f"{COUGHING}/on", "")
         (home.folder / NEVER_TELL_FILE).write_text("{")  # damaged: it stays hidden
         home.hears("coughing")
-        listener.wait_until(lambda: any("is no list of classes" in line for line in bridged.said))
+        listener.wait_until(
+            lambda: any("is no list of classes" in line for line in bridged.problems)
+        )
         listener.wait_for(f"{ROOT}/mic/heard", '{"label": "unknown", "confidence": 0.9}')
         assert listener.values[f"{COUGHING}/on"] == ""
         removed = json.loads(listener.values[DISCOVERY])["components"]["on_coughing"]
@@ -498,7 +500,7 @@ def test_what_earlier_versions_switched_off_is_taken_over_where_commands_are_tak
             listener.wait_for(f"{COUGHING}/on", "OFF")
             listener.wait_for(f"{ROOT}/told/music", "ON")
     assert listener.values[f"{ROOT}/told/speech"] == "OFF"
-    assert any("not published: coughing, speech; " in line for line in bridged.said)
+    assert any("not published: coughing, speech; " in line for line in bridged.problems)
 
 
 def test_what_no_model_knows_is_not_switched_off_by_what_is_left_at_the_broker(home, broker):
@@ -508,7 +510,9 @@ def test_what_no_model_knows_is_not_switched_off_by_what_is_left_at_the_broker(h
             listener.publish(f"{ROOT}/told/{label}", "OFF", retain=True)
         with Bridged(home.folder, broker, commands=True) as bridged:
             listener.wait_for(f"{COUGHING}/on", "OFF")
-    assert [line.partition("; ")[0] for line in bridged.said] == ["mqtt: not published: coughing"]
+    assert [line.partition("; ")[0] for line in bridged.problems] == [
+        "mqtt: not published: coughing"
+    ]
     memory = kept(home)
     assert memory["muted"] == ["coughing"]
 
@@ -806,7 +810,7 @@ def test_a_log_of_a_later_version_is_named_and_read_as_far_as_it_is_known(tmp_pa
     home.hears("coughing")
     with Listener(broker.port) as listener, Bridged(home.folder, broker) as bridged:
         listener.wait_for(f"{COUGHING}/on", "ON")
-    (line,) = bridged.said
+    (line,) = bridged.problems
     assert "is of schema version '99', and this hearthlog knows up to " in line
     assert line.endswith("; update hearthlog")
     home.close()
@@ -827,7 +831,7 @@ def test_a_class_that_is_named_like_a_wildcard_has_topics_of_its_own(tmp_path, b
     assert all(topic.count("/") == 5 for topic in on)
     states = [c["state_topic"] for k, c in config["components"].items() if k.startswith("on_")]
     assert set(states) == on
-    assert bridged.said == []
+    assert bridged.problems == []
     home.close()
 
 

@@ -152,7 +152,7 @@ def test_a_bridge_goes_on_with_its_totals_and_delivers_no_alert_twice(broker):
     with server() as (one, delivered), server() as (two, waiting_target):
         write_secrets(one, two)
         with following("2026-03-01T23:20:00", broker.port) as bridge:
-            wait_for(lambda: waiting_target, what=lambda: bridge.said)
+            wait_for(lambda: waiting_target, what=lambda: bridge.problems)
             wait_for(lambda: not bridge.state.names("outbox/"))
             wait_for(figures.exists)
             wait_for(lambda: "hearthlog_events_total{" in figures.read_text())
@@ -170,7 +170,7 @@ def test_a_bridge_goes_on_with_its_totals_and_delivers_no_alert_twice(broker):
     after = entries(Path("bridge"))
     assert after["totals"] == before["totals"]
     assert Path("bridge/page-token").read_text() == token
-    assert not [line for line in bridge.said if "damaged" in line or "twice" in line]
+    assert not [line for line in bridge.problems if "damaged" in line or "twice" in line]
 
 
 @of_every_version

@@ -24,7 +24,7 @@ def make_microphone(folder: Path, samples: NDArray[np.int16]) -> dict[str, str]:
     Returns
     -------
     dict of str to str
-        Environment of a process that shall see it, under the names `DEVICES`.
+        Environment of a process that shall see it, as the `DEVICES`.
 
     Raises
     ------
