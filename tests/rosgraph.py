@@ -7,7 +7,7 @@ import signal
 import subprocess
 from collections import Counter
 from contextlib import contextmanager
-from itertools import count
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -17,9 +17,12 @@ from waiting import wait_for
 from hearthlog.schemas.logs.files import find_logs
 
 _ROOT = Path(__file__).parents[1]
-_domains = count(10 + 20 * (int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % 4))
+_first = 10 + 22 * (int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % 4)
+_domains = cycle(range(_first, _first + 22))
 DISTRIBUTIONS = ("jazzy", "kilted")
 LISTEN = _ROOT / "tests" / "ros" / "listen.py"
+_DISCOVERY = _ROOT / "tests" / "ros" / "discovery.xml"
+_PROFILES = {"jazzy": "FASTRTPS_DEFAULT_PROFILES_FILE", "kilted": "FASTDDS_DEFAULT_PROFILES_FILE"}
 
 
 def next_domain():
@@ -46,6 +49,7 @@ class Ros:
                 pytest.fail(f"no ROS 2 {distribution}: run .ci/ros {distribution}")
             pytest.skip(f"needs a ROS 2: .ci/ros {distribution}")
         self.environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+        self.environment[_PROFILES[distribution]] = str(_DISCOVERY)
         self.environment.pop("PYTHONPATH", None)
 
     def start(self, *command, **options):
@@ -108,6 +112,20 @@ def listener(ros, output, topics, depth="1000"):
         process.kill()
         process.wait()
         process.stdout.close()
+
+
+def wait_until_arrived(output, log, renamed=""):
+    """Wait until as many rows of each topic of a log have arrived as the log has.
+
+    A topic that is published under another name has `renamed` before its own.
+    """
+    wanted = Counter(renamed + topic for topic, *_ in log)
+
+    def missing():
+        rows = [row for row in arrived(output) if b"\0hearthlog_live\0" not in row[-1]]
+        return wanted - Counter(topic for topic, *_ in rows)
+
+    wait_for(lambda: not missing(), what=lambda: f"not arrived: {missing()}")
 
 
 def arrived(output):

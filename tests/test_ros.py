@@ -19,6 +19,7 @@ from rosgraph import (
     logged,
     next_domain,
     wait_for,
+    wait_until_arrived,
     wait_until_handled,
     wait_until_logged,
 )
@@ -90,7 +91,7 @@ def test_every_message_of_a_log_reaches_the_graph_once_and_in_order(ros, labmic,
                 recorder.wait()
             layer.unlink()
             log = logged(logs)
-            wait_for(lambda: len(of_the_log(output)) >= len(log))
+            wait_until_arrived(output, log)
         assert end(node) == ""
     assert len(list(logs.rglob("*.mcap"))) > 1
     rows = of_the_log(output)
@@ -189,9 +190,8 @@ def test_features_are_labelled_elsewhere_on_the_graph_as_the_recorder_labels_the
                 wait_until_logged(logs, features=320, gap=1, segment=1)
                 recorder.send_signal(signal.SIGTERM)
                 recorder.wait()
-            log = logged(logs)
-            wanted = sum(name in topics for name, *_ in log)
-            wait_for(lambda: sum(row[0] in elsewhere for row in arrived(output)) >= wanted)
+            log = [row for row in logged(logs) if row[0] in topics]
+            wait_until_arrived(output, log, renamed="/elsewhere")
         assert (end(label), end(live)) == ("", "")
     rows = arrived(output)
     for topic in topics:

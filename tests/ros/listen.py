@@ -47,7 +47,7 @@ def main():
     awaited = "hearthlog_label" if is_labelled else "hearthlog"  # else the first frames pass it by
     while not [name for name in node.get_node_names() if name.startswith(awaited)]:
         time.sleep(0.1)
-    time.sleep(1.0)  # all that is there of it
+    time.sleep(1.0)  # ten announcements of discovery.xml: all participants know each other
     print("listening", flush=True)
     while not stopped:
         rclpy.spin_once(node, timeout_sec=0.1)
