@@ -197,12 +197,13 @@ def test_the_contents_of_logs_name_the_counts_of_the_report(logs, capfd):
     assert sum(each["counted"] for each in found["counts"].values()) > 10
 
 
-def test_a_relabelling_has_the_counts_of_its_own_report_and_changes_no_other(logs, capfd):
+def relabelled(logs, change):
+    """Write a relabel layer beside each log, with other labels; return the layers."""
     layers = []
     for log in [path for path in find_logs(logs) if not is_layer(path)]:
         segments = read_columns([log])["/mic/segment"]
         fields = dict(segments.fields)
-        fields["label"] = ["laughing" if n == "yelling" else n for n in fields["label"]]
+        fields["label"] = [change.get(name, name) for name in fields["label"]]
         topic = "/mic/relabel/new_2/segment"
         topics = [
             type(each)(topic, each.type) if each.name.endswith("/segment") else each
@@ -212,6 +213,11 @@ def test_a_relabelling_has_the_counts_of_its_own_report_and_changes_no_other(log
         writer = LogWriter(layer, topics, {"version": "0", "node": "home"})
         writer.write_columns([TopicBatch(topic, segments.log_times, fields)])
         layers.append(writer.finish())
+    return layers
+
+
+def test_a_relabelling_has_the_counts_of_its_own_report_and_changes_no_other(logs, capfd):
+    layers = relabelled(logs, {"yelling": "laughing"})
     try:
         for labelling in ("live", "new-2"):
             words = "events", logs, "--day", DAY, "--json", "--labels", labelling
@@ -223,6 +229,53 @@ def test_a_relabelling_has_the_counts_of_its_own_report_and_changes_no_other(log
                 assert counts["counted"] == (0 if count is None else count.labelled), name
                 assert counts["television"] == day.beside_television(name), name
             assert ("yelling" in found) == (labelling == "live")
+    finally:
+        for layer in layers:
+            layer.unlink()
+
+
+def marks_of(log):
+    """Give what a person would mark who agrees with every label of a log."""
+    segments = read_columns([log])["/mic/segment"]
+    ends = segments["header.stamp"] + segments["duration"]
+    rows = zip(segments["header.stamp"].tolist(), ends.tolist(), segments["label"], strict=True)
+    return [Mark("mic", start, end, str(label)) for start, end, label in rows]
+
+
+def test_the_catalogue_a_comparison_and_an_evaluation_count_the_events_of_the_report(logs, capfd):
+    hearthlog, (start, end) = partial(run, capfd), day_span(DAY, ZONE)
+
+    def counted(labelling="live"):
+        home = whole_home(read_home(find_home_logs([logs]), labelling, 0, (start, end)))
+        return {name: own for name, own in home.events.items() if name != SILENCE and len(own)}
+
+    starts = counted()
+    for name, (alone, _, beside) in reported(logs).items():
+        own = starts.get(name, np.empty(0, np.int64))
+        assert ((own >= start) & (own < end)).sum() == alone + beside, name
+    events = {name: len(own) for name, own in starts.items()}
+    listed = json.loads(hearthlog("catalog", logs, "--json").stdout)["labels"]
+    (logs / "catalog.sqlite").unlink()
+    assert {one["label"]: one["events"] for one in listed if one["label"] != SILENCE} == events
+    assert sum(one["segments"] for one in listed) > sum(one["events"] for one in listed)
+    layers = relabelled(logs, {"yelling": "laughing"})
+    try:
+        difference = json.loads(hearthlog("diff", logs, "live", "new-2", "--json").stdout)
+        kinds, afterwards = difference["total"]["per_class"], counted("new-2")
+        for name in SOUNDS:
+            assert kinds[name]["events_a"] == events.get(name, 0), name
+            assert kinds[name]["events_b"] == len(afterwards.get(name, ())), name
+        days = difference["days"].values()
+        assert sum(one["per_class"]["coughing"]["events_a"] for one in days) == events["coughing"]
+    finally:
+        for layer in layers:
+            layer.unlink()
+    marked = [path for path in find_logs(logs) if not is_layer(path)]
+    layers = [write_marks(log, marks) for log in marked if (marks := marks_of(log))]
+    try:
+        words = "evaluate", "log", logs, "--reference", "review", "--json"
+        found = json.loads(hearthlog(*words).stdout)["events"]
+        assert found == {name: {"reference": k, "labelled": k} for name, k in events.items()}
     finally:
         for layer in layers:
             layer.unlink()

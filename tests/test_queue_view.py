@@ -131,12 +131,17 @@ def test_close_ups_are_right_and_the_span_is_marked_also_when_the_queue_jumps_ba
     assert view.state().errors == []
 
 
-def test_probabilities_are_rows_of_one_colour_at_every_zoom(timeline):
-    with open_hidden() as viewer:
+@pytest.mark.parametrize(
+    ("size", "halves"),
+    [((1920, 1080), (60 * SECOND, 10 * SECOND, SECOND)), ((2560, 1440), (60 * SECOND,))],
+    ids=["every zoom", "a tall window"],
+)
+def test_probabilities_are_rows_of_one_colour(timeline, size, halves):
+    with open_hidden(size=size) as viewer:
         viewer.draw(timeline, close_up=False)
         viewer.wait_until_drawn()
         middle = timeline.grid.start + 70 * SECOND
-        for half in (60 * SECOND, 10 * SECOND, SECOND):
+        for half in halves:
             viewer.show(middle - half, middle + half, 0, select=False)
 
             def is_right(png, half=half):

@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
-from hearthlog.analyzer.logs.spans import Overlay, Spans, common, joined, overlay, pieces, ranges
+from hearthlog.analyzer.logs.spans import (
+    EVENT_PAUSE,
+    Overlay,
+    Spans,
+    common,
+    joined,
+    overlay,
+    pieces,
+    ranges,
+)
 from hearthlog.schemas.arrays import Float64, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
@@ -279,7 +288,7 @@ class ClassAmounts:
     minutes_a: float
     minutes_b: float
     minutes_both: float  # both sides have this class
-    events_a: int  # segments
+    events_a: int  # segments with pauses of at most ten seconds between them are one
     events_b: int
 
 
@@ -385,10 +394,16 @@ class _Counts:
         self._minutes = [_added(day, label, self._lengths, shape) for label in labels]
         same = labels[0] == labels[1]
         self._both = _added(day[same], labels[0][same], self._lengths[same], shape)
-        self._events = []
-        for label, rows in zip(labels, pieces.rows, strict=True):
-            _, first = np.unique(rows, return_index=True)
-            self._events.append(_added(day[first], label[first], None, shape))
+        self._events = [self._count_events(pieces, label) for label in labels]
+
+    def _count_events(self, pieces: Overlay, labels: Int64) -> Float64:
+        counts = np.zeros((len(self.days), self._classes))
+        for label in np.unique(labels).tolist():
+            own = labels == label
+            events = joined(pieces.starts[own], pieces.ends[own], EVENT_PAUSE)
+            day = np.searchsorted(self.days, events.starts // DAY)
+            counts[:, label] = np.bincount(day, minlength=len(self.days))
+        return counts
 
     def confusion(self) -> Float64:
         """Minutes of each pair of classes."""
@@ -419,8 +434,8 @@ class _Counts:
         )
 
 
-def _added(row: Int64, column: Int64, weight: Int64 | None, shape: tuple[int, int]) -> Float64:
-    """Sum weights, or counts, into a table."""
+def _added(row: Int64, column: Int64, weight: Int64, shape: tuple[int, int]) -> Float64:
+    """Sum weights into a table."""
     places = row * shape[1] + column
     return np.bincount(places, weight, shape[0] * shape[1]).astype(np.float64).reshape(shape)
 

@@ -1,12 +1,15 @@
 """Scores of a labelled log against a reference labelling of the same time."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.activity.event_counts import events_of
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import (
     Detections,
@@ -18,10 +21,11 @@ from hearthlog.analyzer.evaluation.event_scores import (
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, all_classes, labelling_of
 from hearthlog.analyzer.logs.layers import find_coverage, with_layers
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.spans import common, joined
+from hearthlog.analyzer.logs.spans import Spans, common, joined, pieces
 from hearthlog.analyzer.marks.label_files import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
+from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
@@ -49,6 +53,14 @@ class LogEvaluation:
     # evaluated seconds by reference label outside the log's classes; excluded from frame
     # scores; any prediction there is a false alarm
     unknown_labels: Mapping[str, float]
+    events: Mapping[str, "EventCount"]  # of the classes that occur in the evaluated time
+
+
+class EventCount(NamedTuple):
+    """Events of a class: spans, merged across pauses of at most ten seconds."""
+
+    reference: int
+    labelled: int
 
 
 def evaluate_labelling(
@@ -91,7 +103,23 @@ def evaluate_labelling(
         evaluated_seconds=_seconds(spans.length),
         ambiguous_seconds=_seconds(ambiguous * FRAME_NANOSECONDS),
         unknown_labels=unknown,
+        events=_event_counts(reference, predicted, spans),
     )
+
+
+def _event_counts(
+    reference: Labelling, predicted: Labelling, spans: Spans
+) -> dict[str, EventCount]:
+    """Count the events of each class, as the report does."""
+
+    def counts(labelling: Labelling) -> Counter[str]:
+        inside, rows, _ = pieces(labelling, spans)
+        within = Labelling(inside.starts, inside.ends, labelling.labels[rows])
+        names = set(within.labels) - {SILENCE}
+        return Counter({name: len(events_of(within, name).starts) for name in names})
+
+    sides = counts(reference), counts(predicted)
+    return {name: EventCount(*(side[name] for side in sides)) for name in sides[0] | sides[1]}
 
 
 def _frames(

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hearthlog.analyzer.logs.locations import UNSURE, ListedLog, Listing, list_logs, size_and_time
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import is_local, open_file, store_errors
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
@@ -27,6 +28,7 @@ _EARLIER = "catalog.parquet", "catalog.index"  # of hearthlog 0.1
 _LAST = (1 << 63) - 1  # the largest integer of SQLite
 _LEAF = b"\x0d"  # kind of a page
 _BATCH = 10_000  # rows
+_AMOUNT = "label", "minutes", "segments", "events", "first", "last"  # of a class in a file
 _MOMENTS = "mtime", "start", "end", "first_stamp", "last_stamp"
 _HOME = re.compile(r"(?:(.*?)/)?\d{4}/\d{2}/\d{2}", re.DOTALL)
 
@@ -105,6 +107,9 @@ CREATE TABLE labels (
     model TEXT,
     minutes REAL NOT NULL,
     segments INTEGER NOT NULL,
+    events INTEGER NOT NULL,
+    first INTEGER NOT NULL,
+    last INTEGER NOT NULL,
     PRIMARY KEY (file, scenario, label)
 ) STRICT, WITHOUT ROWID;
 CREATE VIEW catalog AS
@@ -202,10 +207,10 @@ class Catalog:
             labels: list[dict[str, Any]] = []
             scenarios: list[dict[str, Any]] = []
             for scenario, model, *amounts in self.database.execute(
-                "SELECT scenario, model, label, minutes, segments FROM labels WHERE file = ?",
+                f"SELECT scenario, model, {', '.join(_AMOUNT)} FROM labels WHERE file = ?",  # noqa: S608
                 [row["file"]],
             ):
-                amount = dict(zip(("label", "minutes", "segments"), amounts, strict=True))
+                amount = dict(zip(_AMOUNT, amounts, strict=True))
                 if scenario:
                     scenarios.append({"scenario": scenario, "model": model, **amount})
                 else:
@@ -300,13 +305,13 @@ class Catalog:
             values = [folder, name, *(about[column.name] for column in _FILE)]
             file = self.database.execute(insert, values).lastrowid
             self.database.executemany(
-                "INSERT INTO labels VALUES (?, ?, ?, ?, ?, ?)",
+                "INSERT INTO labels (file, scenario, model, label, minutes, segments, events, "
+                "first, last) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 [
-                    (file, one.get("scenario", ""), one["label"], one.get("model"),
-                     one["minutes"], one["segments"])
+                    (file, one.get("scenario", ""), one.get("model"), *map(one.get, _AMOUNT))
                     for one in (*row.labels, *row.scenarios)
                 ],
-            )  # fmt: skip
+            )
 
     def forget_times(self) -> None:
         """Let the next query list all folders, as some of their logs have no row."""
@@ -478,7 +483,14 @@ class HomeTotals:
 
 @dataclass(frozen=True)
 class LabelAmount:
-    """Minutes and segments of one label in one home."""
+    """Minutes, segments and events of one label in one home.
+
+    Attributes
+    ----------
+    events : int
+        Segments of all microphones of a recorder with pauses of at most ten seconds are one
+        event, as everywhere.
+    """
 
     home: str
     kind: str  # kind of the source files: `log`, `relabel`, `review`
@@ -486,6 +498,7 @@ class LabelAmount:
     label: str
     minutes: float
     segments: int
+    events: int
     scenario: str = ""  # empty for the sounds of the home
 
 
@@ -510,11 +523,16 @@ def label_amounts(catalog: Catalog) -> list[LabelAmount]:
         and descending minutes.
     """
     rows = catalog.database.execute(
-        "SELECT home, kind, iif(scenario = '', files.model, labels.model) AS by_model, label, "
-        "sum(minutes) AS total, sum(segments), scenario "
-        "FROM labels JOIN files USING (file) JOIN folders USING (folder) "
+        # An event may go on in the next log of its recorder.
+        "SELECT home, kind, by_model, label, sum(minutes) AS total, sum(segments), "
+        "sum(events - coalesce(first <= before + ?, 0)), scenario FROM ("
+        "SELECT *, iif(scenario = '', files.model, labels.model) AS by_model, max(last) OVER ("
+        "PARTITION BY home, node, kind, iif(scenario = '', files.model, labels.model), label, "
+        "scenario ORDER BY first, last ROWS BETWEEN UNBOUNDED PRECEDING AND 1 PRECEDING"
+        ") AS before FROM labels JOIN files USING (file) JOIN folders USING (folder)) "
         "GROUP BY home, kind, by_model, label, scenario "
-        "ORDER BY scenario <> '', home, kind, scenario, by_model, total DESC, label"
+        "ORDER BY scenario <> '', home, kind, scenario, by_model, total DESC, label",
+        (EVENT_PAUSE,),
     )
     return [LabelAmount(*row) for row in rows]
 
@@ -527,7 +545,9 @@ def export_parquet(catalog: Catalog, path: Path) -> None:
     import pyarrow as pa  # noqa: PLC0415  only for this
     import pyarrow.parquet as pq  # noqa: PLC0415  only for this
 
-    amount = [("label", pa.string()), ("minutes", pa.float64()), ("segments", pa.int64())]
+    amount = [("label", pa.string()), ("minutes", pa.float64())]
+    amount += [(name, pa.int64()) for name in ("segments", "events")]
+    amount += [(name, pa.timestamp("ns", "UTC")) for name in ("first", "last")]
     scenario = [("scenario", pa.string()), ("model", pa.string()), *amount]
     own = {"labels": pa.list_(pa.struct(amount)), "scenarios": pa.list_(pa.struct(scenario))}
     own |= dict.fromkeys(("first_frame", "last_frame"), pa.uint64())

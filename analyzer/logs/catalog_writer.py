@@ -23,6 +23,7 @@ from hearthlog.analyzer.logs.catalog import (
 from hearthlog.analyzer.logs.labelling import MOST_CLASSES
 from hearthlog.analyzer.logs.locations import ListedLog, list_logs, size_and_time
 from hearthlog.analyzer.logs.selection import decode_types, is_compatible
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NONE, Spans, joined
 from hearthlog.analyzer.workers.workers import InlineWorkers, Workers
 from hearthlog.schemas.errors import HearthlogError, LogError, Progress, ignore_progress
 from hearthlog.schemas.files import map_logs
@@ -45,7 +46,7 @@ from hearthlog.schemas.messages.topics import (
 
 _FEATURES: dict[str, Sequence[str]] = {message_types.FEATURES: ("header.stamp", "frame")}
 _EVENTS: dict[str, Sequence[str]] = {
-    message_types.SEGMENT: ("duration", "label"),
+    message_types.SEGMENT: ("header.stamp", "duration", "label"),
     message_types.GAP: ("duration",),
 }
 _OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
@@ -53,6 +54,7 @@ _OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
 )
 _LONGEST = 1000  # maximum characters of a text from a log
 _LAST = (1 << 63) - 1  # the largest number of a frame in a catalogue
+_MOST_EVENTS = 100_000  # of a class in a log; ten seconds apart, a day has 8,640
 
 
 @dataclass
@@ -74,6 +76,7 @@ class LogInventory:
     # by scenario (empty for the sounds of the home) and by label
     seconds: dict[str, Counter[str]] = field(default_factory=dict)
     segments: dict[str, Counter[str]] = field(default_factory=dict)  # number of segments
+    events: dict[str, dict[str, Spans]] = field(default_factory=dict)  # of all microphones
 
 
 def read_contents(path: Path, labelling: str) -> LogInventory:
@@ -191,8 +194,23 @@ class _Reading:
         ):
             counts[label[:_LONGEST]] += count
             lengths[label[:_LONGEST]] += length
+        events = self._contents.events.setdefault(scenario, {})
+        ends = columns["header.stamp"] + columns["duration"]
+        for number, label in enumerate(labels.tolist()):
+            own = numbers == number
+            before = events.get(label[:_LONGEST], NONE)
+            events[label[:_LONGEST]] = joined(
+                np.append(before.starts, columns["header.stamp"][own]),
+                np.append(before.ends, ends[own]),
+                EVENT_PAUSE,
+            )
         if len(amounts[0]) > MOST_CLASSES:
             raise LogError(f"{self._file.path}: has more than {MOST_CLASSES} scenarios")
+        if any(len(one.starts) > _MOST_EVENTS for one in events.values()):
+            raise LogError(
+                f"{self._file.path}: has more than {_MOST_EVENTS} events of a class; no log of "
+                "a day has so many"
+            )
         if len(counts) > MOST_CLASSES:
             raise LogError(
                 f"{self._file.path}: has more than {MOST_CLASSES} different labels; "
@@ -268,7 +286,9 @@ def _filled(row: CatalogRow, contents: LogInventory) -> CatalogRow:
 def _labels(contents: LogInventory, scenario: str) -> Iterator[dict[str, Any]]:
     for label, count in sorted(contents.segments.get(scenario, {}).items()):
         minutes = contents.seconds[scenario][label] / 60
-        yield {"label": label, "minutes": minutes, "segments": count}
+        starts, ends = contents.events[scenario][label]
+        own = {"label": label, "minutes": minutes, "segments": count, "events": len(starts)}
+        yield own | {"first": int(starts[0]), "last": int(ends[-1])}
 
 
 def _model(record: Mapping[str, str], scenario: str) -> str:

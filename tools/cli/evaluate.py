@@ -27,6 +27,7 @@ from hearthlog.tools.cli.options import (
 )
 from hearthlog.tools.cli.tables import (
     print_coughs,
+    print_event_counts,
     print_reliability,
     print_scenes,
     print_scores,
@@ -248,6 +249,7 @@ def evaluate_log(
                 "evaluated_seconds": result.evaluated_seconds,
                 "ambiguous_seconds": result.ambiguous_seconds,
                 "unknown_labels": dict(result.unknown_labels),
+                "events": {name: one._asdict() for name, one in result.events.items()},
             }
         )
     else:
@@ -257,6 +259,7 @@ def evaluate_log(
             f"{number(result.scores.groups, 'block')} of time\n"
         )
         print_scores(result.scores, result.detections)
+        print_event_counts(result.events)
         if result.ambiguous_seconds:
             amount = f"{result.ambiguous_seconds:.1f} s have two labels in the reference"
             print(f"\n{amount}: left out of the scores of frames")

@@ -482,7 +482,7 @@ def _print_homes(
     print_table(("home", *_COUNTS, *_FIGURES), _home_rows(homes))
     if len(homes) > _HOMES_SHOWN:
         print(f"and {len(homes) - _HOMES_SHOWN} more homes (--json lists all)")
-    print_table(("labels", "model", "label", "minutes", "segments"), _label_sums(labels), words=3)
+    print_table(("labels", "model", "label", "minutes", "events"), _label_sums(labels), words=3)
     print_lines(first_of("unfinished", unfinished))
 
 
@@ -516,9 +516,7 @@ def _label_sums(labels: Sequence["LabelAmount"]) -> Iterator[Sequence[str]]:
     for one in labels:
         kind = f"{one.kind}, scenario {one.scenario}" if one.scenario else one.kind
         key = kind, one.model or "", one.label
-        minutes, segments = sums.get(key, (0.0, 0))
-        sums[key] = minutes + one.minutes, segments + one.segments
-    for key, (minutes, segments) in sorted(
-        sums.items(), key=lambda item: (item[0][:2], -item[1][0])
-    ):
-        yield [*key[:2], in_words(key[2]), f"{minutes:.1f}", str(segments)]
+        minutes, events = sums.get(key, (0.0, 0))
+        sums[key] = minutes + one.minutes, events + one.events
+    for key, (minutes, events) in sorted(sums.items(), key=lambda item: (item[0][:2], -item[1][0])):
+        yield [*key[:2], in_words(key[2]), f"{minutes:.1f}", str(events)]

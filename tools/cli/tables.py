@@ -9,6 +9,7 @@ from hearthlog.tools.cli.terminal import NAME_WIDTH, moment, print_confusion, pr
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.event_scores import Amounts, Detections, LabellingDifference
+    from hearthlog.analyzer.evaluation.log_scores import EventCount
     from hearthlog.analyzer.evaluation.scenes import SceneScores, SingleCoughs
     from hearthlog.analyzer.review.ranking import ReviewQueue
     from hearthlog.analyzer.training.scores import Bin, Interval, Scores
@@ -52,6 +53,15 @@ def _events(detections: "Detections | None", name: str | None, hours: int) -> tu
     if name is None:
         return *(share(one.macro_f1) for one in both), f"{sum(alarms.values()):.1f}"
     return *(share(one.per_class[name].f1) for one in both), f"{alarms[name]:.1f}"
+
+
+def print_event_counts(events: "Mapping[str, EventCount]") -> None:
+    """Print how many events of each class the report would count, and how many there were."""
+    from hearthlog.models.classes import ordered
+
+    rows = [(_words(name), *map(str, events[name])) for name in ordered(events)]
+    print()
+    print_table(("events", "reference", "labelled"), rows)
 
 
 def print_counts(classes: Sequence[str], confusion: Sequence[Sequence[int]]) -> None:
@@ -125,7 +135,7 @@ def between(interval: "Interval | None") -> str:
     return "-" if interval is None else f"{interval[0]:.3f}-{interval[1]:.3f}"
 
 
-_AMOUNTS = "minutes a", "minutes b", "both", "segments a", "segments b", "agreement", "kappa"
+_AMOUNTS = "minutes a", "minutes b", "both", "events a", "events b", "agreement", "kappa"
 
 
 def print_difference(difference: "LabellingDifference", spans: int) -> None:

@@ -19,7 +19,8 @@ _STROKE_WIDTH = 2.0  # pixels
 # Ends of lines are round and reach half a width too far, so thin lines side by side fill a strip.
 # The last line goes around the others: else a short sound would be a row of dots on a large screen.
 _STRIP_LINES, _STRIP_WIDTH = 12, 5.0  # screen points
-_ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 4, 6.0, 0.8
+# As many lines as fill a row of 37 points, as of nine classes in a window of 1440.
+_ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 6, 6.0, 0.8
 ROWS_HEIGHT = 0.2  # of all rows: with numbers as wide as those of lanes, both begin at one place
 _SHADES = 10  # of a row; each change of its colour is a line of its own for the viewer
 _GROUND = np.array((13, 13, 13))  # behind the plots of the viewer
