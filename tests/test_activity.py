@@ -13,8 +13,10 @@ from homelife import GENERAL, at, midnight, write_day
 from livehome import rule
 from spliced import run
 
+from hearthlog.analyzer.activity.checked_minutes import read_checked_minutes
 from hearthlog.analyzer.activity.daily_metrics import day_of, home_sound, whole_home
 from hearthlog.analyzer.activity.day_profile import COUNT, LENGTH, Profiles
+from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.activity.segments import read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
@@ -26,7 +28,10 @@ from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, today
-from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, write_marks
+from hearthlog.analyzer.promotion.paired_labels import reference_sounds
+from hearthlog.analyzer.promotion.recent_time import recent_logs, spans_of
 from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import NANOSECONDS
@@ -276,6 +281,44 @@ def test_the_catalogue_a_comparison_and_an_evaluation_count_the_events_of_the_re
         words = "evaluate", "log", logs, "--reference", "review", "--json"
         found = json.loads(hearthlog(*words).stdout)["events"]
         assert found == {name: {"reference": k, "labelled": k} for name, k in events.items()}
+    finally:
+        for layer in layers:
+            layer.unlink()
+
+
+def test_the_gate_knows_the_sounds_of_the_events_that_the_accuracy_counts(logs):
+    times = "01:29:40", "01:50", "05:09:40", "17:30", "20:29:40"
+    drawn = [midnight(DAY) + int(at(time)) * NANOSECONDS for time in times]
+    quiet, coughing = drawn[1:3]
+    marks = [
+        Mark("mic", quiet + n * NANOSECONDS, quiet + (n + 1) * NANOSECONDS, "crying")
+        for n in (10, 15, 40)  # two of them are one event
+    ]
+    marks.append(Mark("mic", coughing, coughing + 30 * NANOSECONDS, "laughing"))
+    layers = set()
+    for start in drawn:
+        span = ReviewedSpan("mic", start, start + MINUTE, made=1, chosen=RANDOM)
+        entries = find_home_logs([logs]).between(start, start + MINUTE)
+        (log,) = [entry.path for entry in entries if not is_layer(entry.path)]
+        inside = [mark for mark in marks if start <= mark.start < start + MINUTE]
+        layers.add(write_marks(log, inside, reviewed=[span]))
+    try:
+        home = find_home_logs([logs])
+        losses: list[str] = []
+        checked = read_checked_minutes(home, "live", *day_span(DAY, ZONE), losses)
+        known = reference_sounds(recent_logs([logs]), losses)
+        assert losses == []
+        assert len(checked) == len(drawn)
+        sounds = {}
+        for sound in (sound for _, own in known for sound in own if sound.random):
+            sounds.setdefault(sound.label, []).append((sound.start, sound.end))
+        events = {name: len(spans_of(own, EVENT_PAUSE).starts) for name, own in sounds.items()}
+        del events[SILENCE]
+        counted = {name: int(own.sum()) for name, own in checked.true.items()}
+        assert events == {name: count for name, count in counted.items() if count}
+        assert events["crying"] == 2
+        assert len(sounds["crying"]) == 3
+        assert "coughing" in events
     finally:
         for layer in layers:
             layer.unlink()
