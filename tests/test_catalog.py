@@ -218,11 +218,15 @@ def test_layers_have_rows_of_their_own_that_name_their_log(fleet):
     assert (relabel.model, relabel.model_sha256) == ("better.1", "ab" * 32)
     assert (relabel.input_sha256, relabel.version, relabel.node) == ("cd" * 32, "7.8.9", "attic")
     assert relabel.frames == 0
-    assert list(relabel.labels) == [
-        {"label": "music", "minutes": 0.1, "segments": 1},
-        {"label": "speech", "minutes": 0.5, "segments": 2},
-    ]
-    assert list(review.labels) == [{"label": "crying", "minutes": 0.5, "segments": 1}]
+    music, speech = relabel.labels
+    second = music["first"] - 12 * SECOND
+    expected = {"label": "music", "minutes": 0.1, "segments": 1, "events": 1}
+    assert music == expected | {"first": second + 12 * SECOND, "last": second + 18 * SECOND}
+    expected = {"label": "speech", "minutes": 0.5, "segments": 2, "events": 1}
+    assert speech == expected | {"first": second, "last": second + 36 * SECOND}
+    (crying,) = review.labels
+    expected = {"label": "crying", "minutes": 0.5, "segments": 1, "events": 1}
+    assert crying == expected | {"first": start, "last": start + 30 * SECOND}
 
 
 def test_a_merged_log_says_what_its_logs_agree_on(fleet, model_file, day, tmp_path, capfd):
@@ -290,7 +294,13 @@ def test_other_programs_read_the_same(fleet):
     for name in times:
         place = table.column_names.index(name)
         table = table.set_column(place, name, table[name].cast(pa.int64()))
-    assert table.to_pylist() == list(map(vars, catalog.rows()))
+    expected = [dict(vars(row)) for row in catalog.rows()]
+    for row in expected:  # the ends of the events are for the totals of a home alone
+        row["labels"] = [
+            {name: value for name, value in one.items() if name not in {"first", "last"}}
+            for one in row["labels"]
+        ]
+    assert table.to_pylist() == expected
     with closing(sqlite3.connect(fleet / CATALOG)) as database:
         found = database.execute("SELECT path, frames FROM catalog ORDER BY home, path").fetchall()
         assert found == [(row.path, row.frames) for row in catalog.rows()]

@@ -147,7 +147,7 @@ def test_agreement_is_that_of_scikit_learn_on_every_frame(pairs):
     assert found.minutes_a == pytest.approx(sum(map(bool, a)) * minutes)
     for name, amounts in found.total.per_class.items():
         assert amounts.minutes_a == pytest.approx(true.count(name) * minutes)
-        assert amounts.events_b == said.count(name)
+        assert amounts.events_b == (name in said)  # within three seconds there is one at most
 
 
 @given(st.lists(st.tuples(*[st.sampled_from(CLASSES)] * 2), min_size=1, max_size=60))

@@ -547,7 +547,6 @@ def export_parquet(catalog: Catalog, path: Path) -> None:
 
     amount = [("label", pa.string()), ("minutes", pa.float64())]
     amount += [(name, pa.int64()) for name in ("segments", "events")]
-    amount += [(name, pa.timestamp("ns", "UTC")) for name in ("first", "last")]
     scenario = [("scenario", pa.string()), ("model", pa.string()), *amount]
     own = {"labels": pa.list_(pa.struct(amount)), "scenarios": pa.list_(pa.struct(scenario))}
     own |= dict.fromkeys(("first_frame", "last_frame"), pa.uint64())
