@@ -524,14 +524,17 @@ def label_amounts(catalog: Catalog) -> list[LabelAmount]:
     """
     rows = catalog.database.execute(
         # An event may go on in the next log of its recorder.
-        "SELECT home, kind, by_model, label, sum(minutes) AS total, sum(segments), "
-        "sum(events - coalesce(first <= before + ?, 0)), scenario FROM ("
-        "SELECT *, iif(scenario = '', files.model, labels.model) AS by_model, max(last) OVER ("
-        "PARTITION BY home, node, kind, iif(scenario = '', files.model, labels.model), label, "
-        "scenario ORDER BY first, last ROWS BETWEEN UNBOUNDED PRECEDING AND 1 PRECEDING"
-        ") AS before FROM labels JOIN files USING (file) JOIN folders USING (folder)) "
-        "GROUP BY home, kind, by_model, label, scenario "
-        "ORDER BY scenario <> '', home, kind, scenario, by_model, total DESC, label",
+        "WITH logs AS (SELECT file, home, kind, model, "
+        "lag(file) OVER (PARTITION BY home, node, kind, model ORDER BY start) AS earlier "
+        "FROM files JOIN folders USING (folder)) "
+        "SELECT home, kind, iif(own.scenario = '', logs.model, own.model) AS by_model, own.label, "
+        "sum(own.minutes) AS total, sum(own.segments), "
+        "sum(own.events - coalesce(own.first <= before.last + ?, 0)), own.scenario "
+        "FROM logs JOIN labels AS own USING (file) LEFT JOIN labels AS before ON "
+        "before.file = earlier AND before.scenario = own.scenario AND before.label = own.label "
+        "AND before.model IS own.model "
+        "GROUP BY home, kind, by_model, own.label, own.scenario "
+        "ORDER BY own.scenario <> '', home, kind, own.scenario, by_model, total DESC, own.label",
         (EVENT_PAUSE,),
     )
     return [LabelAmount(*row) for row in rows]
