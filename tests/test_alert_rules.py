@@ -54,7 +54,7 @@ def home(*segments, covered=(), classes=None, written=()):
     for start, seconds in written:
         begin = NOON + round(start * SECOND)
         gathered.add_written_span(begin, begin + round(seconds * SECOND))
-    return gathered.heard()
+    return gathered.activity()
 
 
 def rung(one, heard, hours=24):
@@ -254,7 +254,7 @@ def test_a_night_unlike_those_of_the_four_weeks_before_rings_in_the_morning():
             gathered.add_segment("mic", start, start + SECOND, "coughing", 1.0)
     one = rule("unlike_usual", part="night", **{"class": "cough"})
     first, last = midnight(days[0]), midnight(days[-1]) + DAY
-    found, _ = notifications(one, gathered.heard(), first, last, UTC)
+    found, _ = notifications(one, gathered.activity(), first, last, UTC)
     assert [(ring.time, ring.text) for ring in found] == [
         (
             midnight(days[20]) + 8 * HOUR * SECOND,
@@ -277,7 +277,7 @@ def test_a_day_is_compared_by_the_counts_of_the_report_without_coughs_beside_a_t
                 gathered.add_segment("mic", start, start + 20 * SECOND, "speech", 1.0)
         one = rule("unlike_usual", **{"class": "cough"})
         start = midnight(days_of(1)[0])
-        found, _ = notifications(one, gathered.heard(), start, start + 12 * DAY, UTC)
+        found, _ = notifications(one, gathered.activity(), start, start + 12 * DAY, UTC)
         return [ring.text for ring in found]
 
     assert texts(is_television=False) == ["Coughing on 2026-02-11: 40 times, usually 5"]
@@ -297,7 +297,7 @@ def test_a_day_rings_only_with_a_week_to_compare_it_with_of_which_enough_was_hea
         start = midnight(days_of(1)[0])
         return [
             ring.text
-            for ring in notifications(one, gathered.heard(), start, start + 99 * DAY, UTC)[0]
+            for ring in notifications(one, gathered.activity(), start, start + 99 * DAY, UTC)[0]
         ]
 
     expected = ["Music on 2026-02-08: 1 h 00 min, usually 10 min"]

@@ -96,7 +96,7 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
             if second in labels:
                 live.add_label("mic", LiveLabel(second * SECOND, labels[second], 0.9), CLASSES)
         until = live.known_until(now)
-        new = watch.evaluate(live.heard, pytest.fail, until, now)
+        new = watch.evaluate(live.activity, pytest.fail, until, now)
         assert all(now - each.time < 90 * SECOND for each in new)
         found += new
         live.forget_before(watch.needed_from(now))
@@ -123,19 +123,19 @@ def test_what_was_read_and_the_news_after_it_are_the_activity_of_a_replay(tmp_pa
     ]
     live = LiveActivity(begin, 30 * SECOND)
     live.read(logs, "home", begin + 2 * HOUR * SECOND, pytest.fail)
-    halfway = live.heard().written
+    halfway = live.activity().written
     assert len(halfway.starts) == 1, "the recorder wrote in the gap, too"
     for number in range(8):
         edges = [begin + half * HOUR * SECOND // 2 for half in (number, number + 1)]
         live.push([part.between(*edges) for part in columns])
     live.push([part.between(begin + 4 * HOUR * SECOND, None) for part in columns])
     expected = read_activity(logs, "home", begin, 1 << 62, pytest.fail)
-    assert live.heard().sounds.keys() == expected.sounds.keys()
+    assert live.activity().sounds.keys() == expected.sounds.keys()
     for key, own in expected.sounds.items():
-        got = live.heard().sounds[key]
+        got = live.activity().sounds[key]
         np.testing.assert_array_equal(got.starts, own.starts)
         np.testing.assert_array_equal(got.ends, own.ends)
-    for one, other in zip(live.heard().coverage["mic"], expected.coverage["mic"], strict=True):
+    for one, other in zip(live.activity().coverage["mic"], expected.coverage["mic"], strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -158,7 +158,7 @@ def test_a_scenario_that_is_taken_away_keeps_nobody_waiting():
             live.add_label("mic-water", LiveLabel(time, "tap_water", 0.9), ["silence", "tap_water"])
     assert time - live.known_until(time) < 10 * SECOND
     assert [name for name, *_ in live.open_segments()] == ["mic"]
-    taps = live.heard().of("tap_water")
+    taps = live.activity().of("tap_water")
     assert taps.ends.tolist() == [begin + (3599 - 5) * SECOND]
 
 
@@ -170,10 +170,10 @@ def test_what_was_heard_before_a_recorder_was_killed_stays_heard(tmp_path):
     live = LiveActivity(begin, 30 * SECOND)
     for second in range(100, 2 * HOUR, 10):
         live.add_label("mic", LiveLabel(begin + second * SECOND, "silence", 0.9), CLASSES)
-    before = live.heard().coverage["mic"].length
+    before = live.activity().coverage["mic"].length
     assert before > 1.9 * HOUR * SECOND
     live.push([gaps])
-    assert live.heard().coverage["mic"].length == before
+    assert live.activity().coverage["mic"].length == before
 
 
 def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
@@ -208,7 +208,7 @@ def test_a_new_rule_does_not_ring_for_the_silence_before_it(tmp_path):
     silent = rule("recorder_silent", "silent", silent_for="10m")
     begin = midnight(DAY)
     watch, _, _ = watching(tmp_path, [silent], begin)
-    nothing = SegmentCollector().heard()
+    nothing = SegmentCollector().activity()
 
     def ring_times(minutes):
         until = begin + minutes * 60 * SECOND
@@ -269,7 +269,7 @@ def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_t
     said, now = [], midnight(DAY) + 4 * HOUR * SECOND
     silent = rule("recorder_silent", "silent", silent_for="10m", cooldown="1m")
     watch, outbox, memory = watching(tmp_path, [silent, QUIET, COUGHS], now, said.append)
-    nothing = SegmentCollector().heard()
+    nothing = SegmentCollector().activity()
 
     def evaluate(until):
         return watch.evaluate(lambda: nothing, pytest.fail, until, until)
@@ -401,7 +401,7 @@ def news_of_water(time, columns=()):
         label="tap_water",
         confidence=0.9,
         classes=CLASSES,
-        heard=SimpleNamespace(time=time),
+        active=SimpleNamespace(time=time),
     )
     state = HomeState()
     state.microphones["mic"] = microphone

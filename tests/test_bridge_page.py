@@ -637,7 +637,7 @@ def test_what_was_not_heard_is_marked_as_such():
     fields = {"header.stamp": np.array([begin + 12 * hour]), "duration": np.array([2 * hour])}
     state.push([Columns("/mic/gap", message_types.GAP, {}, times, times, times, fields)])
     (microphone,) = state.microphones.values()
-    microphone.heard.time, microphone.seen = begin + 18 * hour, time.monotonic() - 60
+    microphone.active.time, microphone.seen = begin + 18 * hour, time.monotonic() - 60
     now = today(begin + 20 * hour, UTC)
     gaps = picture_of(HomeDay([microphone], now, UTC))["rooms"][0]["gaps"]
     assert gaps == [(0, 0.25), (0.5, 0.5833), (0.75, 0.8333)]

@@ -123,7 +123,7 @@ class ActiveClasses:
     def __init__(self, classes: Sequence[str]) -> None:
         self.time = 0
         self._classes = list(classes)
-        self._last_heard = dict.fromkeys([*classes, ANY_SOUND], 0)
+        self._last_active = dict.fromkeys([*classes, ANY_SOUND], 0)
         self._last_labels = np.empty(0, np.int64)  # less than a second of them
 
     def push(self, labels: Sequence[str], times: Int64) -> None:
@@ -137,22 +137,22 @@ class ActiveClasses:
         if not len(times):
             return
         if times[0] < self.time:  # the clock was set back: earlier labels are not recent
-            self._last_heard = dict.fromkeys(self._last_heard, 0)
+            self._last_active = dict.fromkeys(self._last_active, 0)
             self._last_labels = self._last_labels[:0]
         places = {name: place for place, name in enumerate(self._classes)}
         new = np.array([places.get(label, -1) for label in labels])
         known = np.concatenate([self._last_labels, new])
         silence = places.get(SILENCE, -2)
-        for name in self._last_heard:
+        for name in self._last_active:
             is_of = known != silence if name == ANY_SOUND else known == places[name]
             sums = np.concatenate([np.zeros(_SECOND, np.int64), np.cumsum(is_of)])
-            heard = (sums[_SECOND:] - sums[:-_SECOND])[len(self._last_labels) :] >= _LEAST
-            if heard.any():
-                self._last_heard[name] = int(times[np.flatnonzero(heard)[-1]])
+            active = (sums[_SECOND:] - sums[:-_SECOND])[len(self._last_labels) :] >= _LEAST
+            if active.any():
+                self._last_active[name] = int(times[np.flatnonzero(active)[-1]])
         self._last_labels = known[-_SECOND + 1 :]
         self.time = int(times[-1])
 
-    def is_heard(self, name: str) -> bool:
+    def is_active(self, name: str) -> bool:
         """Whether a class was active in the last ten seconds before the newest label."""
-        last = self._last_heard.get(name, 0)
+        last = self._last_active.get(name, 0)
         return last > 0 and self.time - last <= HOLD_SECONDS * NANOSECONDS

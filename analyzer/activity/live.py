@@ -207,9 +207,9 @@ class LiveActivity:
             until = min(until, max(known, now - self._patience) if is_away else known)
         return until if self._pending else now - self._patience
 
-    def heard(self) -> HomeActivity:
+    def activity(self) -> HomeActivity:
         """Return the activity, with open segments."""
-        return self._collector.heard(self.open_segments())
+        return self._collector.activity(self.open_segments())
 
     @property
     def classes(self) -> Mapping[str, Collection[str]]:
@@ -217,7 +217,7 @@ class LiveActivity:
         return self._collector.classes
 
     def open_segments(self) -> list[tuple[str, int, int, str, float]]:
-        """Return the open segments, as input of `SegmentCollector.heard`."""
+        """Return the open segments, as input of `SegmentCollector.activity`."""
         runs = ((name, each.estimate()) for name, each in self._pending.items())
         return [(name, *run) for name, run in runs if run is not None]
 

@@ -273,7 +273,7 @@ class SegmentCollector:
         """Start of the recorder's last uninterrupted writing; None if it never wrote."""
         return self._written.last_start
 
-    def heard(self, others: Sequence[tuple[str, int, int, str, float]] = ()) -> HomeActivity:
+    def activity(self, others: Sequence[tuple[str, int, int, str, float]] = ()) -> HomeActivity:
         """Return the activity so far, with open segments.
 
         Parameters
@@ -336,7 +336,7 @@ def read_activity(  # noqa: PLR0913, PLR0917
     progress : callable, optional
         Called with the share of the logs read so far, 0 to 1.
     others : sequence of (str, int, int, str, float), optional
-        Open segments that are in no log yet, as for `SegmentCollector.heard`.
+        Open segments that are in no log yet, as for `SegmentCollector.activity`.
     """
     collector = SegmentCollector()
     entries = [
@@ -348,7 +348,7 @@ def read_activity(  # noqa: PLR0913, PLR0917
         except LogError as error:
             lose(str(error))
         progress(number / len(entries))
-    return collector.heard(others)
+    return collector.activity(others)
 
 
 def _add_log(

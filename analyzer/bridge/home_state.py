@@ -106,7 +106,7 @@ class LiveMicrophone:
         self.never_tell: frozenset[str] = frozenset()  # classes that no output shows
         self.common_names: Mapping[str, str] = {}  # of classes that the model takes for one another
         self.names: list[str] = []
-        self.heard = ActiveClasses([])
+        self.active = ActiveClasses([])
         self.label, self.confidence = "", 0.0
         self.level_dbfs = math.nan
         self.gaps: list[tuple[int, int]] = []
@@ -175,8 +175,8 @@ class LiveMicrophone:
         classes = _class_names(columns)
         if classes and classes != self.names:
             self.names = classes
-            self.heard = ActiveClasses(classes)
-        self.heard.push(columns["label"].tolist(), columns.log_times)
+            self.active = ActiveClasses(classes)
+        self.active.push(columns["label"].tolist(), columns.log_times)
         self.since = self.since or int(columns.log_times[0])
         self.label = str(columns["label"][-1])
         self.confidence = float(columns["confidence"][-1])
@@ -323,7 +323,7 @@ class LiveMicrophone:
         spans = [(start, self.since or end), *self.gaps]
         spans += zip(own.ends[:-1].tolist(), own.starts[1:].tolist(), strict=True)
         if not self.is_listening():
-            spans.append((max(self.heard.time, self._latest), end))
+            spans.append((max(self.active.time, self._latest), end))
         inside = [(max(a, start), min(b, end)) for a, b in spans]
         starts, ends = np.array([(a, b) for a, b in inside if a < b], np.int64).reshape(-1, 2).T
         return joined(starts, ends)
@@ -335,8 +335,8 @@ class LiveMicrophone:
             event = self._records[label].current
             # The label may precede the event if the clock was set back. Ongoing sound has no
             # segment yet.
-            is_quiet = event is None or abs(self.heard.time - event.end) > _DECIDED
-            if not self.is_listening() or (is_quiet and not self.heard.is_heard(label)):
+            is_quiet = event is None or abs(self.active.time - event.end) > _DECIDED
+            if not self.is_listening() or (is_quiet and not self.active.is_active(label)):
                 self._unended.remove(label)
                 ended += [] if event is None else [event]
         return [event for event in ended if event.label not in self.never_tell]

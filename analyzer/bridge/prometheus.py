@@ -193,7 +193,7 @@ class HomeCollector(Collector):
         present = {(node, each.name): each for each in state.present()}
         listening = {names: each.is_listening() for names, each in present.items()}
         levels = {n: each.level_dbfs if listening[n] else math.nan for n, each in present.items()}
-        newest = {names: each.heard.time / NANOSECONDS for names, each in present.items()}
+        newest = {names: each.active.time / NANOSECONDS for names, each in present.items()}
         problems = {(node, subject): health.level for subject, health in state.health.items()}
         yield of_home("recording", "Whether the recorder writes.", {(node,): state.is_recording()})
         yield of_microphone("listening", "Whether labels come.", listening)

@@ -207,7 +207,7 @@ class Chunk:
         budget: "RecordBudget",
     ) -> None:
         self.content: MessageBatch | None = None  # None if the chunk is too damaged to be read
-        self.whole = False  # whether `content` has all of its messages
+        self.is_complete = False  # whether `content` has all of its messages
         self.offset = record.offset
         self._length = record.length
         self._findings = findings
@@ -234,7 +234,7 @@ class Chunk:
         if self._head.crc and zlib.crc32(self._records) != self._head.crc:
             self._error("chunk-crc", "a chunk has another checksum than it claims")
             return
-        self.whole = True
+        self.is_complete = True
 
     def add_index(self, record: Record) -> None:
         """Add a message index that follows the chunk."""
@@ -264,11 +264,11 @@ class Chunk:
         cut : bool
             Whether message indexes may be missing after the chunk: they are then not compared.
         """
-        if not self.whole:
+        if not self.is_complete:
             return
         entries = np.frombuffer(b"".join(self._indexes.values()), INDEX_ENTRIES)
         self._find_records(np.sort(entries["offset"]))
-        if self.content is not None and self.whole:
+        if self.content is not None and self.is_complete:
             self._check_times(self.content.heads["log_time"].astype(np.uint64))
             if not cut:
                 self._check_index(self.content)
@@ -297,10 +297,10 @@ class Chunk:
         starts, others, end = _split(records, hints, self._budget)
         if self._budget.left < 0:
             self._error("too-large", "the file holds more records than one of its size can")
-            self.whole = False
+            self.is_complete = False
         elif end != len(records):
             self._error("chunk-records", "the last record of a chunk is damaged")
-            self.whole = False
+            self.is_complete = False
         new: dict[int, int] = {}
         for start in others.tolist():
             opcode, length = HEAD.unpack_from(records, start)
@@ -313,7 +313,7 @@ class Chunk:
         """Read a record other than a message; return a newly defined channel and its position."""
         if opcode == Opcode.MESSAGE:
             self._error("message-short", f"a message at byte {start} of a chunk is too short")
-            self.whole = False
+            self.is_complete = False
         elif opcode not in {Opcode.SCHEMA, Opcode.CHANNEL}:
             report = self._findings.error if opcode <= Opcode.DATA_END else self._findings.warning
             what = f"{name_of(opcode)} inside a chunk"

@@ -95,7 +95,7 @@ def _examine(file: LocalFile, examined: ExaminedFile, progress: Progress) -> Non
     data = DataSection(findings, _KEPT, size, checks, ours=ours)
     walk = RecordWalk(file, findings, sorted(offsets), finished=finished)
     complete = _walk(walk, data, summary_start, progress)
-    whole = data.whole and not walk.damaged
+    is_readable = data.is_readable and not walk.damaged
     if complete:
         _check_end(walk, findings)
     elif finished:
@@ -111,10 +111,12 @@ def _examine(file: LocalFile, examined: ExaminedFile, progress: Progress) -> Non
         findings.warning("newer", text)
     if isinstance(data.checks, MessageChecks):
         data.checks.finish()
-        MetadataChecks(data, data.checks, findings, finished=complete, whole=whole).check()
+        MetadataChecks(
+            data, data.checks, findings, finished=complete, is_readable=is_readable
+        ).check()
         examined.ours, examined.frames = True, data.checks.frames
         examined.node = records[0].get("node", "") if records else ""
-    if CONTENTS in data.metadata and complete and whole:
+    if CONTENTS in data.metadata and complete and is_readable:
         _check_contents(findings)
     examined.span = data.span
 
@@ -162,7 +164,9 @@ def _walk(walk: RecordWalk, data: DataSection, summary_start: int, progress: Pro
             data.ended = True
         if summary is None and data.ended:
             data.finish(cut=False)
-            summary = SummarySection(data, data.findings, whole=data.whole and not walk.damaged)
+            summary = SummarySection(
+                data, data.findings, is_readable=data.is_readable and not walk.damaged
+            )
         if summary is None:
             data.add(record)
             progress(record.offset / walk.size)
@@ -447,13 +451,13 @@ def examine(
 
 def _examine_all(logs: Sequence[Path], progress: Progress) -> list[ExaminedFile]:
     sizes = [log.stat().st_size if log.is_file() else 0 for log in logs]
-    whole = max(sum(sizes), 1)
+    total = max(sum(sizes), 1)
     files = []
     done = 0
     for log, size in zip(logs, sizes, strict=True):
 
         def tell(share: float, done: int = done, size: int = size) -> None:
-            progress((done + share * size) / whole)
+            progress((done + share * size) / total)
 
         files.append(examine_file(log, tell))
         done += size

@@ -319,7 +319,7 @@ class MetadataChecks:
 
     Parameters
     ----------
-    whole : bool
+    is_readable : bool
         Whether the complete file was readable: counts are compared only then.
     """
 
@@ -330,13 +330,13 @@ class MetadataChecks:
         findings: Findings,
         *,
         finished: bool,
-        whole: bool,
+        is_readable: bool,
     ) -> None:
         self._data = data
         self._infos = messages.infos
         self._findings = findings
         self._finished = finished
-        self._whole = whole
+        self._is_readable = is_readable
         self._records = data.metadata.get(HEARTHLOG_METADATA, [])
         self._channels = {c.topic: c for c in data.definitions.channels.values()}
 
@@ -511,7 +511,7 @@ class MetadataChecks:
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             self._error("rosbag2", f"metadata {ROSBAG2} cannot be read ({error!r})")
             return
-        if not self._whole:
+        if not self._is_readable:
             return
         actual: Counter[str] = Counter()
         for number, channel in self._data.definitions.channels.items():

@@ -98,7 +98,7 @@ class DataSection:
         self.span: tuple[int, int] | None = None  # first and last log time
         # Expected index content, by opcode of the index and by offset.
         self.expected_indexes: dict[int, dict[int, bytes]] = {opcode: {} for opcode in _INDEXES}
-        self.whole = True  # whether everything could be read
+        self.is_readable = True  # whether everything could be read
         self.loose = False  # whether there are messages outside of chunks
         self.ended = False  # whether there was a Data End
         self.findings = findings
@@ -172,7 +172,7 @@ class DataSection:
                 what = "the data section has another checksum than its Data End says"
                 self.findings.error("data-crc", what, RECOVER, offset=record.offset)
         else:
-            self.whole = False
+            self.is_readable = False
 
     def _add_attachment(self, attachment: Attachment, record: Record) -> None:
         times = attachment.log_time, attachment.create_time
@@ -212,13 +212,13 @@ class DataSection:
         if chunk is None:
             return
         chunk.check(cut=cut)
-        self.whole &= chunk.whole
+        self.is_readable &= chunk.is_complete
         index = chunk.index_content()
         if index is not None:
             self.expected_indexes[Opcode.CHUNK_INDEX][chunk.offset] = index
         if chunk.content is not None:
             self._add_messages(chunk.content)
-        if not chunk.whole:
+        if not chunk.is_complete:
             self._hand_on()
             self.checks.interrupt()
 
@@ -227,7 +227,7 @@ class DataSection:
         if record.length < MESSAGE_HEAD.itemsize:
             what = "a message is too short"
             self.findings.error("message-short", what, RECOVER, offset=record.offset)
-            self.whole = False
+            self.is_readable = False
             return
         if not self._run:
             self._run_offset = record.offset
@@ -273,14 +273,14 @@ class SummarySection:
 
     Parameters
     ----------
-    whole : bool
+    is_readable : bool
         Whether the data section was completely readable: else the index is not compared with it.
     """
 
-    def __init__(self, data: DataSection, findings: Findings, *, whole: bool) -> None:
+    def __init__(self, data: DataSection, findings: Findings, *, is_readable: bool) -> None:
         self._data = data
         self._findings = findings
-        self._whole = whole
+        self._is_readable = is_readable
         self._starts: dict[int, int] = {}  # of the record groups, by opcode
         self._lengths: Counter[int] = Counter()
         self._last = 0
@@ -327,7 +327,7 @@ class SummarySection:
                 self._error("summary-crc", what, record.offset)
         self._check_offsets()
         self._check_complete(record.offset)
-        if self._whole:
+        if self._is_readable:
             for offset, statistics in self._statistics:
                 self._check_statistics(offset, statistics)
 
@@ -361,7 +361,7 @@ class SummarySection:
 
     def _copy(self, definition: Any, originals: Any, record: Record) -> None:
         self._copies[type(definition)][definition.id] = definition
-        if not self._whole or originals.get(definition.id) == definition:
+        if not self._is_readable or originals.get(definition.id) == definition:
             return
         name = f"{name_of(record.opcode)} {definition.id}"
         if definition.id in originals:
@@ -382,7 +382,7 @@ class SummarySection:
             if offset in self._data.expected_indexes[record.opcode]:
                 what = f"a second {name_of(record.opcode)} for the {thing} at byte {offset}"
                 self._error("index-twice", what, record.offset)
-            elif self._whole:
+            elif self._is_readable:
                 what = f"{name_of(record.opcode)} for byte {offset}, where no {thing} is"
                 self._error("index-place", what, record.offset)
             return

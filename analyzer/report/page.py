@@ -155,7 +155,7 @@ def week_page(account: Account) -> str:
     """Return the page of a week."""
     first, last = account.days[0].day, account.days[-1].day
     spoken = f"{date_in_words(first)} to {date_in_words(last)}"
-    names = [name for name in account.classes if name != SILENCE and _was_heard(account, name)]
+    names = [name for name in account.classes if name != SILENCE and _occurs(account, name)]
     drawn = occurring_classes(account.days)
     days = [(short_day(day.day), timeline_of(day, drawn)) for day in account.days]
     described = " ".join(f"{name}: {_description(each)}" for name, each in days)
@@ -201,7 +201,7 @@ def _description(timeline: DayTimeline) -> str:
 def _page(account: Account, picture: PagePicture, **parts: Any) -> str:
     days = [day for day in (*account.before, *account.days) if day.coverage.length]
     names = [name for name in account.classes if name not in {SILENCE, UNKNOWN}]
-    absent = [name for name in names if _is_known(account, name) and not _was_heard(account, name)]
+    absent = [name for name in names if _is_known(account, name) and not _occurs(account, name)]
     uncertain = [name for name in names if not _is_known(account, name)]
     uncounted = [name for name in SET_APART if name in account.classes]
     return fill_page(
@@ -220,7 +220,7 @@ def _page(account: Account, picture: PagePicture, **parts: Any) -> str:
         days_before=BASELINE_DAYS,
         interrai=_interrai(account, days),
         interrai_days=ASSESSED_DAYS,
-        interrai_heard=_heard(days),
+        interrai_covered=_covered_days(days),
         **parts,
     )
 
@@ -229,7 +229,7 @@ def _listed(names: Sequence[str]) -> str:
     return listed([in_words(name).lower() for name in names], "and")
 
 
-def _heard(days: Sequence[DayMetrics]) -> str:
+def _covered_days(days: Sequence[DayMetrics]) -> str:
     """Return how many days are covered, and how many of them in part: `2 of them heard`."""
     partly = sum(day.share < MOST for day in days)
     return f"{len(days)} of them heard" + (f", {partly} only in part" if partly else "")
@@ -277,7 +277,7 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
         value, uncounted = figure.value(day), day.beside_television(name)
         if name == SILENCE:
             cells = [Cell(""), Cell(""), _cell(account, lasting, day)]
-        elif _was_heard(account, name) and (value is not None or uncounted):
+        elif _occurs(account, name) and (value is not None or uncounted):
             cell = _cell(account, figure, day)
             notes = [f"{_NOT_COUNTED}: {uncounted}"] * bool(uncounted) + [cell.note] * bool(
                 cell.note
@@ -312,7 +312,7 @@ def _times(day: DayMetrics, starts: Int64) -> str:
     return " to ".join(clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max()))
 
 
-def _was_heard(account: Account, name: str) -> bool:
+def _occurs(account: Account, name: str) -> bool:
     """Return whether a class has a value, now or in its usual range."""
     baseline = account.baseline(event_figure(name))
     values = [day.count(name) for day in account.days]
@@ -464,7 +464,7 @@ def _interrai(account: Account, days: Sequence[DayMetrics]) -> PageTable:
         text = _text(number)
         if account.checked and not _is_checked(number):
             text += ", as labelled"
-        rows.append(_row(item.topic, item.heard, text, item.limits))
+        rows.append(_row(item.topic, item.sounds, text, item.limits))
     count = "Count" if account.checked else "Count, as labelled"
     heads = ["The form asks about", "Heard here", count, "What sound cannot tell"]
     return PageTable(heads, rows, "stack")

@@ -143,7 +143,7 @@ def read_account(
         earlier=[day for day in past if any(map(day.comparable, metrics.classes))],
         judged={day: routines.judge(day) for day in days},
         beside={day: len(routines.earlier(day)) for day in days},
-        unheard=_unrecorded(data, *span),
+        uncovered=_unrecorded(data, *span),
         gaps=_within(data.gaps, span),
         troubles=_within(data.troubles, span),
         doubts=_doubts(logs, data, labelling, shown),

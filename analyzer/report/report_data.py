@@ -172,7 +172,7 @@ class Account:
     earlier: Sequence[DayMetrics]  # baseline days
     judged: Mapping[date, DayAnomaly | None]  # of `days`: anomaly of each, if known
     beside: Mapping[date, int]  # of `days`: number of baseline days
-    unheard: Mapping[str, float]  # by microphone: hours without coverage
+    uncovered: Mapping[str, float]  # by microphone: hours without coverage
     gaps: Sequence[Trouble]
     troubles: Sequence[Trouble]
     doubts: Sequence[DoubtfulSound]  # of `days`: those that need a look
@@ -290,7 +290,7 @@ class AssessedItem(NamedTuple):
     """An item of the assessment."""
 
     topic: str  # subject of the item
-    heard: str  # counted sounds
+    sounds: str  # that are counted
     needs: str  # required class; empty if any sound will do
     value: Callable[[DayMetrics], Count | Duration | None]  # count on one day
     limits: str  # limits of sound as evidence

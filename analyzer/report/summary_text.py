@@ -106,7 +106,7 @@ def not_recorded(account: Account) -> Iterator[str]:
         text = Duration(missing / _MINUTE).text
         share = percent(missing / length)
         yield f"Not recorded: {text} ({share}). The report knows nothing about that time."
-    for microphone, hours in account.unheard.items():
+    for microphone, hours in account.uncovered.items():
         if hours * HOUR > missing + _MINUTE:  # another microphone covers this time
             text = Duration(hours * 60).text
             yield f"The microphone {plain(microphone)} did not record for {text}."

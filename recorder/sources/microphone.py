@@ -107,7 +107,7 @@ class MicrophoneSource:
     ) -> None:
         self._own = _Device(device, channels, channel)
         self._fallback = _Device(fallback) if fallback else None
-        self._device_heard = self._own
+        self._device_in_use = self._own
         self._return: ReturnWatch | None = None  # while the fallback is in use
         self._lost_at = -math.inf  # when the device was lost
         self._unfit = ""  # why a connected device cannot be used
@@ -196,7 +196,7 @@ class MicrophoneSource:
                 last_block = self._last_block = block.arrival
                 yield from self._frames_of(block, form.rate)
             if time.monotonic() - last_block > stale and not blocks:
-                self._device_heard.was_silent()
+                self._device_in_use.was_silent()
                 return "the microphone went silent"
             if self._steps_clock():
                 self._framer.step_clock(self._wall_offset)
@@ -211,14 +211,14 @@ class MicrophoneSource:
         """Return why a run of the capture process must end; empty if it need not."""
         if self._return is not None and self._return.is_there:
             return "its device is there again"
-        if self._device_heard.needs_longer_buffer():
+        if self._device_in_use.needs_longer_buffer():
             return "the sound card lost samples: it is opened again with a longer buffer"
         return self._resting()
 
     def _frames_of(self, block: SampleBlock, rate: int) -> Iterator[Event]:
         """Yield the frames completed by a block, and the gap before them."""
         self._overruns += block.overflowed
-        self._device_heard.add(block)
+        self._device_in_use.add(block)
         if not len(block.samples):
             return
         if self._mixer is not None:
@@ -254,7 +254,7 @@ class MicrophoneSource:
         try:
             return open_device(
                 device.wanted,
-                exact=device.was_heard,
+                exact=device.was_opened,
                 channels=device.channels,
                 channel=device.channel,
                 latency=device.latency,
@@ -265,8 +265,8 @@ class MicrophoneSource:
 
     def _on_samples(self, device: "_Device", capture: Capture) -> None:
         self._capture = capture
-        device.is_heard(capture)
-        self._device_heard = device
+        device.opened(capture)
+        self._device_in_use = device
         self.device = device.name
         self._mixer = None
         if device.channels is None and capture.format.channels is not None:
@@ -402,15 +402,15 @@ class _Device:
         self.wanted = device
         self.channels = channels
         self.channel = channel
-        self.was_heard = False
+        self.was_opened = False
         self.latency = LATENCY_SECONDS
         self._may_take_longer = True
         self._last = self._longest_pause = 0.0  # last arrival in this run, longest interval
         self._overflows: deque[float] = deque(maxlen=_OVERFLOWS)  # arrival times
 
-    def is_heard(self, capture: Capture) -> None:
-        heard = capture.format
-        self.name, self.wanted, self.was_heard = heard.device, heard.identity, True
+    def opened(self, capture: Capture) -> None:
+        opened = capture.format
+        self.name, self.wanted, self.was_opened = opened.device, opened.identity, True
         self._last = self._longest_pause = 0.0
         self._overflows.clear()
 

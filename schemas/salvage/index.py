@@ -98,7 +98,7 @@ class Index:
         chunks = array("q")
         offset = start
         while offset < end:
-            whole = self._reader.whole(offset)
+            whole = self._reader.intact(offset)
             record = whole.record
             if isinstance(record, Definition):
                 self.definitions.append(record)
@@ -128,7 +128,7 @@ class Index:
         """Count the messages of consecutive chunks, by channel."""
         messages: Counter[int] = Counter()
         for place in self.chunks[first:last, 5].tolist():
-            record = self._reader.whole(place).record
+            record = self._reader.intact(place).record
             assert isinstance(record, records.ChunkIndex)
             messages.update(_messages_of(record))
         return messages

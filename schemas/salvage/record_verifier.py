@@ -170,7 +170,7 @@ class RecordVerifier:
                 return offset == self.end
         return True
 
-    def whole(self, offset: int, chained: int = 1) -> IntactRecord:
+    def intact(self, offset: int, chained: int = 1) -> IntactRecord:
         """Read a complete record.
 
         Parameters

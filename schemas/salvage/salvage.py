@@ -175,7 +175,7 @@ class Salvage:
             raise McapError("the file holds more messages than one of its size can")
         work = reader.work
         try:
-            whole = reader.chunk(offset) if chunk else reader.whole(offset, 3 if searching else 1)
+            whole = reader.chunk(offset) if chunk else reader.intact(offset, 3 if searching else 1)
             self._count_kept(whole)
             self._doubt(whole, searching=searching)
         except McapError:

@@ -68,21 +68,21 @@ class SoundEvents(NamedTuple):
     ----------
     counted : np.ndarray [shape=(n,)], int64
         When each event reached the minimum length of the rule, and so counts.
-    heard : Spans
+    coverage : Spans
         Joined segments, including those of too short events.
     """
 
     starts: Int64
     ends: Int64
     counted: Int64
-    heard: Spans
+    coverage: Spans
 
-    def heard_counted(self) -> Spans:
+    def counted_coverage(self) -> Spans:
         """Return the heard spans of each event from the time at which the event counts."""
         if self.counted is self.starts:
-            return self.heard
+            return self.coverage
         parts = [
-            cut(self.heard, start, end)
+            cut(self.coverage, start, end)
             for start, end in zip(self.counted.tolist(), self.ends.tolist(), strict=True)
             if start < end
         ]
@@ -91,13 +91,13 @@ class SoundEvents(NamedTuple):
         return Spans(*(np.concatenate(edges) for edges in zip(*parts, strict=True)))
 
 
-def events_of_rule(rule: SoundRule, heard: HomeActivity) -> SoundEvents:
+def events_of_rule(rule: SoundRule, activity: HomeActivity) -> SoundEvents:
     """Find the events that a rule counts, without too short ones.
 
     Segments of all microphones that are at most ten seconds apart form one event, unless the rule
     sets a microphone or pause.
     """
-    sounds = heard.of(rule.label)
+    sounds = activity.of(rule.label)
     rows = sounds.confidences >= np.float32(rule.confidence)
     if rule.microphone:
         rows &= sounds.microphones == rule.microphone
@@ -123,17 +123,17 @@ def _listened_times(spans: Spans, firsts: Int64, least: int) -> tuple[Int64, Int
     return times, np.flatnonzero(totals >= least)
 
 
-def more_than_conditions(rule: MoreThan, heard: HomeActivity, until: int) -> list[Condition]:
+def more_than_conditions(rule: MoreThan, activity: HomeActivity, until: int) -> list[Condition]:
     """Find when a class exceeded the limit of a rule in the preceding window.
 
     Parameters
     ----------
-    heard : HomeActivity
+    activity : HomeActivity
         Must begin one window before the first evaluated time.
     until : int
         End of the recorded activity, in nanoseconds of UTC.
     """
-    events = events_of_rule(rule, heard)
+    events = events_of_rule(rule, activity)
     window = duration_words(rule.window)
 
     def text(time: int) -> str:
@@ -166,7 +166,7 @@ def _too_long(rule: MoreThan, events: SoundEvents, until: int) -> Spans:
     """
     assert rule.minutes is not None
     most = round(rule.minutes * MINUTE)
-    spans, lump = events.heard_counted(), round(rule.least_seconds * NANOSECONDS)
+    spans, lump = events.counted_coverage(), round(rule.least_seconds * NANOSECONDS)
     inside = [events.counted, spans.starts, spans.ends]
     edges = np.unique(np.concatenate([*inside, *(times + rule.window for times in inside)]))
     edges = np.append(edges[edges < until], until)
@@ -191,14 +191,16 @@ def _sum_to(spans: Spans, times: Int64) -> Int64:
     return np.cumsum(lengths(spans, np.concatenate([[first], times])))
 
 
-def longer_than_conditions(rule: LongerThan, heard: HomeActivity, zone: tzinfo) -> list[Condition]:
+def longer_than_conditions(
+    rule: LongerThan, activity: HomeActivity, zone: tzinfo
+) -> list[Condition]:
     """Find when a class lasted too long, until a pause ends the event."""
-    events = events_of_rule(rule, heard)
+    events = events_of_rule(rule, activity)
     limits = events.starts + rule.longer_than
     rows = np.flatnonzero(limits < events.ends)
     # During a pause it is unknown whether the event continues.
-    spans = np.searchsorted(events.heard.ends, limits[rows], side="right")
-    times = np.maximum(events.heard.starts[spans], limits[rows])
+    spans = np.searchsorted(events.coverage.ends, limits[rows], side="right")
+    times = np.maximum(events.coverage.starts[spans], limits[rows])
     over = events.ends[rows] + rule.pause + 1
 
     def text(time: int) -> str:
@@ -210,7 +212,7 @@ def longer_than_conditions(rule: LongerThan, heard: HomeActivity, zone: tzinfo) 
 
 
 def silent_conditions(
-    rule: RecorderSilent, heard: HomeActivity, start: int, end: int, since: int
+    rule: RecorderSilent, activity: HomeActivity, start: int, end: int, since: int
 ) -> list[Condition]:
     """Find when the recorder had written nothing for too long.
 
@@ -222,7 +224,7 @@ def silent_conditions(
     since : int
         When the rule came into force, in nanoseconds of UTC: earlier silence does not count.
     """
-    starts, ends = heard.written
+    starts, ends = activity.written
     before = start - 1 - rule.silent_for
     lasts = (max(last, since) for last in [before, *ends.tolist()])
     silences = zip(lasts, [*starts.tolist(), end], strict=True)
@@ -295,7 +297,7 @@ def end_of_quiet(hours: list[QuietHours], time: int, zone: tzinfo) -> int:
 
 
 def none_by_conditions(
-    rule: NoneBy, heard: HomeActivity, start: int, end: int, zone: tzinfo
+    rule: NoneBy, activity: HomeActivity, start: int, end: int, zone: tzinfo
 ) -> list[Condition]:
     """Find the days without a class by the time of a rule, or with too little coverage to tell."""
     windows = [
@@ -306,8 +308,8 @@ def none_by_conditions(
     ]
     if not windows:
         return []
-    events = events_of_rule(rule, heard)
-    listened = heard.listened(rule.label, rule.microphone)
+    events = events_of_rule(rule, activity)
+    listened = activity.listened(rule.label, rule.microphone)
     conditions = []
     for first, last in windows:
         if ((events.counted < last) & (events.ends > first)).any():
@@ -339,26 +341,26 @@ def _clock(minute: int) -> str:
 
 
 def unlike_conditions(
-    rule: UnlikeUsual, heard: HomeActivity, start: int, end: int, zone: tzinfo
+    rule: UnlikeUsual, activity: HomeActivity, start: int, end: int, zone: tzinfo
 ) -> list[Condition]:
     """Find the days or nights outside the range of the four weeks before.
 
     Parameters
     ----------
-    heard : HomeActivity
+    activity : HomeActivity
         Must begin 31 days before the start.
     """
     days = judged_days(rule, start, end, zone)
     if not days:
         return []
-    events = events_of_rule(rule, heard)
-    spans, starts = events.heard_counted(), events.counted
+    events = events_of_rule(rule, activity)
+    spans, starts = events.counted_coverage(), events.counted
     if rule.label in SET_APART:  # counted as in the report
-        television = television_spans(home_sound(heard).labels)
+        television = television_spans(home_sound(activity).labels)
         starts = starts[rows_at(television, events.starts) < 0]
         if rule.label in APART_IN_LENGTH:
             spans = without(spans, television)
-    listened = heard.listened(rule.label, rule.microphone)
+    listened = activity.listened(rule.label, rule.microphone)
 
     @cache
     def figure(day: date) -> Count | Duration | None:
@@ -411,19 +413,19 @@ def _unlike_text(rule: UnlikeUsual, day: date, own: Count | Duration, baseline: 
 
 
 def unusual_conditions(
-    rule: UnusualDay, heard: HomeActivity, start: int, end: int, zone: tzinfo
+    rule: UnusualDay, activity: HomeActivity, start: int, end: int, zone: tzinfo
 ) -> list[Condition]:
     """Find the days unlike the four weeks before, each reported on the next morning.
 
     Parameters
     ----------
-    heard : HomeActivity
+    activity : HomeActivity
         Must begin 34 days before the start.
     """
     mornings = judged_days(rule, start, end, zone)
     if not mornings:
         return []
-    routines = Routines(Profiles(home_sound(heard), zone, night_after=True))
+    routines = Routines(Profiles(home_sound(activity), zone, night_after=True))
     conditions = []
     for morning, time in mornings:
         judged = routines.judge(morning - timedelta(days=1))
@@ -435,20 +437,20 @@ def unusual_conditions(
     return conditions
 
 
-def home_sound(heard: HomeActivity) -> HomeSegments:
+def home_sound(activity: HomeActivity) -> HomeSegments:
     """Return the segments and coverage from which routines are fitted."""
-    sounds = {name: own for (name, of_scenario), own in heard.sounds.items() if not of_scenario}
+    sounds = {name: own for (name, of_scenario), own in activity.sounds.items() if not of_scenario}
     names = np.array([SILENCE, *sounds], object)
-    parts: list[Spans | Sounds] = [heard.listened(ANY_SOUND, ""), *sounds.values()]
+    parts: list[Spans | Sounds] = [activity.listened(ANY_SOUND, ""), *sounds.values()]
     starts = np.concatenate([own.starts for own in parts])
     ends = np.concatenate([own.ends for own in parts])
     labels = np.repeat(names, [len(own.starts) for own in parts])
     order = np.argsort(starts, kind="stable")
-    of_home = [own for name, own in heard.classes.items() if not is_of_scenario(name)]
+    of_home = [own for name, own in activity.classes.items() if not is_of_scenario(name)]
     known = sorted(set(sounds).union(*of_home))
     return HomeSegments(
         Labelling(starts[order], ends[order], labels[order]),
-        {name: heard.listened(name, "") for name in known},
+        {name: activity.listened(name, "") for name in known},
     )
 
 
@@ -457,7 +459,7 @@ NEW = RuleState()
 
 def notifications(  # noqa: PLR0913, PLR0917
     rule: AlertRule,
-    heard: HomeActivity,
+    activity: HomeActivity,
     start: int,
     end: int,
     zone: tzinfo,
@@ -478,7 +480,7 @@ def notifications(  # noqa: PLR0913, PLR0917
     """
     found: list[Notification] = []
     last, has_rung = state.last, False
-    for condition in _conditions(rule, heard, start, end, zone, state.since):
+    for condition in _conditions(rule, activity, start, end, zone, state.since):
         if condition.end <= start or condition.start >= end:
             continue
         goes_on = condition.start < start
@@ -494,17 +496,17 @@ def notifications(  # noqa: PLR0913, PLR0917
 
 
 def _conditions(  # noqa: PLR0913, PLR0917
-    rule: AlertRule, heard: HomeActivity, start: int, end: int, zone: tzinfo, since: int
+    rule: AlertRule, activity: HomeActivity, start: int, end: int, zone: tzinfo, since: int
 ) -> Sequence[Condition]:
     """Find the conditions of a rule, in ascending order and disjoint."""
     if isinstance(rule, MoreThan):
-        return more_than_conditions(rule, heard, end)
+        return more_than_conditions(rule, activity, end)
     if isinstance(rule, LongerThan):
-        return longer_than_conditions(rule, heard, zone)
+        return longer_than_conditions(rule, activity, zone)
     if isinstance(rule, RecorderSilent):
-        return silent_conditions(rule, heard, start, end, since)
+        return silent_conditions(rule, activity, start, end, since)
     if isinstance(rule, NoneBy):
-        return none_by_conditions(rule, heard, start, end, zone)
+        return none_by_conditions(rule, activity, start, end, zone)
     if isinstance(rule, UnusualDay):
-        return unusual_conditions(rule, heard, start, end, zone)
-    return unlike_conditions(rule, heard, start, end, zone)
+        return unusual_conditions(rule, activity, start, end, zone)
+    return unlike_conditions(rule, activity, start, end, zone)

@@ -110,7 +110,7 @@ class RuleWatch:
 
     def evaluate(
         self,
-        heard: Callable[[], HomeActivity],
+        activity: Callable[[], HomeActivity],
         weeks: Callable[[int, int], HomeActivity],
         until: int,
         now: int,
@@ -119,7 +119,7 @@ class RuleWatch:
 
         Parameters
         ----------
-        heard : callable
+        activity : callable
             Returns the live activity; called only if a rule needs it.
         weeks : callable
             Returns the activity between two times, read from the logs.
@@ -128,7 +128,7 @@ class RuleWatch:
         """
         self.set_right(now)
         found: list[Notification] = []
-        heard_once = cache(heard)
+        activity_once = cache(activity)
         for rule in self._rules:
             own = self._progress[rule.name]
             if until - own.until < _EVERY:
@@ -142,7 +142,7 @@ class RuleWatch:
                     continue
                 what = weeks(until - history(rule), until)
             else:
-                what = heard_once()
+                what = activity_once()
             rang, state = notifications(rule, what, own.until, until, self._zone, own)
             self._progress[rule.name] = state
             found += rang
@@ -220,7 +220,7 @@ class AlertsOutput:
         memory = RuleProgressStore(state, say)
         now = self._latest = time.time_ns()
         self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
-        self._heard = LiveActivity(now, _PATIENCE)
+        self._activity = LiveActivity(now, _PATIENCE)
         self._began = time.monotonic()
         self._has_news = Flag()  # set by the first update
         self._labels: deque[tuple[str, LiveLabel, Sequence[str]]] = deque(maxlen=_LABELS)
@@ -236,7 +236,7 @@ class AlertsOutput:
         """Queue the current labels, and deliver notifications to the broker."""
         for microphone in news.state.every():
             if microphone.label:
-                label = LiveLabel(microphone.heard.time, microphone.label, microphone.confidence)
+                label = LiveLabel(microphone.active.time, microphone.label, microphone.confidence)
                 self._labels.append((microphone.name, label, microphone.classes))
         self._watch.never_tell = news.state.never_tell
         self._columns += news.columns
@@ -314,9 +314,9 @@ class AlertsOutput:
         home, looked, forgot = self._followed, -math.inf, time.monotonic()
         now = self._latest = time.time_ns()
         self._watch.set_right(now)
-        self._heard = LiveActivity(self._watch.needed_from(now), _PATIENCE)
+        self._activity = LiveActivity(self._watch.needed_from(now), _PATIENCE)
         with suppress(LogError):  # no log yet
-            self._heard.read(
+            self._activity.read(
                 find_home_logs([home.folder]), home.node, now + _TO_COME, self._damaged
             )
         while not self._stop.wait(_NEWS_SECONDS):
@@ -329,14 +329,14 @@ class AlertsOutput:
                 self._look()
                 looked = time.monotonic()
             if time.monotonic() - forgot >= _FORGET_SECONDS:
-                self._heard.forget_before(self._watch.needed_from(time.time_ns()))
+                self._activity.forget_before(self._watch.needed_from(time.time_ns()))
                 forgot = time.monotonic()
 
     def _push(self, columns: Columns) -> None:
         known = columns.between(None, self._now() + _TO_COME)
         if len(known) < len(columns):
             self._say("alerts: was the clock ahead? segments in the future are left out")
-        self._heard.push([known])
+        self._activity.push([known])
 
     def _look(self) -> None:
         if not self._has_news.is_set() and time.monotonic() - self._began < _WAIT_SECONDS:
@@ -345,10 +345,12 @@ class AlertsOutput:
         while self._labels:
             name, label, classes = self._labels.popleft()
             if label.time < now + _TO_COME:
-                self._heard.add_label(name, label, classes)
-        self._watch.evaluate(self._heard.heard, self._weeks, self._heard.known_until(now), now)
+                self._activity.add_label(name, label, classes)
+        self._watch.evaluate(
+            self._activity.activity, self._weeks, self._activity.known_until(now), now
+        )
         if time.monotonic() - self._began >= _WAIT_SECONDS:
-            unknown = (unknown_class(rule, self._heard.classes) for rule in self._rules)
+            unknown = (unknown_class(rule, self._activity.classes) for rule in self._rules)
             for text in filter(None, unknown):
                 self._say(f"alerts: {text}")
 
@@ -366,8 +368,8 @@ class AlertsOutput:
         try:
             logs = find_home_logs([home.folder])
         except LogError:  # no log yet
-            return SegmentCollector().heard()
-        open_segments = self._heard.open_segments()
+            return SegmentCollector().activity()
+        open_segments = self._activity.open_segments()
         return read_activity(logs, home.node, start, end, lambda _: None, others=open_segments)
 
     def _damaged(self, error: object) -> None:

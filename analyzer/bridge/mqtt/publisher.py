@@ -303,7 +303,7 @@ class MqttPublisher:
         label = microphone.shown_label
         label = label if self._announced.is_published(label) else UNKNOWN
         say("heard", json.dumps({"label": label, "confidence": confidence}))
-        say("sound", _ON[microphone.heard.is_heard(ANY_SOUND)])
+        say("sound", _ON[microphone.active.is_active(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
             say("level", f"{microphone.level_dbfs:.1f}")
         counts = microphone.counts(news.today, news.state.corrections)
@@ -317,7 +317,7 @@ class MqttPublisher:
                 self._keep(Place(TOLD, label=label), _ON[is_published])
             of_day, of_night = counts[label]
             values = {
-                "on": _ON[microphone.heard.is_heard(label) and is_published],
+                "on": _ON[microphone.active.is_active(label) and is_published],
                 "counts": json.dumps({"today": of_day, "night": of_night, **began}),
                 "count_today": str(of_day),
                 "count_night": str(of_night),

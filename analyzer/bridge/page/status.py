@@ -74,7 +74,7 @@ def _sounds_in_words(microphone: LiveMicrophone, words: Words) -> str:
     names = [words.class_words(label) for label in active_classes(microphone)]
     if names:
         return words.listed([names[0], *map(words.inside, names[1:])])
-    is_sound_now = microphone.heard.is_heard(ANY_SOUND)
+    is_sound_now = microphone.active.is_active(ANY_SOUND)
     return words.text("now.sound") if is_sound_now else words.class_words(SILENCE)
 
 
@@ -83,18 +83,18 @@ def active_classes(microphone: LiveMicrophone) -> list[str]:
     return [
         label
         for label in ordered(microphone.classes)
-        if is_sound(label) and microphone.heard.is_heard(label)
+        if is_sound(label) and microphone.active.is_active(label)
     ]
 
 
 def _active_since(microphone: LiveMicrophone) -> int:
     """Return the start of the microphone's current state, from the log; 0 if unknown."""
     if not microphone.is_listening():
-        return microphone.heard.time
+        return microphone.active.time
     heard = active_classes(microphone)
     if heard:
         last = [microphone.last_event(label) for label in heard]
-        end = microphone.heard.time - _GOES_ON
+        end = microphone.active.time - _GOES_ON
         going = [event.start for event in last if event is not None and event.end >= end]
         return max(going) if len(going) == len(heard) else 0
     last = [microphone.last_event(label) for label in microphone.labels()]
