@@ -353,11 +353,11 @@ def is_ping_address(url: str) -> bool:
     """Whether a URL is a valid HTTP or HTTPS address to ping."""
     try:
         parts = urlsplit(url)
-        is_whole = parts.scheme in {"http", "https"} and bool(parts.hostname)
+        is_complete = parts.scheme in {"http", "https"} and bool(parts.hostname)
         _ = parts.port
     except ValueError:
         return False
-    return is_whole and url.isascii() and url.isprintable() and " " not in url
+    return is_complete and url.isascii() and url.isprintable() and " " not in url
 
 
 def has_password(url: str) -> bool:

@@ -108,8 +108,8 @@ def _networks(logs: Sequence[Path]) -> Iterator[State]:
                 if not wanted:
                     continue
                 what = f"{info.model} takes what the network {wanted} hears"
-                heard = info.embedding
-                if heard is not None and heard.network == wanted:
+                space = info.embedding
+                if space is not None and space.network == wanted:
                     yield State("ok", info.microphone, f"{what}, which is there")
                     continue
                 remedy = f"hearthlog models fetch {wanted}, and restart the recorder"
@@ -276,7 +276,7 @@ def _configuration(log: Path) -> bytes:
 
 def _log(log: Path, folder: Path) -> dict[str, Any]:
     findings = examine_file(log).findings
-    told: dict[str, Any] = {
+    status: dict[str, Any] = {
         "name": str(log.relative_to(folder)) if log.is_relative_to(folder) else log.name,
         "bytes": log.stat().st_size if log.exists() else 0,
         "findings": [
@@ -288,17 +288,17 @@ def _log(log: Path, folder: Path) -> dict[str, Any]:
         with LogFile(log) as file:
             topics = {number: channel.topic for number, channel in file.channels.items()}
             counts = file.statistics.channel_message_counts if file.statistics else {}
-        told["frames"] = {
+        status["frames"] = {
             topics[number]: count
             for number, count in counts.items()
             if topics.get(number, "").endswith("/features")
         }
         gaps = [topic for topic in topics.values() if topic.endswith("/gap")]
         columns = read_columns([log], [*gaps, DIAGNOSTICS])
-        told["gaps"] = [gap for each in columns.values() for gap in _gaps(each)]
+        status["gaps"] = [gap for each in columns.values() for gap in _gaps(each)]
         if DIAGNOSTICS in columns:
-            told["health"] = list(_health(columns[DIAGNOSTICS], log_name(log).node))
-    return told
+            status["health"] = list(_health(columns[DIAGNOSTICS], log_name(log).node))
+    return status
 
 
 def _gaps(columns: Columns) -> Iterator[dict[str, Any]]:

@@ -233,7 +233,7 @@ class DiskKeeper:
         self._began: int | None = None
         self._looked = 0
         self._thinned: int | None = None
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._helpless = False
 
     def tick(self, now: int) -> tuple[list[EncodedMessage], list[str]]:
@@ -246,8 +246,8 @@ class DiskKeeper:
             self._helpless = bool(report.problem)
             if report.more:
                 self._thinned = None
-            news = {report.problem} - self._said - {""}
-            self._said |= news
+            news = {report.problem} - self._reported - {""}
+            self._reported |= news
             return report_messages(self._rules.node, now, report), sorted(news)
         if self._is_due(now):
             self._began = now

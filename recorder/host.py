@@ -150,7 +150,7 @@ class ServiceManager:
         self._is_there = _address() is not None
         self._feed_seconds = _watchdog_seconds() / 4 or math.inf
         self._health = dict.fromkeys(microphones, "starting")
-        self._heard: dict[str, float] = {}  # when, by CLOCK_MONOTONIC
+        self._last_sound: dict[str, float] = {}  # when, by CLOCK_MONOTONIC
         self._awaited = set(self._health)  # no event since the last watchdog message
         self._fed = 0.0
         self._is_ready = False
@@ -162,7 +162,7 @@ class ServiceManager:
             return
         now = time.monotonic()
         if isinstance(event, Frames):
-            self._heard[microphone] = now
+            self._last_sound[microphone] = now
         if isinstance(event, SourceHealth):
             self._health[microphone] = self._describe(microphone, event, now)
         self._awaited.discard(microphone)
@@ -188,7 +188,7 @@ class ServiceManager:
 
     def _describe(self, microphone: str, health: SourceHealth, now: float) -> str:
         summary = " ".join(health.summary.split())
-        silent = now - self._heard.get(microphone, now)
+        silent = now - self._last_sound.get(microphone, now)
         if health.level == OK or silent < _SILENT_SECONDS:
             return summary
         last = datetime.fromtimestamp(time.time() - silent).astimezone()
@@ -226,8 +226,8 @@ def _watchdog_seconds() -> float:
     """Return systemd's watchdog timeout of this process; 0 for none."""
     microseconds = os.environ.get("WATCHDOG_USEC", "")
     process = os.environ.get("WATCHDOG_PID", str(os.getpid()))
-    is_asked = microseconds.isdecimal() and process == str(os.getpid())
-    return int(microseconds) / 1e6 if is_asked else 0.0
+    is_watched = microseconds.isdecimal() and process == str(os.getpid())
+    return int(microseconds) / 1e6 if is_watched else 0.0
 
 
 _AGAIN_SECONDS = 600.0
@@ -267,16 +267,16 @@ class HealthJournal:
 
     def __init__(self) -> None:
         self._trouble: dict[str, str] = {}
-        self._said_at: dict[str, float] = {}
+        self._reported_at: dict[str, float] = {}
 
     def add(self, microphone: str, health: SourceHealth) -> None:
         """Print the state of a microphone, if it changed or is due again."""
         before = self._trouble.get(microphone, "")
         trouble = self._trouble[microphone] = health.summary if health.level != OK else ""
         now = time.monotonic()
-        is_old = now - self._said_at.get(microphone, 0.0) >= _AGAIN_SECONDS
+        is_old = now - self._reported_at.get(microphone, 0.0) >= _AGAIN_SECONDS
         if trouble != before or (trouble and is_old):
-            self._said_at[microphone] = now
+            self._reported_at[microphone] = now
             say(f"{microphone}: {health.summary}")
 
 

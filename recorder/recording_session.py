@@ -336,8 +336,8 @@ class RecordingSession:
         labels = stream.pipeline.last_labels
         if isinstance(event, Frames) and labels is not None:
             self.summary.labels += len(labels.frames)
-        heard = stream.pipeline.last_frames if isinstance(event, Frames) else None
-        notices += self._clips.after(stream.pipeline.microphone, heard or event, labels)
+        frames = stream.pipeline.last_frames if isinstance(event, Frames) else None
+        notices += self._clips.after(stream.pipeline.microphone, frames or event, labels)
         self._now = event_time(event)
         self._log.write(self._clip_messages(stream, notices))
         self._look_after_the_disk(stream)

@@ -329,10 +329,10 @@ def kept_because(log: RecordedLog) -> str:
         return REVIEWED
     try:
         with LogFile(log.path) as file:
-            whole, records = file.complete, provenance_records(file)
+            is_complete, records = file.complete, provenance_records(file)
     except LogError as error:
         return f"cannot be read ({error})"
-    return "" if whole and records else "no log that a recorder has finished"
+    return "" if is_complete and records else "no log that a recorder has finished"
 
 
 def is_reviewed(log: Path) -> bool:

@@ -122,18 +122,18 @@ def _lose(losses: list[str], error: Exception) -> None:
 
 def _joined_parts(found: list[tuple[Path, ReviewedSpan]]) -> list[tuple[Path, ReviewedSpan]]:
     """Merge spans that were cut at the boundary of two logs."""
-    whole: list[tuple[Path, ReviewedSpan]] = []
+    merged: list[tuple[Path, ReviewedSpan]] = []
     open_: dict[ReviewedSpan, tuple[int, Path]] = {}  # index and log by continuing span
     for log, span in found:
-        place, before = open_.pop(span._replace(end=0), (len(whole), log))
-        if place < len(whole) and before != log and _is_one(whole[place][1], span):
-            first, earlier = whole[place]
-            whole[place] = first, earlier._replace(end=span.end)
+        place, before = open_.pop(span._replace(end=0), (len(merged), log))
+        if place < len(merged) and before != log and _is_one(merged[place][1], span):
+            first, earlier = merged[place]
+            merged[place] = first, earlier._replace(end=span.end)
         else:
-            place = len(whole)
-            whole.append((log, span))
+            place = len(merged)
+            merged.append((log, span))
         open_[span._replace(start=span.end, end=0)] = place, log
-    return whole
+    return merged
 
 
 def _is_one(before: ReviewedSpan, after: ReviewedSpan) -> bool:
@@ -230,11 +230,11 @@ class ClassCheck(NamedTuple):
         return _interval(effective * (self.missed + more) / (self.true + more), effective)
 
 
-def _interval(some: float, whole: float) -> tuple[float, float] | None:
+def _interval(some: float, merged: float) -> tuple[float, float] | None:
     """Return the central 90 % of a beta distribution with Jeffreys prior."""
-    if not whole:
+    if not merged:
         return None
-    low, high = (beta_quantile(some + 0.5, whole - some + 0.5, share) for share in (0.05, 0.95))
+    low, high = (beta_quantile(some + 0.5, merged - some + 0.5, share) for share in (0.05, 0.95))
     return low, high
 
 

@@ -456,8 +456,8 @@ def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> DayMetrics:
     return DayMetrics(day, near, zone, span, night, common(near.coverage, span))
 
 
-def _share(heard: Spans, span: Spans) -> float:
-    return common(heard, span).length / span.length
+def _share(covered: Spans, span: Spans) -> float:
+    return common(covered, span).length / span.length
 
 
 def _if_known(value: _Figure, share: float) -> _Figure | None:

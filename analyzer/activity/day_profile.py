@@ -194,9 +194,9 @@ class Profiles:
 
     def _minutes(self, name: str, edges: Int64) -> Float64:
         widths = np.diff(edges)
-        heard = lengths(self._listened[name], edges)
+        covered = lengths(self._listened[name], edges)
         minutes = lengths(self._spans[name], edges) / MINUTE
-        return np.where(heard >= _LEAST * np.maximum(widths, 1), minutes, np.nan)
+        return np.where(covered >= _LEAST * np.maximum(widths, 1), minutes, np.nan)
 
     def _value(self, figure: DayFigure, day: date) -> float:
         if figure.kind == CLOCK:
@@ -235,8 +235,8 @@ class Profiles:
             return np.nan
         time = int(lasts[is_busy][-1] if last else firsts[is_busy][0])
         outside = (time, end) if last else (begin, time)
-        heard = cut(self._coverage, *outside).length
-        known = heard >= _LEAST_BESIDE * (outside[1] - outside[0])
+        covered = cut(self._coverage, *outside).length
+        known = covered >= _LEAST_BESIDE * (outside[1] - outside[0])
         return self._clock(time, day) if known else np.nan
 
     def _clock(self, time: int, day: date) -> float:

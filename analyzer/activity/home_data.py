@@ -62,7 +62,7 @@ class HomeData:
     gaps: list[Trouble] = field(default_factory=list)
     troubles: list[Trouble] = field(default_factory=list)
     nodes: list[str] = field(default_factory=list)
-    never_told: frozenset[str] = frozenset()  # classes that are not in `classes` for that
+    hidden: frozenset[str] = frozenset()  # classes that are not in `classes` for that
     losses: list[str] = field(default_factory=list)  # read errors with reasons
 
     def lose(self, line: str) -> None:
@@ -123,11 +123,11 @@ def read_home(
     _check(home, logs, labelling, close)
     _name_classes(home, logs.between(*close, layer), name)
     try:
-        home.never_told = logs.never_tell()
+        home.hidden = logs.never_tell()
     except LogError as error:
         home.lose(str(error))
     home.classes = {
-        source: [each for each in classes if each not in home.never_told]
+        source: [each for each in classes if each not in home.hidden]
         for source, classes in home.classes.items()
     }
     return home
@@ -305,7 +305,7 @@ def read_scenario_minutes(
     logs: HomeLogs,
     days: Sequence[tuple[int, int]],
     lose: Callable[[str], None],
-    never_told: Collection[str] = (),
+    hidden: Collection[str] = (),
 ) -> ScenarioMinutes:
     """Read the duration of each scenario class, over all microphones.
 
@@ -315,7 +315,7 @@ def read_scenario_minutes(
         Starts and ends, in nanoseconds of UTC, in time order.
     """
     found: dict[str, list[Counter[str]]] = {}
-    left_out = OF_EVERY_SCENARIO.union(never_told)
+    left_out = OF_EVERY_SCENARIO.union(hidden)
     start, end = days[0][0], days[-1][1]
     for entry in logs.between(start, end + SEGMENT_DELAY):
         try:

@@ -95,7 +95,7 @@ def marked_classes(data: HomeData) -> list[str]:
     """
     marked = {name for own in data.segments.values() for name in np.unique(own.labels).tolist()}
     labelled = set(chain.from_iterable(data.classes.values()))
-    return ordered(marked - labelled - data.never_told - _NO_EVENTS)
+    return ordered(marked - labelled - data.hidden - _NO_EVENTS)
 
 
 def home_events(

@@ -134,11 +134,11 @@ class HomeActivity:
         knowing = [
             spans
             for name, spans in self.coverage.items()
-            if microphone in {"", source_microphone(name)} and self._knows(name, label)
+            if microphone in {"", source_microphone(name)} and self._has_class(name, label)
         ]
         return union(*knowing)
 
-    def _knows(self, source: str, label: str) -> bool:
+    def _has_class(self, source: str, label: str) -> bool:
         known = self.classes.get(source)
         if is_of_scenario(source):
             return known is not None and label in known

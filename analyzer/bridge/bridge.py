@@ -174,19 +174,19 @@ class ProblemReporter:
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
-        self._said: OrderedDict[str, float] = OrderedDict()
+        self._reported: OrderedDict[str, float] = OrderedDict()
         self._lock = Lock()
 
     def __call__(self, text: object) -> None:
         """Report a line, unless it was reported within the last hour."""
         line, now = str(text), time.monotonic()
         with self._lock:
-            if now - self._said.get(line, -_REPEAT_SECONDS) < _REPEAT_SECONDS:
+            if now - self._reported.get(line, -_REPEAT_SECONDS) < _REPEAT_SECONDS:
                 return
-            self._said[line] = now
-            self._said.move_to_end(line)
-            if len(self._said) > _MOST_TEXTS:
-                self._said.popitem(last=False)
+            self._reported[line] = now
+            self._reported.move_to_end(line)
+            if len(self._reported) > _MOST_TEXTS:
+                self._reported.popitem(last=False)
         with suppress(OSError, ValueError):  # a full disk, or a closed stream
             self._say(line)
 

@@ -384,7 +384,7 @@ class HomeState:
         self._never_tell: frozenset[str] = frozenset()
         self.common_names: Mapping[str, str] = {}
         self._seen = -math.inf  # time of the last message, by CLOCK_MONOTONIC
-        self._said: set[str] = set()  # subjects with diagnostics in the current log
+        self._diagnosed: set[str] = set()  # subjects with diagnostics in the current log
 
     def is_recording(self) -> bool:
         """Whether anything was written in the last fifteen seconds."""
@@ -422,8 +422,8 @@ class HomeState:
 
     def begin_log(self) -> None:
         """Begin a new log: drop the health of subjects without diagnostics in the last log."""
-        self.health = {name: each for name, each in self.health.items() if name in self._said}
-        self._said.clear()
+        self.health = {name: each for name, each in self.health.items() if name in self._diagnosed}
+        self._diagnosed.clear()
 
     def find_event(self, identifier: str) -> SoundEvent | None:
         """Return the event with an id; None if unknown or dropped."""
@@ -484,7 +484,7 @@ class HomeState:
         for status in (each for same in columns["status"] for each in same):
             subject = str(status["name"]).removeprefix("hearthlog: ")
             if subject in self.health or len(self.health) < _MOST_CLASSES:
-                self._said.add(subject)
+                self._diagnosed.add(subject)
                 self.health[subject] = Health(int(status["level"]), str(status["message"]))
             microphone = self.microphones.get(subject)
             if microphone is not None:

@@ -189,10 +189,10 @@ def labelled_parts(
         else:
             alone.setdefault(what.label, []).append((span, what.detail))
     parts = []
-    for label, heard in alone.items():
-        spans = _joined(span for span, _ in heard)
+    for label, pieces in alone.items():
+        spans = _joined(span for span, _ in pieces)
         names: list[set[str]] = [set() for _ in spans]
-        for span, detail in heard:
+        for span, detail in pieces:
             names[bisect_right(spans, (span[0], math.inf)) - 1].add(detail)
         parts += [
             LabelledPart(label, " + ".join(sorted(details)), *span)

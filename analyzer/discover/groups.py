@@ -150,9 +150,9 @@ class Groups(Clusters):
         """Return the group row of each sound; `NO_CLUSTER` for a sound without a group."""
         if self.embedded is None:
             return self.space.find(points)
-        of, heard = np.empty(len(points), np.int64), is_embedded(embedded)
-        of[heard] = self.embedded.find(embedded[heard])
-        of[~heard] = self.space.find(points[~heard])
+        of, embedded_rows = np.empty(len(points), np.int64), is_embedded(embedded)
+        of[embedded_rows] = self.embedded.find(embedded[embedded_rows])
+        of[~embedded_rows] = self.space.find(points[~embedded_rows])
         return of
 
     def are_comparable(self, embeddings: Float32) -> Bool:
@@ -205,9 +205,9 @@ def new_groups(
     """
     embedded = None
     if embedding is not None and embeddings is not None:
-        heard = is_embedded(embeddings)
-        if heard.sum() >= _FEWEST_EMBEDDED:
-            both = np.concatenate([descriptors[heard], embeddings[heard]], axis=1)
+        embedded_rows = is_embedded(embeddings)
+        if embedded_rows.sum() >= _FEWEST_EMBEDDED:
+            both = np.concatenate([descriptors[embedded_rows], embeddings[embedded_rows]], axis=1)
             embedded = make_space(both)
     return Groups(
         np.empty(0, np.int64),
@@ -436,11 +436,11 @@ def _problem(header: _Header, arrays: dict[str, NDArray[Any]]) -> str:
     if arrays.keys() != expected.keys():
         return "it has other arrays"
     for name, dimensions in expected.items():
-        whole = name.removeprefix(_EMBEDDED) in _WHOLE
-        array, kind = arrays[name], np.int64 if whole else np.float64
+        is_integer = name.removeprefix(_EMBEDDED) in _WHOLE
+        array, kind = arrays[name], np.int64 if is_integer else np.float64
         if array.ndim != dimensions or array.dtype != kind:
             return f"{name} is not as it has to be"
-        if not whole and not (np.abs(array) <= _LARGE).all():
+        if not is_integer and not (np.abs(array) <= _LARGE).all():
             return f"{name} has numbers that are too large, or none"
     width, numbers = descriptor_width(header.features), arrays["numbers"]
     fits = (

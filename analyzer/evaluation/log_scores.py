@@ -229,15 +229,15 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     return TopicLabelling(topic, classes, labelling, tuple(selection.unfinished))
 
 
-def _segment_topic(selection: LogSelection, asked: str | None) -> str:
+def _segment_topic(selection: LogSelection, requested: str | None) -> str:
     """Find the topic of a recorder's segments."""
     topics = sorted(selection.topics_of(message_types.SEGMENT, SEGMENT_FIELDS))
     recorded = [topic for topic in topics if topic.count("/") == 2]
     if not topics:
         raise LogError("no segments; if the log was recorded without a model, relabel it with one")
-    if asked is None and len(recorded) != 1:
+    if requested is None and len(recorded) != 1:
         raise LogError(f"choose one with --topic: {', '.join(topics)}")
-    topic = recorded[0] if asked is None else asked
+    topic = recorded[0] if requested is None else requested
     if topic not in topics:
         raise LogError(f"{topic}: no such segments; there are {', '.join(topics)}")
     return topic

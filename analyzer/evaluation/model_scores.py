@@ -242,8 +242,8 @@ class _Listener:
         if begin == end:
             return
         labeller = Labeller(self._classifier, embedding=self._source)
-        floors, heard = self._floors(recording, features), self._heard(recording, stamps)
-        pushed = labeller.push(features, floors, 0, stamps, Auxiliary(embeddings=heard))[1]
+        floors, embeddings = self._floors(recording, features), self._embeddings(recording, stamps)
+        pushed = labeller.push(features, floors, 0, stamps, Auxiliary(embeddings=embeddings))[1]
         segments = [*pushed, *labeller.close(length)]
         self._add(self._reference, begin, end, self._classifier.classes.index(label))
         for one in segments:
@@ -258,7 +258,7 @@ class _Listener:
         if start < end:
             events.append((self._place + start, self._place + end, label))
 
-    def _heard(self, recording: Recording, stamps: Int64) -> Embeddings:
+    def _embeddings(self, recording: Recording, stamps: Int64) -> Embeddings:
         """Return the embeddings of a recording, at the frames of the room around it."""
         if recording.embedded is None or self._source is None:
             return NO_EMBEDDINGS

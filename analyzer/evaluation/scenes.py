@@ -380,10 +380,10 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
                 )
     each = [evaluate_labelling(truth, found, model.classes) for truth, found in scenes]
     true, predicted = (_apart(same) for same in zip(*scenes, strict=True))
-    whole = evaluate_labelling(true, predicted, model.classes)
+    overall = evaluate_labelling(true, predicted, model.classes)
     return ScenesEvaluation(
-        scores=whole.scores,
-        detections=whole.detections,
+        scores=overall.scores,
+        detections=overall.detections,
         scenes=[
             SceneScores(
                 seed=options.seed + number,
@@ -394,7 +394,7 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
             for number, one in enumerate(each)
         ],
         coughs=_single_coughs(singles, silence) if singles else None,
-        evaluated_seconds=whole.evaluated_seconds,
+        evaluated_seconds=overall.evaluated_seconds,
         sounds=sounds,
         clips=len(laid),
         sources=len({clip.source_group for clip in laid}),
@@ -483,8 +483,8 @@ class _Recorder:
         with tempfile.TemporaryDirectory(prefix="hearthlog-scene-") as folder:
             sound, logs = Path(folder) / "scene.wav", Path(folder) / "logs"
             _write(sound, scene.samples)
-            asked = {"output": logs, "keep_audio": "off", "feature_set": ""}
-            settings = load_settings(None, asked, {})
+            options = {"output": logs, "keep_audio": "off", "feature_set": ""}
+            settings = load_settings(None, options, {})
             source = FileSource([sound], _START, progress=report)
             microphone = settings.microphone[0].name
             models = {microphone: LabellingModels(self._watch)}
@@ -539,8 +539,8 @@ def _single_coughs(scenes: Sequence[tuple[list[Span], Labelling]], silence: str)
         same = found.labels == COUGHING
         starts, ends = found.starts[same] / NANOSECONDS, found.ends[same] / NANOSECONDS
         for begin, end, _ in coughs:
-            heard = np.flatnonzero((starts < end) & (ends > begin))
-            lengths += (ends - starts)[heard[:1]].tolist()
+            near = np.flatnonzero((starts < end) & (ends > begin))
+            lengths += (ends - starts)[near[:1]].tolist()
         count += len(coughs)
         others += int((~same & (found.labels != silence)).sum())
     return SingleCoughs(

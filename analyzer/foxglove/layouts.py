@@ -127,13 +127,13 @@ def _panels(one: LaidOutMicrophone, panels: dict[str, dict[str, Any]]) -> Iterat
     """Add the panels of a microphone; yield their names, from the top."""
     if one.classes:
         name = f"StateTransitions!heard_{one.name}"
-        heard = [
+        paths = [
             _series(f"/{one.name}/label.label", "each 50 ms"),
             _series(f"/{one.name}/segment.label", "segments, when they close"),
         ]
         panels[name] = _titled(
             f"{one.title}: what is heard",
-            {"paths": heard, "isSynced": False, "xAxisRange": _SECONDS, "showPoints": False},
+            {"paths": paths, "isSynced": False, "xAxisRange": _SECONDS, "showPoints": False},
         )
         yield name
         name = f"Plot!probabilities_{one.name}"

@@ -254,7 +254,7 @@ class Playback:
         self._position = recording.start  # at the moment `_since`
         self._since = time.monotonic()
         self._seeks = 0
-        self._told = self._since  # last time message to viewers
+        self._last_sent = self._since  # last time message to viewers
 
     @property
     def span(self) -> tuple[int, int]:
@@ -313,8 +313,8 @@ class Playback:
                 if not is_there:
                     ahead = (moment - now) / NANOSECONDS / self._speed
                     self._changed.wait(min(ahead, _TICK_SECONDS) if is_playing else _IDLE_SECONDS)
-            if is_playing and time.monotonic() - self._told >= _TICK_SECONDS:
-                self._told = time.monotonic()
+            if is_playing and time.monotonic() - self._last_sent >= _TICK_SECONDS:
+                self._last_sent = time.monotonic()
                 server.broadcast_time(min(now, moment))
             if is_there:
                 return True

@@ -149,8 +149,8 @@ class HomeLogs:
         if not days:
             raise LogError(self.losses[0] if self.losses else "there is no message in these logs")
         end = self.end() or 0
-        whole = [day for day in days if day_span(day, zone)[1] - _TAIL <= end]
-        return whole[-1] if whole else days[-1]
+        complete = [day for day in days if day_span(day, zone)[1] - _TAIL <= end]
+        return complete[-1] if complete else days[-1]
 
     def end(self) -> int | None:
         """Return the log time of the last message of the logs.
@@ -280,16 +280,16 @@ def network_changes(logs: Iterable[HomeLog], zone: tzinfo) -> list[str]:
     list of str
         One line for each microphone with a change.
     """
-    heard: dict[tuple[str, str], list[tuple[int, EmbeddingSpace | None]]] = {}
+    spaces: dict[tuple[str, str], list[tuple[int, EmbeddingSpace | None]]] = {}
     for log in logs:
         with suppress(LogError), LogFile(log.path) as file:
             for microphone in sorted(microphones_of(file, "features")):
                 source = embedding_source(file, microphone)
                 space = None if source is None else source.space
-                heard.setdefault((log.node, microphone), []).append((log.start, space))
+                spaces.setdefault((log.node, microphone), []).append((log.start, space))
     return [
         f"{microphone}: {_changes(times, zone)}"
-        for (_, microphone), times in sorted(heard.items())
+        for (_, microphone), times in sorted(spaces.items())
         if len({space for _, space in times}) > 1
     ]
 

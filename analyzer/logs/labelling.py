@@ -366,12 +366,12 @@ class Labellings:
         parts = list(self._segments(topic, start, end, progress))
         if not parts:
             return None
-        whole = labelling_of(join(parts))
+        together = labelling_of(join(parts))
         span = one(-NEVER if start is None else start, NEVER if end is None else end)
-        spans, rows, _ = pieces(whole, span)
+        spans, rows, _ = pieces(together, span)
         if not len(rows):
             return None
-        return Labelling(*spans, whole.labels[rows], whole.confidences[rows])
+        return Labelling(*spans, together.labels[rows], together.confidences[rows])
 
     def _segments(
         self, topic: str, start: int | None, end: int | None, progress: Progress

@@ -50,7 +50,7 @@ class Chain(NamedTuple):
     """The logs of a node of a home."""
 
     logs: Sequence[Path]  # in order of time; the last may still be written
-    asked: Mapping[int, Path]  # requested logs, by position
+    requested: Mapping[int, Path]  # requested logs, by position
 
 
 def with_layers(path: Path) -> list[Path]:
@@ -164,16 +164,16 @@ def find_chains(paths: Iterable[Path]) -> list[Chain]:
 
     Raise `LogError` if there is no such log, or it is a layer.
     """
-    asked: dict[str, Path] = {}
+    requested: dict[str, Path] = {}
     for path in paths:
         if is_layer(path):
             raise LogError(f"{path}: is a layer; name the log that it speaks of")
-        asked |= {str(log): log for log in find_logs(path) if not is_layer(log)}
-    homes = {str(folder): folder for folder in map(home_folder, asked.values())}
+        requested |= {str(log): log for log in find_logs(path) if not is_layer(log)}
+    homes = {str(folder): folder for folder in map(home_folder, requested.values())}
     chains = []
     for root in homes.values():
         for logs in _logs_by_node(root):
-            places = {i: log for i, log in enumerate(logs) if str(log) in asked}
+            places = {i: log for i, log in enumerate(logs) if str(log) in requested}
             if places:
                 chains.append(Chain(logs, places))
     return chains

@@ -110,23 +110,23 @@ class Damages:
     """Collector of warnings about damaged chunks: the first few of each log, then a count."""
 
     def __init__(self) -> None:
-        self._told: dict[Path, set[str]] = {}
+        self._reported: dict[Path, set[str]] = {}
         self._lock = Lock()
 
     def add(self, path: Path, error: LogError) -> None:
         """Record a damaged chunk; thread-safe."""
         text = str(error)
         with self._lock:
-            told = self._told.setdefault(path, set())
-            is_new = text not in told
-            told.add(text)
-        if is_new and len(told) <= _CHUNKS_NAMED:
+            reported = self._reported.setdefault(path, set())
+            is_new = text not in reported
+            reported.add(text)
+        if is_new and len(reported) <= _CHUNKS_NAMED:
             _warn(path, error)
 
     def warn_of_more(self) -> None:
         """Warn of the number of damaged chunks without a warning of their own."""
-        for path, told in self._told.items():
-            if (more := len(told) - _CHUNKS_NAMED) > 0:
+        for path, reported in self._reported.items():
+            if (more := len(reported) - _CHUNKS_NAMED) > 0:
                 _warn(path, LogError(f"{more:,} more chunks are damaged and left out{RECOVER}"))
 
 

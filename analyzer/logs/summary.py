@@ -241,10 +241,10 @@ def _is_counted(file: LogFile) -> bool:
     if file.statistics is None or file.late:
         return False
     counts = file.statistics.channel_message_counts
-    is_whole = sum(counts.values()) == file.statistics.message_count
+    is_complete = sum(counts.values()) == file.statistics.message_count
     indexed = (file.chunks["index_length"] > 0).any()
-    is_whole &= bool(not indexed or file.lists_all_messages())
-    return is_whole and counts.keys() <= file.channels.keys()
+    is_complete &= bool(not indexed or file.lists_all_messages())
+    return is_complete and counts.keys() <= file.channels.keys()
 
 
 def _count_by_index(file: LogFile, summary: LogSummary) -> None:

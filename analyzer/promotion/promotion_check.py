@@ -199,10 +199,10 @@ def _swallowed(evidence: HomeComparison, champion: str) -> Iterator[str]:
     changes = evidence.changes
     for new in sorted(evidence.taught):
         name, column = class_words(new), changes.minutes[:, changes.classes.index(new)]
-        for what, whole, taken in _taken(evidence, new):
-            if taken >= _MARKS_ALONE and taken > (1.0 - _KEPT) * whole:
+        for what, total, taken in _taken(evidence, new):
+            if taken >= _MARKS_ALONE and taken > (1.0 - _KEPT) * total:
                 yield (
-                    f"{name} takes {taken} of {whole} {what} that {champion} had right: hear its "
+                    f"{name} takes {taken} of {total} {what} that {champion} had right: hear its "
                     "marks, delete wrong ones, and mark what sounds like it as what it is"
                 )
                 break

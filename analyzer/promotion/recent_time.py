@@ -101,8 +101,8 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
     """Return the time of logs outside the training set, in the order of the logs."""
     parts = []
     for log in logs:
-        whole = Spans(np.array([log.start]), np.array([log.end]))
-        rest = without(whole, cut(learned, log.start, log.end))
+        span = Spans(np.array([log.start]), np.array([log.end]))
+        rest = without(span, cut(learned, log.start, log.end))
         times = zip(rest.starts.tolist(), rest.ends.tolist(), strict=True)
         parts += [LogSpan(log.path, *span) for span in times if span[1] - span[0] >= _SHORTEST_PART]
     return parts
@@ -114,9 +114,9 @@ def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list
     loud: list[LogSpan] = []
     quiet: list[LogSpan] = []
     for part in parts:
-        whole = Spans(np.array([part.start]), np.array([part.end]))
+        span = Spans(np.array([part.start]), np.array([part.end]))
         inside = cut(near, part.start, part.end)
-        for chosen, spans in ((loud, inside), (quiet, without(whole, inside))):
+        for chosen, spans in ((loud, inside), (quiet, without(span, inside))):
             times = zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
             chosen += [part._replace(start=start, end=end) for start, end in times]
     return [*_weighted(loud, *_LOUD, seed), *_weighted(quiet, *_QUIET, seed)]
@@ -152,8 +152,8 @@ def sample(parts: Sequence[LogSpan], count: int, longest: int, seed: int = _SEED
 
 def _weighted(parts: Sequence[LogSpan], count: int, longest: int, seed: int) -> list[LogSpan]:
     chosen = sample(parts, count, longest, seed)
-    whole, sampled = (sum(part.end - part.start for part in some) for some in (parts, chosen))
-    return [part._replace(weight=whole / sampled) for part in chosen]
+    total, sampled = (sum(part.end - part.start for part in some) for some in (parts, chosen))
+    return [part._replace(weight=total / sampled) for part in chosen]
 
 
 def recorded_minutes(logs: Sequence[RecentLog]) -> float:

@@ -81,7 +81,7 @@ def relabel(
         If the workers' cluster is gone; completed layers stay.
     """
     chains = find_chains(paths)
-    total = sum(len(chain.asked) for chain in chains)
+    total = sum(len(chain.requested) for chain in chains)
     work = _Relabelling(chains, model, model_path, workers)
     work.run(lambda done: progress(done / max(total, 1)))
     return work.result
@@ -151,12 +151,12 @@ class _Relabelling:
         """
         for chain in self._chains:
             queue = _ChainQueue(chain)
-            found = map_logs(self._look_at, list(chain.asked.values()))
+            found = map_logs(self._look_at, list(chain.requested.values()))
             stretch: list[_PendingLayer] = []
-            for number, (place, layer) in enumerate(zip(chain.asked, found, strict=True)):
+            for number, (place, layer) in enumerate(zip(chain.requested, found, strict=True)):
                 pending = self._pending(chain, place, layer)
                 waits = pending is not None and not pending.ready
-                left = len(chain.asked) - number + len(stretch)
+                left = len(chain.requested) - number + len(stretch)
                 longest = min(-(-left // self._workers.parallel), _LONGEST_STRETCH)
                 follows = bool(stretch) and stretch[-1].place == place - 1
                 if stretch and not (waits and follows and len(stretch) < longest):
@@ -198,7 +198,7 @@ class _Relabelling:
 
     def _job(self, chain: Chain, place: int, *, replaces: bool, alone: bool = False) -> Job:
         """Make the job of a log; `alone` if the layer before it failed."""
-        continues = place - 1 in chain.asked and not alone
+        continues = place - 1 in chain.requested and not alone
         log = chain.logs[place]
         first = max(place - _MOST_EARLIER, 0) if continues else 0
         return Job(

@@ -42,16 +42,16 @@ def day_headline(day: DayMetrics) -> str:
 def week_headline(days: Sequence[DayMetrics]) -> str:
     """Return the headline of a week: its quiet days; coughing, crying and shouting."""
     known = [day for day in days if day.coverage.length]
-    whole_days = [day for day in known if _is_known(day)]
-    quiet = sum(is_quiet(day) for day in whole_days)
-    number, of = number_in_words(len(whole_days)), number_in_words(len(days))
-    which = {0: "none", len(whole_days): "all" if len(whole_days) > _ONE_MORE else "both"}
+    complete_days = [day for day in known if _is_known(day)]
+    quiet = sum(is_quiet(day) for day in complete_days)
+    number, of = number_in_words(len(complete_days)), number_in_words(len(days))
+    which = {0: "none", len(complete_days): "all" if len(complete_days) > _ONE_MORE else "both"}
     was = which.get(quiet, number_in_words(quiet))
-    if len(whole_days) == len(days):
+    if len(complete_days) == len(days):
         parts = [f"{_capital(was)} of the {of} days {_were(quiet)} quiet."]
-    elif len(whole_days) > 1:
+    elif len(complete_days) > 1:
         parts = [f"{_capital(number)} of {of} days could be judged, {was} of them quiet."]
-    elif whole_days:
+    elif complete_days:
         parts = [f"One of {of} days could be judged, and was {'' if quiet else 'not '}quiet."]
     else:
         parts = [f"Too little was recorded to judge any of the {of} days."]
@@ -112,18 +112,18 @@ def _day(day: DayMetrics) -> str:
     """Return whether a day was quiet, and how much of it is known."""
     name = weekday(day.day)
     hours = rounded(day.coverage.length / MINUTE) / 60  # as the page says it
-    whole_hours = rounded(day.span.length / HOUR)
+    hours_of_day = rounded(day.span.length / HOUR)
     if not _is_known(day):
         if hours < 1:
             return f"Less than an hour of {name} was recorded."
         were = _were(int(hours))
-        return f"Only {int(hours)} of the {whole_hours} hours of {name} {were} recorded."
+        return f"Only {int(hours)} of the {hours_of_day} hours of {name} {were} recorded."
     lively = _lively(day)
     partly = ""
     if day.span.length / HOUR - hours >= _MISSING_HOURS:
-        partly = f", as far as it was recorded ({int(hours)} of {whole_hours} hours)"
+        partly = f", as far as it was recorded ({int(hours)} of {hours_of_day} hours)"
     if not is_quiet(day):
-        return f"{name} had sound in {lively.sum()} of {whole_hours} hours{partly}."
+        return f"{name} had sound in {lively.sum()} of {hours_of_day} hours{partly}."
     if not lively.any():
         return f"{name} was quiet{partly}."
     runs = _runs(day, lively)

@@ -152,7 +152,7 @@ def read_account(
         scenarios=_scenarios(logs, days, zone, data) if labelling == LIVE else {},
         unread=len(data.losses),
         networks=network_changes(logs.between(since, close[1]), zone),
-        hidden=data.never_told,
+        hidden=data.hidden,
     )
     return account, data.losses
 
@@ -179,27 +179,27 @@ def _doubts(
         own = (events.starts >= start) & (events.starts < end)
         own &= ~np.isin(events.starts // MINUTE * MINUTE, television)
         own &= rows_at(known[0].reviewed, events.starts) < 0
-        own &= ~np.isin(events.labels, [*data.never_told])
+        own &= ~np.isin(events.labels, [*data.hidden])
         entries = [(e.path, e.start, e.end) for e in (*close, *layer) if e.node == node]
         topics = labelling_topic(microphone, name, "label"), f"/{microphone}/features"
         found += read_doubtful_sounds(entries, topics, events.rows(own))
-    return [sound for sound in found if sound.needs_look(data.never_told)]
+    return [sound for sound in found if sound.needs_look(data.hidden)]
 
 
 def _scenarios(
     logs: HomeLogs, days: Sequence[date], zone: tzinfo, data: HomeData
 ) -> ScenarioMinutes:
     spans = [day_span(day, zone) for day in days]
-    return read_scenario_minutes(logs, spans, data.lose, data.never_told)
+    return read_scenario_minutes(logs, spans, data.lose, data.hidden)
 
 
 def _unrecorded(data: HomeData, start: int, end: int) -> dict[str, float]:
     """Return the hours without coverage of each microphone."""
-    whole = end - start
+    length = end - start
     hours: dict[str, float] = {}
     for (_, microphone), segments in data.segments.items():
         own = common(joined(segments.starts, segments.ends), one(start, end)).length
-        hours[microphone] = max(hours.get(microphone, 0.0), (whole - own) / HOUR)
+        hours[microphone] = max(hours.get(microphone, 0.0), (length - own) / HOUR)
     return hours
 
 

@@ -58,10 +58,10 @@ def gist_of_week(account: Account) -> Iterator[str]:
     if max(account.beside.values()) < FEWEST:
         yield too_few_text(max(account.beside.values()))
         return
-    told = [(day.day, judged) for day in days if (judged := account.judged[day.day])]
-    unusual = [(day, judged) for day, judged in told if judged.once_in >= WEEK]
+    judgements = [(day.day, judged) for day in days if (judged := account.judged[day.day])]
+    unusual = [(day, judged) for day, judged in judgements if judged.once_in >= WEEK]
     if not unusual:
-        yield f"None of the {len(told)} days that can be judged was unlike those before it."
+        yield f"None of the {len(judgements)} days that can be judged was unlike those before it."
     for day, judged in unusual:
         yield f"{short_day(day)}: {judgement_text(judged)}"
 
@@ -131,8 +131,8 @@ def not_well(account: Account) -> Iterator[str]:
         An introduction, then a line for each kind of trouble, the longest first; nothing without
         troubles.
     """
-    told = {gap.text for gap in account.gaps}
-    troubles = [trouble for trouble in account.troubles if trouble.text not in told]
+    reported = {gap.text for gap in account.gaps}
+    troubles = [trouble for trouble in account.troubles if trouble.text not in reported]
     if troubles:
         yield "The box reported problems; have it checked if this goes on."
     for name, same in _by_lasting(troubles, lambda t: f"{t.source.split(': ')[-1]}: {t.text}"):

@@ -274,10 +274,10 @@ def _classes(
             rows = one.spans.texts == name
             seconds[in_words(name)] += int((one.spans.ends - one.spans.starts)[rows].sum())
     shades = {in_words(name): colour(name) for name in reversed(names)}
-    heard = [name for name in shades if seconds[name]]
+    sounding = [name for name in shades if seconds[name]]
     silent = [in_words(name) for name in names if not seconds[in_words(name)]]
-    room = max(_MOST_LANES - len(heard), 0)
-    shown = {*heard, *silent[:room]}
+    room = max(_MOST_LANES - len(sounding), 0)
+    shown = {*sounding, *silent[:room]}
     return {name: shades[name] for name in map(in_words, names) if name in shown}
 
 

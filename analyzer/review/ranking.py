@@ -275,9 +275,9 @@ def _useful(
         return rows[cover(points, gamma, shares, eligible, count)]
     kept, row, _ = pieces(some, audible)
     length = np.bincount(row, kept.ends - kept.starts, len(some))
-    heard = length > _MOSTLY * (some.ends - some.starts)
-    first = cover(points, gamma, shares, eligible & heard, count)
-    rest = cover(points, gamma, shares, eligible & ~heard, count - len(first))
+    sounding = length > _MOSTLY * (some.ends - some.starts)
+    first = cover(points, gamma, shares, eligible & sounding, count)
+    rest = cover(points, gamma, shares, eligible & ~sounding, count - len(first))
     return rows[np.concatenate([first, rest])]
 
 

@@ -299,11 +299,11 @@ def find_kept_sound(
 
 
 def sound_files(
-    marks: Sequence[Mark], asked: Iterable[ReviewSpan], kept: KeptSoundLayers
+    marks: Sequence[Mark], requested: Iterable[ReviewSpan], kept: KeptSoundLayers
 ) -> list[SoundFile]:
     """List the lines of a label file that have kept sound, then the minutes."""
     lines = [SoundFile(n, n, mark.start, mark.end) for n, mark in enumerate(marks, 1)]
-    files = [*lines, *(one for one in drawn_minutes(asked, marks) if one.last > one.first)]
+    files = [*lines, *(one for one in drawn_minutes(requested, marks) if one.last > one.first)]
     return [one for one in files if cut(kept.time, one.start, one.end).length >= _SHORTEST]
 
 
@@ -331,7 +331,7 @@ def write_sounds(
 
 def label_lines(
     marks: Sequence[Mark],
-    asked: Iterable[ReviewSpan],
+    requested: Iterable[ReviewSpan],
     files: Iterable[SoundFile],
     folder: str,
     zone: tzinfo,
@@ -341,7 +341,7 @@ def label_lines(
     An import reads the first three columns.
     """
     notes: dict[int, list[str]] = {}
-    for minute in drawn_minutes(asked, marks):
+    for minute in drawn_minutes(requested, marks):
         text = f"a minute drawn at random, to line {minute.last}"
         notes.setdefault(minute.first, []).append(text)
     for file in files:
@@ -364,9 +364,9 @@ def _clock(nanoseconds: int, zone: tzinfo) -> str:
     return f"{text[:19]}.{decimals}{text[19:]}" if decimals else text
 
 
-def drawn_minutes(asked: Iterable[ReviewSpan], marks: Sequence[Mark]) -> Iterator[SoundFile]:
+def drawn_minutes(requested: Iterable[ReviewSpan], marks: Sequence[Mark]) -> Iterator[SoundFile]:
     """Yield the minutes drawn at random; a minute whose log is gone has no lines and is skipped."""
-    for span in asked:
+    for span in requested:
         lines = [number for number, mark in enumerate(marks, 1) if _answers(mark, span)]
         if span.reason == RANDOM and lines:
             yield SoundFile(lines[0], lines[-1], span.start, span.end)
@@ -416,7 +416,7 @@ def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:
 
 
 def looked_at(
-    asked: Iterable[ReviewSpan],
+    requested: Iterable[ReviewSpan],
     marks: Sequence[Mark],
     coverage: Mapping[str, Coverage],
     reviewer: str,
@@ -424,7 +424,7 @@ def looked_at(
 ) -> dict[Path, list[ReviewedSpan]]:
     """Return the requested spans that a person has reviewed: those with a label."""
     reviewed: dict[Path, list[ReviewedSpan]] = {}
-    for span in asked:
+    for span in requested:
         if span.microphone in coverage and any(_answers(mark, span) for mark in marks):
             origin = reviewer, made, corrected_name(span.a), chosen_as(span)
             for log, first, last in coverage[span.microphone].split(span.start, span.end):

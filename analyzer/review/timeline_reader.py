@@ -381,11 +381,11 @@ def _unrecorded(
     gaps = microphone.gaps
     spans = [gaps, *(one.spans for one in microphone.labellings)]
     past = max(time_ns(), *coverage.ends, grid.start)
-    whole = one_span(grid.start, min(grid.end, past))
+    span = one_span(grid.start, min(grid.end, past))
     starts = np.concatenate([coverage.starts, *(each.starts for each in spans)]).astype(np.int64)
     ends = np.concatenate([coverage.ends, *(each.ends for each in spans)]).astype(np.int64)
     recorded = joined(starts, ends, NANOSECONDS)
-    off = without(whole, recorded)
+    off = without(span, recorded)
     starts = np.concatenate([gaps.starts, off.starts])
     order = np.argsort(starts, kind="stable")
     ends = np.concatenate([gaps.ends, off.ends])

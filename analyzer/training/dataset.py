@@ -575,10 +575,10 @@ def learned_groups(model: Model, data: Dataset) -> Indices:
 def _digests(windows: Float32) -> Int64:
     with np.errstate(over="ignore"):
         rows = windows.astype("<f2")  # the last bits of features differ between machines
-    whole = b"".join(
+    digests = b"".join(
         hashlib.blake2b(row.tobytes(), digest_size=_DIGEST_BYTES).digest() for row in rows
     )
-    return np.frombuffer(whole, "<i8").astype(np.int64)
+    return np.frombuffer(digests, "<i8").astype(np.int64)
 
 
 def _distinguishable(windows: Float32) -> Bool:

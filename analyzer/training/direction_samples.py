@@ -70,11 +70,11 @@ def with_directions(
     """
     silence = model.classes.index(SILENCE) if SILENCE in model.classes else -1
     located = zip(target.tolist(), sightings, strict=False)
-    told = [(number, one) for number, one in located if one is not None and number != silence]
-    arrays = sorted({one.microphone for _, one in told})[:MOST_ARRAYS]
+    placed = [(number, one) for number, one in located if one is not None and number != silence]
+    arrays = sorted({one.microphone for _, one in placed})[:MOST_ARRAYS]
     weights = np.zeros((len(arrays), len(model.classes), SECTORS))
     for number, array in enumerate(arrays):
-        classes, own = zip(*(each for each in told if each[1].microphone == array), strict=True)
+        classes, own = zip(*(each for each in placed if each[1].microphone == array), strict=True)
         weights[number] = _weights(np.array(classes), own, len(model.classes))
     if not weights.any():
         return model

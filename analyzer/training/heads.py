@@ -282,8 +282,8 @@ def cross_validated_heads(
         seen = ~unseen_windows(data, unseen)
         learned = learn_heads(data.embedding_windows, data.classes, inputs, seen)
         heads = EmbeddingHeads(mix, *learned, data.classes)
-        heard = unseen[data.is_embedded[unseen]]
-        by_heads[heard] = heads.log_probabilities(data.embedded[heard])
+        embedded = unseen[data.is_embedded[unseen]]
+        by_heads[embedded] = heads.log_probabilities(data.embedded[embedded])
     return by_heads
 
 
@@ -489,9 +489,9 @@ def _nested(data: Dataset, mix: EmbeddingMix, way: Tried, by_heads: Float64) -> 
         others = np.ones(len(data), bool)
         others[unseen] = False
         inverse = _inverse_temperature(data, mix, way, by_heads, others)
-        heard = unseen[~np.isnan(by_heads[unseen]).any(axis=1)]
+        embedded = unseen[~np.isnan(by_heads[unseen]).any(axis=1)]
         surer = mix.model_copy(update={"inverse_temperature": inverse})
-        result[heard] = mixed(way.decisions[heard], by_heads[heard], surer, data.classes)
+        result[embedded] = mixed(way.decisions[embedded], by_heads[embedded], surer, data.classes)
     return result
 
 

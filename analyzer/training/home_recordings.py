@@ -266,7 +266,7 @@ def _columns_before(log: Path, topics: Collection[str], start: int) -> dict[str,
     """Read the log before another one from a time on, if it exists and is readable."""
     with suppress(LogError):
         for chain in find_chains([log]):
-            for place in chain.asked:
+            for place in chain.requested:
                 return read_columns(
                     chain.logs[max(place - 1, 0) : place], topics, start, fields=_FIELDS
                 )
@@ -350,11 +350,11 @@ def marked_recordings(
         A mark, or a part of one between gaps; log by log.
     """
     quiet: list[str] = []
-    unheard: list[str] = []
+    missing: list[str] = []
     for sound in sounds:
         for mark in sound.marks:
             if not sound.inside([(mark.start, mark.end)]).any():
-                unheard.append(f"{mark.label} in {sound.log.name}")
+                missing.append(f"{mark.label} in {sound.log.name}")
                 continue
             silence = class_name(mark.label) == SILENCE
             if is_short_silence(mark, features):
@@ -365,9 +365,9 @@ def marked_recordings(
                 quiet.append(f"{mark.label} in {sound.log.name}")
             else:
                 yield from pieces
-    if unheard:
+    if missing:
         text = (
-            f"{len(unheard)} marks lie where nothing was recorded, the first is {unheard[0]}: they "
+            f"{len(missing)} marks lie where nothing was recorded, the first is {missing[0]}: they "
             "are left out"
         )
         warnings.warn(HearthlogWarning(text, folder), stacklevel=2)

@@ -208,12 +208,12 @@ def _with_new_classes(
             learned[name] = every[name]
             continue
         count = sum(class_name(one.label) == name for one in others)
-        whole = math.ceil(round(seconds, 3))
-        more = f"{whole} more {'second' if whole == 1 else 'seconds'}" if whole else "any"
+        rounded = math.ceil(round(seconds, 3))
+        more = f"{rounded} more {'second' if rounded == 1 else 'seconds'}" if rounded else "any"
         day = ", from another day," if amount.sources < _FEWEST_DAYS else ""
         what = "the model has no room for it"
         if room:
-            what = f"{more}{day} {'make' if whole > 1 else 'makes'} it a class"
+            what = f"{more}{day} {'make' if rounded > 1 else 'makes'} it a class"
         if any(meant_by(label, as_unknown) for label in every[name]):
             what += "; until then they count as unknown"
         else:

@@ -244,14 +244,14 @@ def _usable(
 ) -> Bool:
     """Return which windows of segments are loud enough for training."""
     power = features.power(segments).astype(np.float64)
-    heard: Bool = ~np.isnan(power.sum(axis=1, keepdims=True))
+    is_finite: Bool = ~np.isnan(power.sum(axis=1, keepdims=True))
     if len(window_places(segments.shape[1], window_frames)) == 1:
-        return heard
+        return is_finite
     least = _ABOVE_FLOOR * floor[:, -1:] if floor.shape[1] else None
     loud = loud_windows(power, window_frames, least)
     if SILENCE in data.classes:
         loud |= (data.target == data.classes.index(SILENCE))[:, np.newaxis]
-    usable: Bool = loud & heard
+    usable: Bool = loud & is_finite
     return usable
 
 

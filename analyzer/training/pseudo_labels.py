@@ -243,9 +243,9 @@ def _by_heads(recordings: Sequence[Recording], classifier: Classifier) -> Float6
     if classifier.embedding_heads is None:
         return by_heads
     for row, recording in enumerate(recordings):
-        heard = None if recording.embedded is None else recording.embedded.at(0)
-        if heard is not None and len(heard):
-            by_heads[row] = classifier.embedding_heads.log_probabilities(heard)[0]
+        embedded = None if recording.embedded is None else recording.embedded.at(0)
+        if embedded is not None and len(embedded):
+            by_heads[row] = classifier.embedding_heads.log_probabilities(embedded)[0]
     return by_heads
 
 

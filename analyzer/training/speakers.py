@@ -93,8 +93,8 @@ def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
     for one in recordings:
         if is_voice(one.label):
             groups.setdefault(one.label, set()).add(one.group)
-            heard = seconds.get(one.label, 0.0) + len(one.features) * FRAME_SECONDS
-            seconds[one.label] = heard
+            total = seconds.get(one.label, 0.0) + len(one.features) * FRAME_SECONDS
+            seconds[one.label] = total
     if not groups:
         raise DataError("nobody is enrolled; begin with `hearthlog enrol anna --home voices`")
     for name in sorted(groups):

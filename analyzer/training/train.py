@@ -321,8 +321,8 @@ def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Me
         data.target, predicted, labels=numbers, zero_division=0.0
     )
     confusion = confusion_matrix(data.target, predicted, labels=numbers)
-    told = np.bincount(data.target, minlength=len(data.classes)) > 0
-    known = [number for number in numbers if data.classes[number] != UNKNOWN and told[number]]
+    occurs = np.bincount(data.target, minlength=len(data.classes)) > 0
+    known = [number for number in numbers if data.classes[number] != UNKNOWN and occurs[number]]
     return Metrics(
         folds=folds,
         macro_f1=float(f1[known].mean()),

@@ -200,9 +200,9 @@ class LabellingModels:
         for labelling, watch in self._watches.items():
             if not is_by_names(watch.first.model):
                 continue
-            whole = watch.first.model
-            shared = shared_classes(whole, self._others(labelling).values())
-            model = without_classes(whole, shared, self._features)
+            full = watch.first.model
+            shared = shared_classes(full, self._others(labelling).values())
+            model = without_classes(full, shared, self._features)
             before = self.in_use.pop(labelling, None)
             loaded = None
             if len(model.classes) > 1:

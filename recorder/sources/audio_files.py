@@ -188,10 +188,10 @@ class FileSource:
             for block in blocks:
                 samples += len(block)
                 held = np.concatenate([held, block]) if len(held) else block
-                whole = len(held) - len(held) % size
-                for start in range(0, whole, size):
+                full = len(held) - len(held) % size
+                for start in range(0, full, size):
                     yield held[start : start + size].reshape(-1, FRAME_SAMPLES, *shape)
-                held = held[whole:]
+                held = held[full:]
         rest = len(held) - len(held) % FRAME_SAMPLES
         if rest:
             yield held[:rest].reshape(-1, FRAME_SAMPLES, *shape)

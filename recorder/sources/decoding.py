@@ -148,15 +148,15 @@ class StreamMixer:
             if not self._missing:
                 self._look(self._choice, np.concatenate(self._piece))
                 self._piece = []
-        heard = np.rint(np.concatenate(mixed) * _INT16_FULL_SCALE)
-        return np.clip(heard, -32768, 32767).astype(np.int16)
+        scaled = np.rint(np.concatenate(mixed) * _INT16_FULL_SCALE)
+        return np.clip(scaled, -32768, 32767).astype(np.int16)
 
     def _look(self, choice: "_Choice", piece: Float32) -> None:
         choice.look_at_piece(piece)
         self._recent.append(piece)
         is_full = len(self._recent) == _PIECES
         if is_full or (self._begins and len(self._recent) >= _FIRST_PIECES):
-            choice.look_at_block(np.concatenate(self._recent), is_whole=is_full)
+            choice.look_at_block(np.concatenate(self._recent), is_full=is_full)
         if is_full:
             self._recent, self._begins = [], False
 
@@ -173,7 +173,7 @@ class _Choice:
     ) -> None:
         self._count = count
         self._usual = [0] if takes_first else [*range(count)]
-        self._heard = self._usual
+        self._in_mix = self._usual
         self._instead: list[int] | None = None  # in this piece, because of NaN
         self._chosen = chosen
         self._usable = np.ones(count, bool)
@@ -190,7 +190,7 @@ class _Choice:
         ----------
         samples : np.ndarray [shape=(n, c)], float32
         """
-        return self._mixed(samples, self._heard if self._instead is None else self._instead)
+        return self._mixed(samples, self._in_mix if self._instead is None else self._instead)
 
     def _mixed(self, samples: _Samples, channels: list[int]) -> _Samples:
         if len(channels) == 1:
@@ -223,11 +223,11 @@ class _Choice:
         if candidates[best]:
             usual = self._mixed(finite, self._usual).var()
             self._usual_covers &= bool(usual * _COVERS > powers[best])
-            if self._hides(best, powers[best], self._mixed(finite, self._heard).var()):
+            if self._hides(best, powers[best], self._mixed(finite, self._in_mix).var()):
                 self._go_to(best, hides=False)
-        self._instead = self._without(is_lost, powers) if is_lost[self._heard].any() else None
+        self._instead = self._without(is_lost, powers) if is_lost[self._in_mix].any() else None
 
-    def look_at_block(self, block: Float32, *, is_whole: bool = True) -> None:
+    def look_at_block(self, block: Float32, *, is_full: bool = True) -> None:
         """Select channels from ten seconds, long enough to recognise steady noise.
 
         Parameters
@@ -255,8 +255,8 @@ class _Choice:
         quietest = floors[sounding].min() if sounding.any() else np.inf
         noisy = steady & (total > _FAINTER * quietest)
         usable = ~noisy & ~(lost & ~lost.all())
-        covers = is_whole and self._usual_covers
-        self._usual_covers = is_whole or self._usual_covers
+        covers = is_full and self._usual_covers
+        self._usual_covers = is_full or self._usual_covers
         best = int(np.where(usable, total, -1.0).argmax())
         if not total[best] > _AUDIBLE:
             return
@@ -264,34 +264,34 @@ class _Choice:
         usual = self._mixed(pieces, self._usual).var(axis=1).mean()
         is_usual_there = sounding.sum() > 1 or (self._usual == [best] and sounding[best])
         covers = covers and usable[self._usual].all() and usual * _COVERS > total[best]
-        if self._heard != self._usual and covers and is_usual_there:
+        if self._in_mix != self._usual and covers and is_usual_there:
             self._on_samples(self._usual, "")
             return
-        power = self._mixed(pieces, self._heard).var(axis=1).mean()
+        power = self._mixed(pieces, self._in_mix).var(axis=1).mean()
         # The steady noise of an unplugged socket is louder than a quiet room.
-        hides = not usable[self._heard].all()
+        hides = not usable[self._in_mix].all()
         if (self._is_mean() or sounding[best] or power < _DEAD) and (
             hides or self._hides(best, total[best], power)
         ):
             self._go_to(best, hides=hides)
-        elif is_whole and self._heard != self._usual:
+        elif is_full and self._in_mix != self._usual:
             self._leave_silent()
 
     def _is_mean(self) -> bool:
         """Whether the mean of all channels is selected, as by default."""
-        return self._heard == self._usual and len(self._usual) > 1
+        return self._in_mix == self._usual and len(self._usual) > 1
 
     def _hides(self, best: int, most: float, power: float) -> bool:
         """Whether a mix of this power hides the best channel."""
-        count = len(self._heard)
-        if self._heard != self._usual and best in self._heard:
+        count = len(self._in_mix)
+        if self._in_mix != self._usual and best in self._in_mix:
             return power * max(_FAINTER, _CANCELLED * count) < most
         return power * _FAINTER < most
 
     def _go_to(self, best: int, *, hides: bool) -> None:
         """Select the best channel; keep the others if it was left less than a minute ago."""
-        others = [i for i in self._heard if self._usable[i] and i != best]
-        is_back = best not in self._heard and self._piece - self._left[best] < _REMEMBERED
+        others = [i for i in self._in_mix if self._usable[i] and i != best]
+        is_back = best not in self._in_mix and self._piece - self._left[best] < _REMEMBERED
         if is_back and others:
             self._on_samples(sorted([*others, best]), "sound comes from one or the other")
         elif self._is_mean():
@@ -299,34 +299,34 @@ class _Choice:
                 [best], "the others hide it" if hides else "their mean is much fainter"
             )
         else:
-            before = "the first one" if self._heard == [0] else _names(self._heard)
-            verb = "is" if len(self._heard) == 1 else "are"
+            before = "the first one" if self._in_mix == [0] else _names(self._in_mix)
+            verb = "is" if len(self._in_mix) == 1 else "are"
             why = "hides it" if hides else f"{verb} much fainter"
             self._on_samples([best], f"{before} {why}")
 
     def _leave_silent(self) -> None:
         """Drop selected channels that held no sound for a minute."""
-        there = [i for i in self._heard if self._piece - self._sounded[i] < _REMEMBERED]
-        if there and there != self._heard:
-            silent = _names(i for i in self._heard if i not in there)
+        there = [i for i in self._in_mix if self._piece - self._sounded[i] < _REMEMBERED]
+        if there and there != self._in_mix:
+            silent = _names(i for i in self._in_mix if i not in there)
             self._on_samples(there, f"no more sound comes from {silent}")
 
     def _on_samples(self, channels: list[int], why: str) -> None:
-        if channels == self._heard:
+        if channels == self._in_mix:
             return
         if not self._is_mean():
-            self._left[self._heard] = self._piece
-        self._heard = channels
+            self._left[self._in_mix] = self._piece
+        self._in_mix = channels
         if channels == self._usual:
             self._chosen("")
             return
-        is_heard = "is heard alone" if len(channels) == 1 else "are heard"
-        self._chosen(f"{_names(channels)} of {self._count} {is_heard}: {why}")
+        remains = "is heard alone" if len(channels) == 1 else "are heard"
+        self._chosen(f"{_names(channels)} of {self._count} {remains}: {why}")
 
     def _without(self, is_lost: Bool, powers: Float64) -> list[int] | None:
         """Return channels for a piece in which some selected channels have NaN."""
-        most = powers[self._heard].max()
-        held = [i for i in self._heard if not is_lost[i]]
+        most = powers[self._in_mix].max()
+        held = [i for i in self._in_mix if not is_lost[i]]
         for others in (held, [int(np.where(is_lost, -1.0, powers).argmax())]):
             if others and not is_lost[others].any() and powers[others].max() * _FAINTER >= most:
                 return others

@@ -321,7 +321,7 @@ class _Sound:
         fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, _READ_BYTES)
         for pipe in (self._pipe, self._errors):
             os.set_blocking(pipe, False)
-        self._said = b""
+        self._error_text = b""
         self._has_sounded = False
         self._parent = os.getppid()
 
@@ -378,7 +378,9 @@ class _Sound:
 
     def _listen(self) -> None:
         with suppress(BlockingIOError):
-            self._said = (self._said + os.read(self._errors, _READ_BYTES))[-_SAID_BYTES:]
+            self._error_text = (self._error_text + os.read(self._errors, _READ_BYTES))[
+                -_SAID_BYTES:
+            ]
 
     def _reason(self) -> str:
         if self._has_sounded:
@@ -386,7 +388,7 @@ class _Sound:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=1.0)
         self._listen()
-        return explain(self._address, self._said.decode(errors="replace"))
+        return explain(self._address, self._error_text.decode(errors="replace"))
 
 
 def _capture(sound: _Sound, address: str, output: Any) -> None:

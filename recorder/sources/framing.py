@@ -50,8 +50,8 @@ class FrameCutter:
         if self._resampler is not None:
             samples = self._resampler.resample_chunk(samples, last=last)
         self._held = np.concatenate([self._held, samples])
-        whole = len(self._held) - len(self._held) % FRAME_SAMPLES
-        frames, self._held = np.split(self._held, [whole])
+        full = len(self._held) - len(self._held) % FRAME_SAMPLES
+        frames, self._held = np.split(self._held, [full])
         return frames.reshape(-1, FRAME_SAMPLES, *self._shape)
 
 
@@ -347,8 +347,8 @@ class Framer:
         times = self._times(count)
         self._framed += count * FRAME_SAMPLES
         if self._reason and self._end is not None:  # it overlaps the previous source
-            heard = int(np.searchsorted(times, self._end))
-            times, frames, count = times[heard:], frames[heard:], count - heard
+            framed = int(np.searchsorted(times, self._end))
+            times, frames, count = times[framed:], frames[framed:], count - framed
             if count == 0:
                 return []
         gap = self._gap_before(int(times[0]))

@@ -265,9 +265,9 @@ class DirectionFinder:
         crossed = (weighted.take(one, axis=2) * phases.take(other, axis=2).conj()).sum(axis=1)
         rows = crossed.view(np.float32).reshape(len(crossed), -1)
         total = weights.reshape(*blocks, _BINS).sum(axis=1).sum(axis=1, keepdims=True)
-        is_heard = total >= _LEAST_WEIGHT * BLOCK_FRAMES * _HOPS * _BINS
+        is_loud = total >= _LEAST_WEIGHT * BLOCK_FRAMES * _HOPS * _BINS
         steered = np.einsum("bk,ak->ba", rows, self._steering)
-        return np.where(is_heard, steered / np.maximum(total, _TINY) / len(self._pairs), 0)
+        return np.where(is_loud, steered / np.maximum(total, _TINY) / len(self._pairs), 0)
 
     def _spectra(self, frames: Float32) -> NDArray[np.complex64]:
         """Return the spectrum of each channel at each hop: [shape=(h, c, f)]."""
@@ -293,8 +293,8 @@ class DirectionFinder:
         """Return the gate of each frame and band: powers below it have no weight."""
         frames = bands.reshape(-1, _HOPS, len(_STARTS)).astype(np.float64)
         powers = (frames[:, 0] + frames[:, 1] + frames[:, 2] + frames[:, 3]) / _HOPS
-        whole = powers.sum(axis=1, keepdims=True)
-        floors = self._floor(np.concatenate([powers, whole], axis=1), first).powers
+        sums = powers.sum(axis=1, keepdims=True)
+        floors = self._floor(np.concatenate([powers, sums], axis=1), first).powers
         unknown = np.full((len(powers) - len(floors), len(_STARTS)), np.inf)
         return np.concatenate([unknown, _GATE * floors[:, :-1]])
 

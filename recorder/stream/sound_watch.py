@@ -131,8 +131,8 @@ class ClipWatch:
         self._still += int(is_still.sum())
         self._zero += int((is_flat & ~is_still).sum())  # silence in a file
         held = np.concatenate([self._held, samples])
-        whole = len(held) - len(held) % _SECOND
-        seconds, self._held = np.split(held, [whole])
+        full = len(held) - len(held) % _SECOND
+        seconds, self._held = np.split(held, [full])
         self._seconds += map(_hum_of, seconds.reshape(-1, SAMPLE_RATE))
 
     def problem(self) -> str:

@@ -90,7 +90,7 @@ def events(
         data = read_home(home_logs, labels, before, span[:2], progress)
     metrics = whole_home(data)
     marked = marked_classes(data)
-    classes = _chosen_classes([*metrics.classes, *marked], label or (), data.never_told)
+    classes = _chosen_classes([*metrics.classes, *marked], label or (), data.hidden)
     found = home_events(data, metrics, classes, *span[:2])
     labelled = [name for name in classes if name not in marked] or metrics.classes
     missing = _not_listened(metrics, labelled, span, every=bool(label))

@@ -225,7 +225,7 @@ class AlertsOutput:
         self._has_news = Flag()  # set by the first update
         self._labels: deque[tuple[str, LiveLabel, Sequence[str]]] = deque(maxlen=_LABELS)
         self._columns: deque[Columns] = deque(maxlen=_COLUMNS)
-        self._told_now: tuple[Notification, str] | None = None  # being delivered to the broker
+        self._in_delivery: tuple[Notification, str] | None = None  # being delivered to the broker
         self._stop = Flag()
         self._delivery = Delivery(self._outbox, [], home.node, home.zone, say)
         self._find_targets()
@@ -253,17 +253,17 @@ class AlertsOutput:
 
     def _publish_ring(self, on_notification: OnNotification) -> bool:
         """Offer one notification to the broker, repeatedly; return whether it was taken."""
-        if self._told_now is None:
+        if self._in_delivery is None:
             waiting = self._outbox.waiting_for(BROKER, time.time_ns())
             if not waiting:
                 return False
             # Formatted once: minutes later the text would say "late" and be a different message.
-            self._told_now = waiting[0], message(waiting[0], self._followed.zone)
-        notification, text = self._told_now
+            self._in_delivery = waiting[0], message(waiting[0], self._followed.zone)
+        notification, text = self._in_delivery
         is_taken = on_notification(notification.rule, text, notification.time)
         if is_taken:
             self._outbox.record_delivery(BROKER, notification)
-            self._told_now = None
+            self._in_delivery = None
         return is_taken
 
     def _run(self) -> None:
@@ -301,9 +301,9 @@ class AlertsOutput:
             if names != self._lines:
                 self._lines = names
                 self._lines_entry.save(names)
-        told = [target.name for target in targets] + [UNREAD] * bool(problems)
-        told += [BROKER] * (self._on_notification is not None)
-        self._outbox.set_targets(told, time.time_ns())
+        recipients = [target.name for target in targets] + [UNREAD] * bool(problems)
+        recipients += [BROKER] * (self._on_notification is not None)
+        self._outbox.set_targets(recipients, time.time_ns())
         self._delivery.set_targets(targets)
 
     def _follow(self) -> None:

@@ -66,12 +66,12 @@ class MqttPublisher:
         self._birth_topic = f"{settings.discovery_topic}/status"
         self._command_topic = topics.at("command")
         subscriptions = [self._birth_topic] if settings.home_assistant else []
-        self._asked: deque[bytes] = deque(maxlen=_MOST_ASKED)
+        self._received: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
         self._say = say
         self._announced = RetainedTopics(state, say)
         self._forgotten: set[str] = set()  # topics being cleared at the broker
-        self._has_said_muted = False
+        self._has_published_muted = False
         # Earlier versions stored retained topics and muted classes only at the broker.
         self._is_new = self._announced.is_new
         self._found, self._found_size = 0, 0  # topics read back from the broker
@@ -176,8 +176,8 @@ class MqttPublisher:
 
     def _obey(self, state: HomeState) -> None:
         """Queue received commands, and publish the results of finished ones."""
-        while self._commands is not None and self._asked:
-            self._commands.add(self._asked.popleft(), state)
+        while self._commands is not None and self._received:
+            self._commands.add(self._received.popleft(), state)
         while self._answers:
             answer = self._answers.popleft()
             self._connection.send(self._topics.at("command/answer"), json.dumps(answer._asdict()))
@@ -188,7 +188,7 @@ class MqttPublisher:
             self._is_born |= message.payload == _BORN and not message.retain
         elif message.topic == self._command_topic:
             if not message.retain:  # a retained command was meant for an earlier time
-                self._asked.append(bytes(message.payload))
+                self._received.append(bytes(message.payload))
         elif self._reads_back and message.retain and message.payload == b"OFF":
             place = self._topics.parse(message.topic)
             if place is not None and place.kind == TOLD and len(self._off) < _MOST_OFF:
@@ -212,7 +212,7 @@ class MqttPublisher:
         for label in self._off.intersection(classes):
             self._off.discard(label)
             self._announced.switch(label, is_published=False)
-            self._has_said_muted = False
+            self._has_published_muted = False
 
     def _discovery_topic(self, device: str) -> str:
         return f"{self._settings.discovery_topic}/device/{device}/config"
@@ -220,7 +220,7 @@ class MqttPublisher:
     def _report_muted(self) -> None:
         """Report the muted classes once, and how to unmute them."""
         muted = self._announced.muted()
-        if muted and not self._has_said_muted:
+        if muted and not self._has_published_muted:
             remedy = (
                 f'a command such as {{"told": true, "label": "{muted[0]}"}} changes that'
                 if self._settings.commands
@@ -228,7 +228,7 @@ class MqttPublisher:
                 f"bridge once with --unmute {muted[0]}"
             )
             self._say(f"mqtt: not published: {', '.join(muted)}; {remedy}")
-        self._has_said_muted = True
+        self._has_published_muted = True
 
     def _topic(self, place: Place) -> str:
         """Return the topic of a place."""

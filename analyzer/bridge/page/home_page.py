@@ -119,16 +119,16 @@ class HomePage:
         opened = loopback if bind.is_unspecified else settings.bind  # 0.0.0.0 opens nowhere
         host = f"[{opened}]" if bind.version == 6 else opened
         address = f"http://{host}:{settings.port}/"
-        whole = f"{address}?token={token}"
+        full = f"{address}?token={token}"
         try:
-            file = keep_address(whole, state)
+            file = keep_address(full, state)
         except BridgeError:
             self._server.end()
             raise
         # Other users may read the journal, so it must not have the token.
         if writes_to_journal():
-            whole = f"{address}; its full address is in {file.absolute()}"
-        say(f"the page of the home: {whole}")
+            full = f"{address}; its full address is in {file.absolute()}"
+        say(f"the page of the home: {full}")
         if not bind.is_loopback:
             say(
                 f"the page listens on {settings.bind}: it crosses the network unencrypted, and "

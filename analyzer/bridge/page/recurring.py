@@ -190,11 +190,11 @@ class GroupNaming:
         timer.cancel()
 
 
-def _started(asked: list[str]) -> subprocess.Popen[str]:
+def _started(arguments: list[str]) -> subprocess.Popen[str]:
     """Start `hearthlog discover` with low priority."""
     try:
         process = subprocess.Popen(  # noqa: S603  a list of arguments, without a shell
-            [*module_command("hearthlog.tools.cli.main"), "discover", *asked],
+            [*module_command("hearthlog.tools.cli.main"), "discover", *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

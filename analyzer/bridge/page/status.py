@@ -91,12 +91,12 @@ def _active_since(microphone: LiveMicrophone) -> int:
     """Return the start of the microphone's current state, from the log; 0 if unknown."""
     if not microphone.is_listening():
         return microphone.active.time
-    heard = active_classes(microphone)
-    if heard:
-        last = [microphone.last_event(label) for label in heard]
+    active = active_classes(microphone)
+    if active:
+        last = [microphone.last_event(label) for label in active]
         end = microphone.active.time - _GOES_ON
         going = [event.start for event in last if event is not None and event.end >= end]
-        return max(going) if len(going) == len(heard) else 0
+        return max(going) if len(going) == len(active) else 0
     last = [microphone.last_event(label) for label in microphone.labels()]
     return max((event.end for event in last if event is not None), default=0)
 

@@ -478,13 +478,13 @@ def review_layout(
         for time in (timeline.grid.start, timeline.grid.end)
     )
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
-    asked: list[Row] = [
+    question: list[Row] = [
         (_QUESTION_HEIGHT, _text(ASKED_WORDS)),
         (_ASKED_HEIGHT, _requested_view()),
     ]
-    whole = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
+    homes = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []
-    everything = [*(asked if close_up else hours), whole]
+    everything = [*(question if close_up else hours), homes]
     share = max(own[close_up][0] for own in stacks.values()) / sum(part for part, _ in everything)
     return TimelineBlueprint(everything, panel, start, end, lanes_share=share)
 

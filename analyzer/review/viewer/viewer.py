@@ -111,7 +111,7 @@ class Viewer(ABC):
         self._opening: Any = None  # range of the time axes
         self._axes: dict[str, list[float]] = {}  # vertical ranges, by component of the blueprint
         self._selected: tuple[int, int] | None = None  # as drawn
-        self._asked = 0
+        self._requests = 0
         self._close = NONE  # spans of the close-ups
         self._sent = False
 
@@ -221,8 +221,8 @@ class Viewer(ABC):
         """Draw the requested span, in place of the previous one."""
         if not self.address:
             question = question._replace(keys_in="Press in the terminal")
-        draw_requested(self._asked, start, end, question, self._canvas)
-        self._asked += 1
+        draw_requested(self._requests, start, end, question, self._canvas)
+        self._requests += 1
         self._flush()
 
     def redraw_marks(
