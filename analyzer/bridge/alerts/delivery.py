@@ -39,7 +39,7 @@ class Waiting(BaseModel):
     text: str
     is_known: bool
     due: int
-    reached: set[str] = set()
+    told: set[str] = set()
 
     @property
     def notification(self) -> Notification:
@@ -71,7 +71,7 @@ class Outbox:
         self._waiting: dict[str, Waiting] = {}
         for name in state.names(_OUTBOX):
             self._load(name.removeprefix(_OUTBOX))
-        self._remove([n for n, each in self._waiting.items() if each.reached >= self._targets])
+        self._remove([n for n, each in self._waiting.items() if each.told >= self._targets])
         self._early = frozenset(self._waiting)  # these may be evaluated again after a restart
 
     def __len__(self) -> int:
@@ -93,16 +93,16 @@ class Outbox:
         """Copy the delivery state of replaced targets to the new targets (new name to former)."""
         with self._lock:
             for waiting in self._waiting.values():
-                delivered = {now for now, before in former.items() if before in waiting.reached}
-                if delivered - waiting.reached:
-                    waiting.reached |= delivered
+                delivered = {now for now, before in former.items() if before in waiting.told}
+                if delivered - waiting.told:
+                    waiting.told |= delivered
                     self._write(waiting)
 
     def _remove_done(self, now: int) -> None:
         self._remove([n for n, each in self._waiting.items() if self._is_done(each, now)])
 
     def _is_done(self, waiting: Waiting, now: int) -> bool:
-        missing = self._targets - waiting.reached
+        missing = self._targets - waiting.told
         is_old = now - waiting.time > _UNREAD_LONGEST
         return not missing or (is_old and missing == {UNREAD})
 
@@ -120,7 +120,7 @@ class Outbox:
         """Return the notifications due for a target, oldest first."""
         with self._lock:
             notifications = [
-                each.notification for each in self._waiting.values() if target not in each.reached
+                each.notification for each in self._waiting.values() if target not in each.told
             ]
         return sorted(
             (notification for notification in notifications if notification.due <= now),
@@ -133,8 +133,8 @@ class Outbox:
             waiting = self._waiting.get(notification.id)
             if waiting is None:
                 return
-            waiting.reached.add(target)
-            if waiting.reached >= self._targets:
+            waiting.told.add(target)
+            if waiting.told >= self._targets:
                 self._remove([notification.id])
             else:
                 self._write(waiting)
@@ -390,8 +390,8 @@ class Delivery:
         first, longest = self._pauses
         pause = first
         while not stop.wait(_LOOK_SECONDS):
-            reached, failed = self._tell(target, stop)
-            if reached:
+            told, failed = self._tell(target, stop)
+            if told:
                 pause = first
             if failed:
                 stop.wait(pause)
@@ -399,7 +399,7 @@ class Delivery:
 
     def _tell(self, target: Target, stop: Flag) -> tuple[int, bool]:
         """Deliver all due notifications to a target; return their number and whether one failed."""
-        reached = 0
+        told = 0
         for notification in self._outbox.waiting_for(target.name, time.time_ns()):
             if stop.is_set():
                 break
@@ -414,10 +414,10 @@ class Delivery:
                     f"{target.place}: an alert could not be delivered ({reason}); it is kept and "
                     "retried at least every quarter of an hour"
                 )
-                return reached, True
+                return told, True
             self._outbox.record_delivery(target.name, notification)
-            reached += 1
-        return reached, False
+            told += 1
+        return told, False
 
 
 def message(notification: Notification, zone: tzinfo, now: int | None = None) -> str:
