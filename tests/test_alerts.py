@@ -444,7 +444,7 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
             newest = right()
         wait_for(lambda: hears(lambda: own._watch.needed_from(0) > right() + AHEAD // 2))
         recorder.write_segment(right() + ahead[0])
-        wait_for(lambda: hears(lambda: own._heard._segment("mic").start > right() + AHEAD // 2))
+        wait_for(lambda: hears(lambda: own._activity._segment("mic").start > right() + AHEAD // 2))
         ahead[0], newest = 0, recorder.water
         own.update(news_of_water(right() + AHEAD))  # known then, and looked at now
         told.clear()

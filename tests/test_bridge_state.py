@@ -36,7 +36,7 @@ def heard(labels, cuts=()):
     now, times = ActiveClasses(CLASSES), FRAME * np.arange(1, len(labels) + 1)
     for first, last in zip([0, *cuts], [*cuts, len(labels)], strict=True):
         now.push(labels[first:last], times[first:last])
-    return [now.is_heard(name) for name in (*CLASSES, ANY_SOUND)]
+    return [now.is_active(name) for name in (*CLASSES, ANY_SOUND)]
 
 
 @given(st.lists(st.sampled_from(CLASSES), max_size=300), st.lists(st.integers(0, 300), max_size=9))
@@ -47,12 +47,12 @@ def test_what_is_heard_does_not_depend_on_how_the_labels_came(labels, cuts):
 def ends_of(spans, seconds):
     """When a microphone that heard coughs in some spans was told of which event's end, in s."""
     microphone, ends = LiveMicrophone("mic"), []
-    microphone.names, microphone.heard = CLASSES, ActiveClasses(CLASSES)
+    microphone.names, microphone.active = CLASSES, ActiveClasses(CLASSES)
     microphone.seen = math.inf
     for now in range(seconds):
         times = now * NANOSECONDS + FRAME * np.arange(20)
         sounds = any(start <= now < end for start, end in spans)
-        microphone.heard.push(20 * ["coughing" if sounds else "silence"], times)
+        microphone.active.push(20 * ["coughing" if sounds else "silence"], times)
         for start, end in (span for span in spans if span[1] + 3 == now):
             span = np.array([start]) * NANOSECONDS, np.array([end]) * NANOSECONDS
             fields = {
@@ -95,9 +95,9 @@ def test_a_sound_is_held_for_ten_seconds(frames, is_heard):
 def test_a_clock_that_is_set_back_ends_what_was_heard():
     now = ActiveClasses(CLASSES)
     now.push(40 * ["coughing"], 3600 * NANOSECONDS + FRAME * np.arange(40))
-    assert now.is_heard("coughing")
+    assert now.is_active("coughing")
     now.push(["silence"], np.array([FRAME]))
-    assert not now.is_heard("coughing")
+    assert not now.is_active("coughing")
 
 
 def test_events_are_counted_by_their_time_when_the_clock_is_set_back():
@@ -278,6 +278,6 @@ def test_what_a_recorder_speaks_of_no_more_is_forgotten_a_log_later():
     for subjects in (("mic", "porch"), ("mic",), ("mic",)):
         state.begin_log()
         for subject in subjects:
-            state._said.add(subject)
+            state._diagnosed.add(subject)
             state.health[subject] = Health(0, "")
     assert set(state.health) == {"mic"}

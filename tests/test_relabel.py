@@ -486,7 +486,10 @@ def test_logs_follow_each_other_by_name_or_else_by_time(recording, tmp_path):
     shutil.copy(first, tmp_path / "b.mcap")
     shutil.copy(second, tmp_path / "a.mcap")
     (chain,) = find_chains([tmp_path / "a.mcap"])
-    assert ([path.name for path in chain.logs], list(chain.requested)) == (["b.mcap", "a.mcap"], [1])
+    assert ([path.name for path in chain.logs], list(chain.requested)) == (
+        ["b.mcap", "a.mcap"],
+        [1],
+    )
 
 
 @of_one_kind

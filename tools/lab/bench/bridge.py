@@ -137,7 +137,7 @@ def _decisions(labels: Columns) -> NDArray[np.float64]:
     is_on = []
     for place, name in enumerate(names):
         heard.push([name], labels.log_times[place : place + 1])
-        is_on.append(heard.is_heard(ANY_SOUND))
+        is_on.append(heard.is_active(ANY_SOUND))
     began = np.flatnonzero(np.diff(np.array([False, *is_on]).astype(np.int8)) > 0)
     return (labels.log_times[began] + FRAME_NANOSECONDS) / NANOSECONDS
 
