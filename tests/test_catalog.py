@@ -229,6 +229,16 @@ def test_layers_have_rows_of_their_own_that_name_their_log(fleet):
     assert crying == expected | {"first": start, "last": start + 30 * SECOND}
 
 
+def test_a_log_with_more_events_than_a_recorder_writes_is_an_error_of_its_own(fleet, monkeypatch):
+    log = find_logs(fleet / "north")[0]
+    relabelled(log, [(1, "speech"), (15, "music"), (1, "speech"), (15, "music"), (1, "speech")])
+    monkeypatch.setattr("hearthlog.analyzer.logs.catalog_writer._MOST_EVENTS", 2)
+    damaged = {row.path: row.error for row in write_catalog(fleet).of_state(DAMAGED)}
+    name = log.relative_to(fleet).as_posix().replace(".mcap", ".relabel-better.1.mcap")
+    line = "has more than 2 events of a label; no recorder writes so many"
+    assert damaged[name] == line
+
+
 def test_a_merged_log_says_what_its_logs_agree_on(fleet, model_file, day, tmp_path, capfd):
     log = find_logs(fleet / "north")[0]
     layer = relabelled(log, [(12, "speech"), (6, "music")])

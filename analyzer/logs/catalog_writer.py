@@ -54,7 +54,7 @@ _OTHERS: dict[str, Sequence[str]] = dict.fromkeys(
 )
 _LONGEST = 1000  # maximum characters of a text from a log
 _LAST = (1 << 63) - 1  # the largest number of a frame in a catalogue
-_MOST_EVENTS = 100_000  # of a class in a log; ten seconds apart, a day has 8,640
+_MOST_EVENTS = 1_000_000  # of a class in a log; a day has 8,640 at most, ten seconds apart
 
 
 @dataclass
@@ -208,8 +208,8 @@ class _Reading:
             raise LogError(f"{self._file.path}: has more than {MOST_CLASSES} scenarios")
         if any(len(one.starts) > _MOST_EVENTS for one in events.values()):
             raise LogError(
-                f"{self._file.path}: has more than {_MOST_EVENTS} events of a class; no log of "
-                "a day has so many"
+                f"{self._file.path}: has more than {_MOST_EVENTS} events of a label; no recorder "
+                "writes so many"
             )
         if len(counts) > MOST_CLASSES:
             raise LogError(
