@@ -603,12 +603,12 @@ def test_alerts_hear_what_a_scenario_labels_from_the_log_and_as_it_is_written(lo
     live = LiveActivity(start, 0)
     live.push([part for topic, part in columns.items() if is_of_alerts(topic)])
     labels = read_columns([log], OF_WATER)[OF_WATER[1]]["label"].tolist()
-    for heard in (replayed, live.heard()):
-        water = heard.of("flushing_water")
+    for activity in (replayed, live.activity()):
+        water = activity.of("flushing_water")
         assert len(water.starts) == labels.count("flushing_water") > 0
         assert set(water.microphones) == {"mic"}
         none = {("other", True), ("silence", True), ("flushing_water", False)}
-        assert none.isdisjoint(heard.sounds)
+        assert none.isdisjoint(activity.sounds)
     assert "flushing_water" in replayed.classes["mic-water"]
 
 
