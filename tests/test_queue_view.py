@@ -20,7 +20,7 @@ from hearthlog.models.classes import ordered
 
 SECOND = 1_000_000_000
 MARGIN = 20 * SECOND
-_LEFT = 190  # pixels at the left of the plot of what is asked
+_LEFT = 202  # pixels at the left of the plot of what is asked, as of the lanes
 _LANES, _SPECTRUM = 202, slice(175, 245)  # where the spectrogram is, at 1920 x 1080
 _NEAR = 14  # of 255: how far a colour may be off
 

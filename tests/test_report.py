@@ -693,7 +693,8 @@ def test_a_damaged_log_is_not_heard_and_the_command_says_so(hearthlog, tmp_path)
     assert logs[10].name in done.stderr
     text = text_of((tmp_path / "day.html").read_text())
     assert "Recorded: 23 h 00 min" in text
-    assert "Nothing was recorded for 1 h 00 min: the recorder was off" in text
+    assert "Not recorded: 1 h 00 min (4 %)." in text
+    assert "The recorder was off then, or its logs are not here." in text
     assert "1 log could not be read, or only in part." in text
 
 

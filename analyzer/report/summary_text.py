@@ -110,9 +110,10 @@ def not_recorded(account: Account) -> Iterator[str]:
         if hours * HOUR > missing + _MINUTE:  # another microphone covers this time
             text = Duration(hours * 60).text
             yield f"The microphone {plain(microphone)} did not record for {text}."
-    if (unsaid := _unexplained(account)) >= _MINUTE:
-        text = Duration(unsaid / _MINUTE).text
-        yield f"Nothing was recorded for {text}: the recorder was off, or its logs are not here."
+    if (unexplained := _unexplained(account)) >= _MINUTE:
+        text = Duration(unexplained / _MINUTE).text
+        which = "then" if missing - unexplained < _MINUTE else f"for {text} of this time"
+        yield f"The recorder was off {which}, or its logs are not here."
     for reason, same in _by_lasting(account.gaps, lambda gap: gap.text):
         yield f"{reason[:1].upper()}{reason[1:]}: {_when(account, same)}."
     if account.unread:

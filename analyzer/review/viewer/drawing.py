@@ -340,6 +340,7 @@ _HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 74
 _SPECTRUM_SHAPE = (64, 2240)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 HOUR_COLUMNS = (2, 11)  # the same, of the hours, whose view has no vertical axis
+ASKED_COLUMNS = (2, 12)  # of what is asked, whose axis has numbers of one digit
 COLUMNS = (2, 10)  # widths of the text and of the plot, until the width of the window is known
 Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
@@ -558,7 +559,7 @@ def _spectrum_view(microphone: str) -> rrb.Container:
 
 def _requested_view() -> rrb.Container:
     lane = _time_series("Which span is asked", [ASKED], (0.0, 1.0))
-    return rrb.Horizontal(_text(ASKED_NAME), lane, column_shares=COLUMNS)
+    return rrb.Horizontal(_text(ASKED_NAME), lane, column_shares=ASKED_COLUMNS)
 
 
 def _close_up(plot: Plot, clock: str) -> rrb.Container:

@@ -34,6 +34,7 @@ from hearthlog.analyzer.review.timeline import (
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
     APPLICATION,
+    ASKED_COLUMNS,
     BELOW,
     COLUMNS,
     HOUR_COLUMNS,
@@ -82,6 +83,7 @@ class ViewerSize(NamedTuple):
 # Points of the viewer's own parts.
 _RULER_LEFT, _RULER_RIGHT = 200.0, 30.0  # from the edges of the viewer to the ends of its ruler
 _SCALE_WIDTH, _AXIS_HEIGHT = 28.0, 17.0  # between a view and its plot
+_DIGIT_WIDTH = 17.0  # the same, with numbers of one digit
 TOP_BAR, _TAB_BAR = 36.0, 30.0
 _PANEL_HEIGHTS = 150.0, 250.0  # a quarter of the viewer, within these
 
@@ -346,6 +348,7 @@ class Viewer(ABC):
             shares = {path: _container(blueprint, path) for path in blueprint}
             for columns, left in (
                 (COLUMNS, _RULER_LEFT - _SCALE_WIDTH),
+                (ASKED_COLUMNS, _RULER_LEFT - _DIGIT_WIDTH),
                 (HOUR_COLUMNS, _RULER_LEFT),
             ):
                 own = [*map(float, columns)]
