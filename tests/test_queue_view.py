@@ -69,8 +69,8 @@ def is_asked(picture, start, end):
     left = _LEFT
     scale = (picture.shape[1] - left) / (end - start + 2 * MARGIN)
     first, last = (left + round(edge * scale) for edge in (MARGIN, MARGIN + end - start))
-    inside = picture[:, first + 5 : last - 5].min(axis=2) > 150
-    beside = picture[:, [first - 10, last + 10]].min(axis=2) < 100
+    inside = picture[:, first + 3 : last - 3].min(axis=2) > 150
+    beside = picture[:, [first - 4, last + 4]].min(axis=2) < 100
     return (inside.all(axis=1) & beside.all(axis=1)).sum() >= 10
 
 
