@@ -339,9 +339,8 @@ LANE_HEIGHT = 0.1
 _HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 74
 _SPECTRUM_SHAPE = (64, 2240)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
-HOUR_COLUMNS = (2, 11)  # the same, of the hours, whose view has no vertical axis
-ASKED_COLUMNS = (2, 12)  # of what is asked, whose axis has numbers of one digit
-COLUMNS = (2, 10)  # widths of the text and of the plot, until the width of the window is known
+# Widths of a text and a plot, until that of the window is known; the hours have no axis.
+COLUMNS, ASKED_COLUMNS, HOUR_COLUMNS = (2, 10), (2, 12), (2, 11)
 Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
 

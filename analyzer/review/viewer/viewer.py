@@ -82,8 +82,7 @@ class ViewerSize(NamedTuple):
 
 # Points of the viewer's own parts.
 _RULER_LEFT, _RULER_RIGHT = 200.0, 30.0  # from the edges of the viewer to the ends of its ruler
-_SCALE_WIDTH, _AXIS_HEIGHT = 28.0, 17.0  # between a view and its plot
-_DIGIT_WIDTH = 17.0  # the same, with numbers of one digit
+_SCALE_WIDTH, _DIGIT_WIDTH, _AXIS_HEIGHT = 28.0, 17.0, 17.0  # between a view and its plot
 TOP_BAR, _TAB_BAR = 36.0, 30.0
 _PANEL_HEIGHTS = 150.0, 250.0  # a quarter of the viewer, within these
 
