@@ -122,8 +122,7 @@ def wait_until_arrived(output, log, renamed=""):
     wanted = Counter(renamed + topic for topic, *_ in log)
 
     def missing():
-        rows = [row for row in arrived(output) if b"\0hearthlog_live\0" not in row[-1]]
-        return wanted - Counter(topic for topic, *_ in rows)
+        return wanted - Counter(topic for topic, *_ in of_the_log(output))
 
     wait_for(lambda: not missing(), what=lambda: f"not arrived: {missing()}")
 
@@ -133,6 +132,11 @@ def arrived(output):
     written = output.read_text().rpartition("\n")[0]
     rows = [json.loads(line) for line in written.splitlines()]
     return [(topic, mono, wall, bytes.fromhex(data)) for topic, mono, wall, data in rows]
+
+
+def of_the_log(output):
+    """Give what arrived, without the lines of the node itself."""
+    return [row for row in arrived(output) if b"\0hearthlog_live\0" not in row[-1]]
 
 
 def logged(folder):

@@ -18,6 +18,7 @@ from rosgraph import (
     listener,
     logged,
     next_domain,
+    of_the_log,
     wait_for,
     wait_until_arrived,
     wait_until_handled,
@@ -64,11 +65,6 @@ def lose_microphone(labmic, logs):
     labmic.unplug()
     time.sleep(5)
     labmic.restore()
-
-
-def of_the_log(output):
-    """Give what arrived, without the lines of the node itself."""
-    return [row for row in arrived(output) if b"\0hearthlog_live\0" not in row[-1]]
 
 
 def test_every_message_of_a_log_reaches_the_graph_once_and_in_order(ros, labmic, tmp_path):

@@ -230,11 +230,11 @@ class ClassCheck(NamedTuple):
         return _interval(effective * (self.missed + more) / (self.true + more), effective)
 
 
-def _interval(some: float, merged: float) -> tuple[float, float] | None:
+def _interval(some: float, total: float) -> tuple[float, float] | None:
     """Return the central 90 % of a beta distribution with Jeffreys prior."""
-    if not merged:
+    if not total:
         return None
-    low, high = (beta_quantile(some + 0.5, merged - some + 0.5, share) for share in (0.05, 0.95))
+    low, high = (beta_quantile(some + 0.5, total - some + 0.5, share) for share in (0.05, 0.95))
     return low, high
 
 

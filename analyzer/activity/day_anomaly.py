@@ -160,8 +160,8 @@ def regular_hours(days: Sequence[DayProfile], classes: Sequence[str]) -> list[Da
     """
     found = []
     for row, name in enumerate(classes):
-        rows_by_day = np.array([day.half_hours[row] for day in days])
-        found += [DayFigure(name, LENGTH, hours=hours) for hours in _hours(rows_by_day)]
+        half_hours = np.array([day.half_hours[row] for day in days])
+        found += [DayFigure(name, LENGTH, hours=hours) for hours in _hours(half_hours)]
     return found
 
 
