@@ -502,7 +502,9 @@ class _Batch(NamedTuple):
         without = np.bincount(parts[:, 0], minlength=len(self.chunks)) == 0
         parts = parts[~np.isin(parts[:, 1], others)]
         identities, firsts, counts = np.unique(parts[:, 1], return_index=True, return_counts=True)
-        by_channel = np.split(parts[np.argsort(parts[:, 1], kind="stable")], np.cumsum(counts)[:-1])
+        # By channel, then by chunk, so that the entries of a channel are in the order of the file.
+        ordered = parts[np.lexsort((parts[:, 0], parts[:, 1]))]
+        by_channel = np.split(ordered, np.cumsum(counts)[:-1])
         entries_of = {
             int(identities[i]): [self._entries(by_channel[i])] for i in np.argsort(firsts).tolist()
         }
@@ -580,6 +582,9 @@ class _Batch(NamedTuple):
         channel = self.file.channels.get(identity)
         if channel is None:
             raise self._damaged(number[0], "a message of a channel that is not defined")
+        if (entries["time"][1:] < entries["time"][:-1]).any():
+            order = np.argsort(entries["time"], kind="stable")  # the heads must have these times
+            number, entries = number[order], entries[order]
         rest = self.sizes[number] - entries["offset"]
         inside = (entries["offset"] >= 0) & (rest >= MESSAGE_HEAD.itemsize)
         if not inside.all():
@@ -605,10 +610,6 @@ class _Batch(NamedTuple):
         if (heads["length"] + HEAD.size).sum() > len(self.buffer):
             raise self._damaged(number[0], _WRONG_INDEX)  # two entries point at one message
         offsets = starts + MESSAGE_HEAD.itemsize
-        times = heads["log_time"]
-        if (times[1:] < times[:-1]).any():
-            order = np.argsort(times, kind="stable")
-            offsets, heads = offsets[order], heads[order]
         schema = self.file.schemas.get(channel.schema_id)
         return RawMessages(channel, schema, self.buffer, offsets, heads, self.file.path)
 

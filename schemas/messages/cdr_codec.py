@@ -271,12 +271,14 @@ def _by_layout(
     """Group payloads of one size by layout, without invalid ones."""
     rest = np.arange(len(payloads))
     for layout in kind.layouts(payloads.dtype.itemsize)[:_TRIED]:
-        fitting = layout.fits(payloads[rest].view(layout.dtype))
+        left = payloads if len(rest) == len(payloads) else payloads[rest]
+        fitting = layout.fits(left.view(layout.dtype))
+        if fitting.all():
+            yield layout, rest
+            return
         if fitting.any():
             yield layout, rest[fitting]
             rest = rest[~fitting]
-        if not len(rest):
-            return
     for _ in range(_TRIED):
         words: dict[int, bytes] = {}
         found = _layout_of(kind, payloads, int(rest[0]), errors, words)
