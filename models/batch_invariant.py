@@ -31,16 +31,16 @@ def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
     columns = weights.shape[1]
     product = np.empty((count, columns))
     stacks, rest = divmod(count, _ROWS)
-    whole = stacks * _ROWS
+    stacked = stacks * _ROWS
     np.matmul(
-        rows[:whole].reshape(stacks, _ROWS, width),
+        rows[:stacked].reshape(stacks, _ROWS, width),
         weights,
-        out=product[:whole].reshape(stacks, _ROWS, columns),
+        out=product[:stacked].reshape(stacks, _ROWS, columns),
     )
     if rest:
         last = np.zeros((_ROWS, width))
-        last[:rest] = rows[whole:]
-        product[whole:] = (last @ weights)[:rest]
+        last[:rest] = rows[stacked:]
+        product[stacked:] = (last @ weights)[:rest]
     return product
 
 

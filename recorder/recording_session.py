@@ -330,7 +330,7 @@ class RecordingSession:
             self._look_for_models(stream, event)
         if stream.device_changes():
             self._log.begin_anew(self._describe(), stream.pipeline.flush())
-            self._tell(f"{stream.pipeline.microphone}: the microphone is {stream.device} now")
+            self._notify(f"{stream.pipeline.microphone}: the microphone is {stream.device} now")
         notices = self._clips.before(stream.pipeline.microphone, event)
         self._write(stream.pipeline.push(event), event)
         labels = stream.pipeline.last_labels
@@ -416,7 +416,7 @@ class RecordingSession:
             where = "" if labelling == LIVE else f" ({labelling.replace('/', ' ')})"
             after = f", after {before.name}" if labelling == LIVE and before is not None else ""
             if model is not None:
-                self._tell(f"the labels are by {model.name} now{after}{where}")
+                self._notify(f"the labels are by {model.name} now{after}{where}")
         closing: list[EncodedMessage] = []
         opening: list[EncodedMessage] = []
         for each in self._streams.values():
@@ -430,7 +430,7 @@ class RecordingSession:
         self._log.begin_anew(self._describe(), sorted(closing, key=by_time))
         self._log.write(sorted(opening, key=by_time))
 
-    def _tell(self, text: str) -> None:
+    def _notify(self, text: str) -> None:
         if self._state is not None:
             self._state.news.append(text)
 

@@ -152,7 +152,7 @@ def test_the_truth_covers_the_time_and_lies_where_the_energy_is(evening):
             assert np.percentile(span, 90) < 5
         else:
             assert span.max() > 1.5
-    heard = sum(event.heard_frames for event in truth.events) * FRAME_SECONDS
+    heard = sum(event.audible_frames for event in truth.events) * FRAME_SECONDS
     silent = sum(end - start for start, end, label in truth.spans if label == "silence")
     assert heard + silent == pytest.approx(frames * FRAME_SECONDS)
 
@@ -169,7 +169,7 @@ def test_of_two_sounds_the_louder_one_is_true(library, rooms, level, heard):
     assert ("coughing" in here) is heard
     assert {name for *_, name in truth.spans} >= {"speech", "silence"}
     assert [event.plan.origin for event in truth.events] == ["television", "resident"]
-    assert bool(truth.events[1].heard_frames) is heard
+    assert bool(truth.events[1].audible_frames) is heard
 
 
 def test_what_is_not_heard_through_a_wall_is_silence(library):
@@ -179,13 +179,13 @@ def test_what_is_not_heard_through_a_wall_is_silence(library):
         rooms = Rooms(room, seed=0)
         rooms.floor *= 1e-2 ** (room == "bathroom")
         truth = truth_of(Composition(HomePlan(200, [sound], ()), library, rooms))
-        assert bool(truth.events[0].heard_frames) is heard
+        assert bool(truth.events[0].audible_frames) is heard
         assert (len(truth.spans) > 1) is heard
 
 
 def test_walls_take_level_and_the_high_frequencies_first(library):
     sound = library.sound(library.of("coughing")[0], 20)
-    near, far = (Rooms(room, seed=0).heard(sound, "bedroom") for room in ("bedroom", "bathroom"))
+    near, far = (Rooms(room, seed=0).received(sound, "bedroom") for room in ("bedroom", "bathroom"))
     assert 11 < 10 * np.log10(frame_powers(near).mean() / frame_powers(far).mean()) < 25
     bright = [np.abs(np.fft.rfft(one))[len(one) // 4 :].std() for one in (near, far)]
     dark = [np.abs(np.fft.rfft(one))[: len(one) // 16].std() for one in (near, far)]

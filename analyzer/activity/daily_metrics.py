@@ -166,10 +166,10 @@ def checked_rates_of(minutes: HomeMinutes, checks: CheckedMinutes) -> dict[str, 
         for name, counts in minutes.labelled.items()
         if class_name(name) != UNKNOWN  # no sound is truly `unknown`
     }
-    whole = sum(amounts.values())
+    total = sum(amounts.values())
     fewest = 1 / max(len(amounts), 1)  # rarely labelled classes may be missed more often
     drawn = {
-        name: checks.rates(name, max(amount / whole, fewest)) for name, amount in amounts.items()
+        name: checks.rates(name, max(amount / total, fewest)) for name, amount in amounts.items()
     }
     return {name: rates for name, rates in drawn.items() if rates is not None}
 
@@ -310,8 +310,8 @@ class DayMetrics:
     def comparable(self, name: str = "") -> bool:
         """Return whether three quarters of the day, and of its night, are covered."""
         spans = [self.home.listened[name]] if name else [*self.home.listened.values()]
-        wholes = self.span, self.night
-        shares = [common(each, whole).length / whole.length for each in spans for whole in wholes]
+        periods = self.span, self.night
+        shares = [common(own, period).length / period.length for own in spans for period in periods]
         return min(shares) >= MOST
 
     def share_of(self, name: str) -> float:

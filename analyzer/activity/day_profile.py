@@ -176,13 +176,13 @@ class Profiles:
         loud = labels.labels != SILENCE
         self._sound = joined(labels.starts[loud], labels.ends[loud])
         self._starts = joined(*self._sound, EVENT_PAUSE).starts
-        beside = television_spans(labels) if set(names) & set(APART_IN_LENGTH) else NONE
+        television = television_spans(labels) if set(names) & set(APART_IN_LENGTH) else NONE
         self._spans, self._events = dict[str, Spans](), dict[str, Spans]()
         for name in names:
             own = labels.labels == name
             spans, events = joined(labels.starts[own], labels.ends[own]), events_of(labels, name)
             if name in APART_IN_LENGTH:
-                spans, events = without(spans, beside), _outside(events, beside)
+                spans, events = without(spans, television), _outside(events, television)
             self._spans[name], self._events[name] = spans, events
 
     def of(self, day: date) -> DayProfile:

@@ -72,8 +72,8 @@ def perhaps(sounds: Collection[DoubtfulSound], hidden: Collection[str] = ()) -> 
 
     A model that lacks one of them gives its probability to the others, so these must be likely.
     """
-    knows_all = all(name in sound.shares for sound in sounds for name in WORRYING)
-    least = _NAMED if knows_all else _LIKELY
+    has_all = all(name in sound.shares for sound in sounds for name in WORRYING)
+    least = _NAMED if has_all else _LIKELY
     shares = {
         name: max(sound.shares.get(name, 0.0) for sound in sounds)
         for name in WORRYING

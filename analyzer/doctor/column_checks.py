@@ -63,8 +63,8 @@ def split_topic(topic: str) -> tuple[str, str]:
         return "", topic
     kind = name.kind
     if name.labelling != LIVE:
-        is_beside = name.labelling.partition("/")[0] in {CANDIDATE, SCENARIO}
-        kind = f"{_BESIDE if is_beside else name.labelling}/{kind}"
+        is_other = name.labelling.partition("/")[0] in {CANDIDATE, SCENARIO}
+        kind = f"{_BESIDE if is_other else name.labelling}/{kind}"
     return (name.microphone, kind) if kind in TYPES else ("", topic)
 
 

@@ -456,9 +456,9 @@ def _examine_all(logs: Sequence[Path], progress: Progress) -> list[ExaminedFile]
     done = 0
     for log, size in zip(logs, sizes, strict=True):
 
-        def tell(share: float, done: int = done, size: int = size) -> None:
+        def notify(share: float, done: int = done, size: int = size) -> None:
             progress((done + share * size) / total)
 
-        files.append(examine_file(log, tell))
+        files.append(examine_file(log, notify))
         done += size
     return files

@@ -63,7 +63,7 @@ class FrameSequence:
         self._pending: dict[str, list[Int64]] = {}
         self._previous: tuple[int, int] | None = None
         self._run: tuple[int, int] | None = None  # first frame since the last gap
-        self._heard = _NONE  # features of the last frames, which have no label yet
+        self._unlabelled = _NONE  # features of the last frames, which have no label yet
         self._first_end = 0  # last frame of the first window since that gap
         self._segment: tuple[int, int] | None = None  # log time and end of the last segment
         self._gap_ends: Int64 = np.empty(0, np.int64)
@@ -107,7 +107,7 @@ class FrameSequence:
     def _forget(self) -> None:
         """Start anew: nothing before the next message is compared with it."""
         self._previous = self._run = self._segment = None
-        self._heard = _NONE
+        self._unlabelled = _NONE
 
     def finish(self) -> None:
         """Check the last frame; messages that a killed recorder did not write are not reported."""
@@ -297,11 +297,11 @@ class FrameSequence:
 
     def _check_label_stamps(self, features: Int64, labels: Int64, delay: int) -> None:
         """Compare the stamps of labels with the features of the same frames."""
-        heard = np.concatenate([self._heard, features])
-        self._heard = heard[max(len(heard) - delay, 0) :]
+        unlabelled = np.concatenate([self._unlabelled, features])
+        self._unlabelled = unlabelled[max(len(unlabelled) - delay, 0) :]
         self._report(
             "frame-stamp",
-            _has_other_stamp(labels, heard),
+            _has_other_stamp(labels, unlabelled),
             labels[:, 0],
             lambda i: f"the label of frame {labels[i, 1]} has another stamp than its features",
         )

@@ -399,11 +399,11 @@ class SummarySection:
             values = vars(index)
             if isinstance(stated, ChunkIndex) and not stated.message_index_offsets:
                 values.pop("message_index_offsets")  # a chunk index may omit them
-            says = f"{name_of(record.opcode)} says"
-            self._compare("index-differs", says, stated, values, record.offset)
+            text = f"{name_of(record.opcode)} says"
+            self._compare("index-differs", text, stated, values, record.offset)
 
     def _compare(
-        self, rule: str, says: str, stated: McapRecord, expected: dict[str, Any], offset: int
+        self, rule: str, text: str, stated: McapRecord, expected: dict[str, Any], offset: int
     ) -> None:
         """Compare a record with the values that a writer would write."""
         differing = [
@@ -412,7 +412,7 @@ class SummarySection:
             if getattr(stated, field) != value
         ]
         if differing:
-            self._error(rule, f"{says} {'; '.join(differing)}", offset)
+            self._error(rule, f"{text} {'; '.join(differing)}", offset)
 
     def _add_statistics(self, statistics: Statistics, offset: int) -> None:
         self._statistics.append((offset, statistics))

@@ -68,8 +68,8 @@ def with_layers(path: Path) -> list[Path]:
     """
     if not path.is_file():
         return [path]
-    beside = (each for each in path.parent.iterdir() if each.name.startswith(f"{stem(path)}."))
-    layers = (each for each in beside if each.name.endswith(SUFFIX) and is_log(each))
+    siblings = (each for each in path.parent.iterdir() if each.name.startswith(f"{stem(path)}."))
+    layers = (each for each in siblings if each.name.endswith(SUFFIX) and is_log(each))
     return [path, *sorted(layers)]
 
 

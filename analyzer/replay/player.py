@@ -204,10 +204,12 @@ class Player:
         classifier = None if model is None else Classifier(model)
         clips = self._options.kind != "features"  # clips do not state how often
         every = LOGGED_EVERY if clips else configuration.statistics_every
-        self._beside = self._scenarios(info, features, model)
-        beside = {scenario_labelling(name): Classifier(one) for name, one in self._beside.items()}
+        self._by_scenario = self._scenarios(info, features, model)
+        by_scenario = {
+            scenario_labelling(name): Classifier(one) for name, one in self._by_scenario.items()
+        }
         self._pipeline = Pipeline(
-            info.microphone, features, classifier, every, beside, embedding=info.embedding
+            info.microphone, features, classifier, every, by_scenario, embedding=info.embedding
         )
         if self._options.output is not None:
             self._log = RollingLog(
@@ -236,7 +238,7 @@ class Player:
         A class of two models is refused, as by the recorder; names are left to the other model.
         """
         known = {} if live is None else {LIVE: live}
-        beside = {}
+        by_scenario = {}
         for name, model in self._options.scenarios.items():
             if is_by_names(model):
                 continue
@@ -249,13 +251,13 @@ class Player:
             if reason := class_conflict(model, known):
                 where = f"model {model.name} of scenario {name}"
                 raise LogError(f"{info.path}: cannot be replayed so: {where} {reason}")
-            known[scenario_labelling(name)] = beside[name] = model
+            known[scenario_labelling(name)] = by_scenario[name] = model
         for name, model in self._options.scenarios.items():
             if is_by_names(model):
                 own = without_classes(model, shared_classes(model, known.values()), features)
                 if len(own.classes) > 1:
-                    beside[name] = own
-        return {name: beside[name] for name in self._options.scenarios if name in beside}
+                    by_scenario[name] = own
+        return {name: by_scenario[name] for name in self._options.scenarios if name in by_scenario}
 
     def _goes_on(self, info: RecorderInfo) -> bool:
         """Return whether a log is of the same recorder run, but of another model."""
@@ -275,11 +277,11 @@ class Player:
         if sha256 == self._sha256:
             return
         assert info.first_frame is not None
-        before = self._beside
-        self._beside = self._scenarios(info, self._features(info, model), model)
+        before = self._by_scenario
+        self._by_scenario = self._scenarios(info, self._features(info, model), model)
         changes = [(LIVE, model)]
         for name in self._options.scenarios:  # they may now have to exclude other classes
-            own = self._beside.get(name)
+            own = self._by_scenario.get(name)
             if _digest(own) != _digest(before.get(name)):
                 changes.append((scenario_labelling(name), own))
         closing: list[EncodedMessage] = []
@@ -299,7 +301,7 @@ class Player:
         assert self._options.output is not None
         if model is not None and model.sha256 == info.model_sha256:
             model = replace(model, name=info.model)  # whatever the name of its file here
-        features, scenarios = self._pipeline.feature_set, self._beside
+        features, scenarios = self._pipeline.feature_set, self._by_scenario
         stream = stream_info(info.microphone, info.device, features, model)
         attachments = [item for item in info.attachments if not item.name.startswith(_MODELS)]
         if model is not None:
@@ -370,7 +372,7 @@ class Player:
             self._write(messages)
             if end > self._start:
                 self._progress(end)
-        if self._sha256 is None and not self._beside:
+        if self._sha256 is None and not self._by_scenario:
             self.converged |= len(event.stamps) >= self._pipeline.feature_set.window_frames
         return True
 

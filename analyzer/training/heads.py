@@ -385,8 +385,8 @@ def _candidates(
     by_rejecting = [] if rejecting is None else [rejecting]
     known = [n for n, name in enumerate(data.classes) if name not in {SILENCE, UNKNOWN}]
     if names is not None and (_sources(data)[known] < FEWEST_SOURCES).any():
-        beside = names.model_copy(update={"weight": _NAMES_BESIDE})
-        yield taken.inputs, [*by_rejecting, beside], 0.0
+        names_too = names.model_copy(update={"weight": _NAMES_BESIDE})
+        yield taken.inputs, [*by_rejecting, names_too], 0.0
     else:
         yield taken.inputs, [], 0.0
         if by_rejecting:

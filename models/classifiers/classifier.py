@@ -214,12 +214,12 @@ class Classifier:
         novelty : np.ndarray [shape=(n,)], float32
             As from `classify`.
         """
-        heard = np.isfinite(by_heads.sum(axis=1))
-        changed = heard if evidence is None else heard | evidence.any(axis=1)
+        embedded = np.isfinite(by_heads.sum(axis=1))
+        changed = embedded if evidence is None else embedded | evidence.any(axis=1)
         decision = np.log(np.maximum(probabilities[changed], _TINY, dtype=np.float64))
-        if self._mix is not None and heard.any():
-            own = heard[changed]
-            decision[own] = mixed(decision[own], by_heads[heard], self._mix, self.classes)
+        if self._mix is not None and embedded.any():
+            own = embedded[changed]
+            decision[own] = mixed(decision[own], by_heads[embedded], self._mix, self.classes)
         if evidence is not None:
             decision += evidence[changed]
         probabilities = probabilities.copy()

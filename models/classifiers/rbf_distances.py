@@ -53,13 +53,13 @@ class RoundedDistances:
 
     def rows(self, scaled: Float64) -> Prepared:
         """Prepare scaled inputs, of shape (n, width)."""
-        whole = in_steps(scaled, self._steps)
-        return _exact(_as_rows(whole), whole)
+        rounded = in_steps(scaled, self._steps)
+        return _exact(_as_rows(rounded), rounded)
 
     def vectors(self, scaled: Float64) -> Prepared:
         """Prepare scaled vectors, of shape (m, width)."""
-        whole = in_steps(scaled, self._steps)
-        values, longest = _exact(_as_columns(whole, 1.0), whole)
+        rounded = in_steps(scaled, self._steps)
+        values, longest = _exact(_as_columns(rounded, 1.0), rounded)
         return Prepared(aligned(values), longest)
 
     def between(self, rows: Prepared, vectors: Prepared) -> Float64:
@@ -120,7 +120,7 @@ def _as_columns(vectors: Float64, gamma: float) -> Float64:
     return np.concatenate(parts, axis=1).T
 
 
-def _exact(values: Float64, whole: Float64) -> Prepared:
+def _exact(values: Float64, rounded: Float64) -> Prepared:
     """Convert values to float32 if that is exact."""
-    longest = float(np.vecdot(whole, whole).max(initial=0.0)) ** 0.5
+    longest = float(np.vecdot(rounded, rounded).max(initial=0.0)) ** 0.5
     return Prepared(values if longest > _EXACT else values.astype(np.float32), longest)

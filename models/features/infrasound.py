@@ -178,7 +178,9 @@ def _probes() -> Float64:
         waves += [np.sqrt(2) * np.cos(frequency * turns), np.sqrt(2) * np.sin(frequency * turns)]
     weights = np.stack(waves, axis=1) * (taper / taper.sum())[:, np.newaxis]
     curves = _curves()
-    whole = np.concatenate([curves.T @ weights[:FRAME_SAMPLES], curves.T @ weights[FRAME_SAMPLES:]])
-    waves_only = whole.copy()
+    all_waves = np.concatenate(
+        [curves.T @ weights[:FRAME_SAMPLES], curves.T @ weights[FRAME_SAMPLES:]]
+    )
+    waves_only = all_waves.copy()
     waves_only[::_TERMS] = 0.0
-    return np.concatenate([whole, waves_only], axis=1)
+    return np.concatenate([all_waves, waves_only], axis=1)

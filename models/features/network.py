@@ -345,8 +345,8 @@ class NetworkExtractor:
         sound = np.concatenate([self._recent, samples.ravel()])
         ends = range(self._window + self._hop, len(sound) + 1, self._hop)
         embeddings += [self._network.embed(sound[end - self._window : end]) for end in ends]
-        heard = before + FRAME_SAMPLES * np.arange(1, len(frames) + 1)
-        values[:, 1:] = np.stack(embeddings)[heard // self._hop]
+        frame_ends = before + FRAME_SAMPLES * np.arange(1, len(frames) + 1)
+        values[:, 1:] = np.stack(embeddings)[frame_ends // self._hop]
         self._last = embeddings[-1]
         self._recent = sound[len(ends) * self._hop :].copy()
         return values

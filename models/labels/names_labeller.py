@@ -172,10 +172,10 @@ class NamesLabeller:
             row = rows.get(window)
             if row is None and self._converged is not None and not self._open.any():
                 continue
-            heard = self._add(window, self._nothing if row is None else row.astype(np.int64))
+            active = self._add(window, self._nothing if row is None else row.astype(np.int64))
             place = window - first
             recent = np.arange(place - self._later, place + 1)
-            named[recent] |= heard & (recent[:, np.newaxis] >= self._first - first)
+            named[recent] |= active & (recent[:, np.newaxis] >= self._first - first)
         self._named = named[len(named) - len(self._named) :]
         return first, named
 
@@ -194,8 +194,8 @@ class NamesLabeller:
         self._known |= counts | (self._below > _PAUSE)
         if self._converged is None and self._known.all():
             self._converged = window
-        heard: Bool = goes_on_here & counts
-        return heard
+        active: Bool = goes_on_here & counts
+        return active
 
     def _probabilities(self, frames: Int64, window: int, named: Bool) -> Float32:
         """Return the probabilities of frames, each from the window centred on the frame."""

@@ -152,8 +152,8 @@ def read_columns(  # noqa: PLR0913
         If a log cannot be read or is damaged, or two logs have different types on one topic.
     """
     logs = list(logs)
-    whole = start is None and end is None
-    expected = sum(map_logs(topic_counts, logs), Counter()) if whole else Counter()
+    unlimited = start is None and end is None
+    expected = sum(map_logs(topic_counts, logs), Counter()) if unlimited else Counter()
     builders: dict[str, _ColumnBuilder] = {}
     for batch in iterate_columns(logs, topics, start, end, fields, on_damage=on_damage):
         for columns in batch:

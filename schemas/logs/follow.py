@@ -263,13 +263,13 @@ class _News:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._changes = FolderChanges()
-        self._was_told = True
+        self._was_notified = True
         self._missed = 0
         self._due = 0.0  # by CLOCK_MONOTONIC
 
     def expect(self, growing: "Iterable[_Growing]", *, has_news: bool) -> None:
         """Update the active logs, and whether there was new data."""
-        if has_news and not self._was_told and not self._changes.wait(0, Event()):
+        if has_news and not self._was_notified and not self._changes.wait(0, Event()):
             self._missed += 1
         places = {self._folder}
         for log in growing:
@@ -279,9 +279,11 @@ class _News:
 
     def may_be_there(self, stop: Event) -> bool:
         """Wait for at most a fifth of a second; return whether to poll."""
-        self._was_told = self._changes.wait(_POLL_SECONDS, stop)
+        self._was_notified = self._changes.wait(_POLL_SECONDS, stop)
         has_events = self._changes.has_events and self._missed < _MOST_MISSED
-        return self._was_told or not has_events or time.monotonic() >= self._due or stop.is_set()
+        return (
+            self._was_notified or not has_events or time.monotonic() >= self._due or stop.is_set()
+        )
 
     def close(self) -> None:
         """Stop watching."""
@@ -408,7 +410,7 @@ class _Folder:
                 if not _has_vanished(error):
                     self._listed_logs.discard(_name(path))
                     self._listed[path.parent] = -1
-                    self._tell(path, error)
+                    self._report(path, error)
             else:
                 self._unreadable.discard(path)
                 yield log
@@ -441,9 +443,9 @@ class _Folder:
             problem = "the folder is gone; waiting for it"
         elif not isinstance(error, PermissionError):
             problem = f"cannot be read ({error.strerror}); it is tried again"
-        self._tell(folder, LogError(f"{folder}: {problem}"))
+        self._report(folder, LogError(f"{folder}: {problem}"))
 
-    def _tell(self, path: Path, error: LogError) -> None:
+    def _report(self, path: Path, error: LogError) -> None:
         """Report an error once, until the folder or the log is readable again."""
         if path not in self._unreadable:
             self._unreadable.add(path)

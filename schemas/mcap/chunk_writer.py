@@ -422,16 +422,21 @@ class ChunkWriter:
                     self.flush()
             self._chunk.add_chunk(chunk, {*dropped, *own})
         if own:
-            self._gather(chunk, own, whole=not rest, dropped=dropped)
+            self._gather(chunk, own, every_message=not rest, dropped=dropped)
 
     def _gather(
-        self, chunk: StoredChunk, own: Collection[int], *, whole: bool, dropped: Collection[int]
+        self,
+        chunk: StoredChunk,
+        own: Collection[int],
+        *,
+        every_message: bool,
+        dropped: Collection[int],
     ) -> None:
         begun = self._gathered
         start, end = min(begun.start, chunk.start), max(begun.end, chunk.end)
         if end - start > GATHERED_SPAN or len(begun.content) + chunk.size > self._chunk_size:
             self.flush()
-        if whole:
+        if every_message:
             self._gathered.add_chunk(chunk, dropped)
         else:
             self._gathered.gather(chunk, own)

@@ -435,49 +435,49 @@ def read_parts(stream: ContentStream) -> Iterator[Part]:
     """
     held, first = bytearray(), 0  # offset of `held` in the content
     messages, others = array("q"), list[tuple[int, int]]()
-    whole = 0  # bytes of complete records in `held`
+    complete = 0  # bytes of complete records in `held`
     while piece := stream.read(_PIECE):
         held += piece
-        whole, large = _next_records(held, whole, stream.head.size - first, messages, others)
-        if large or whole >= _PART:
-            if whole:
-                yield Part(first, whole, bytes(held[:whole]), messages, others)
-            del held[:whole]
-            first += whole
-            whole, messages, others = 0, array("q"), []
+        complete, large = _next_records(held, complete, stream.head.size - first, messages, others)
+        if large or complete >= _PART:
+            if complete:
+                yield Part(first, complete, bytes(held[:complete]), messages, others)
+            del held[:complete]
+            first += complete
+            complete, messages, others = 0, array("q"), []
         if large:
             yield Part(first, large, bytes(held[: MESSAGE.size]), messages, others)
             first += large
             stream.skip(first - stream.position)
             held = bytearray()
-    if whole < len(held):
+    if complete < len(held):
         raise McapError("a record in a chunk is cut")
-    if whole:
-        yield Part(first, whole, bytes(held), messages, others)
+    if complete:
+        yield Part(first, complete, bytes(held), messages, others)
     stream.check()
 
 
 def _next_records(
-    held: bytearray, whole: int, end: int, messages: "array[int]", others: list[tuple[int, int]]
+    held: bytearray, complete: int, end: int, messages: "array[int]", others: list[tuple[int, int]]
 ) -> tuple[int, int]:
     """Walk through records; return the end of the last complete record.
 
     The second number is the size of the next record if that is larger than `LIMIT`.
     """
-    while len(held) - whole >= min(MESSAGE.size, end - whole):
-        if end - whole < HEAD.size:
+    while len(held) - complete >= min(MESSAGE.size, end - complete):
+        if end - complete < HEAD.size:
             break
-        opcode, length = HEAD.unpack_from(held, whole)
+        opcode, length = HEAD.unpack_from(held, complete)
         length += HEAD.size
-        if opcode == 0 or whole + length > end:
+        if opcode == 0 or complete + length > end:
             raise McapError("a record in a chunk is damaged")
         if length > LIMIT:
-            return whole, length
-        if whole + length > len(held):
+            return complete, length
+        if complete + length > len(held):
             break
         if opcode == Opcode.MESSAGE and length >= MESSAGE.size:
-            messages.append(whole)
+            messages.append(complete)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            others.append((whole, whole + length))
-        whole += length
-    return whole, 0
+            others.append((complete, complete + length))
+        complete += length
+    return complete, 0

@@ -93,7 +93,7 @@ class DamageList:
         self._damages.append((damage, messages or {}))
 
     def add_unnamed(
-        self, channel: int, messages: int, times: tuple[int, int], whole: IntactRecord
+        self, channel: int, messages: int, times: tuple[int, int], intact: IntactRecord
     ) -> None:
         """Add messages of a channel without a definition so far.
 
@@ -101,12 +101,12 @@ class DamageList:
         ----------
         times : tuple of int
             First and last log time in nanoseconds.
-        whole : IntactRecord
+        intact : IntactRecord
             Record of the messages, behind those added before for the channel.
         """
-        count, span, (start, _) = self.unnamed.get(channel, (0, times, (whole.offset, 0)))
+        count, span, (start, _) = self.unnamed.get(channel, (0, times, (intact.offset, 0)))
         span = min(span[0], times[0]), max(span[1], times[1])
-        self.unnamed[channel] = count + messages, span, (start, whole.end)
+        self.unnamed[channel] = count + messages, span, (start, intact.end)
 
     def add_unmet(self, unmet: Iterable[MissingMessages], names: Sequence[str]) -> None:
         """Add records of the index that the file lacks, unless known damages cover them.
@@ -124,15 +124,15 @@ class DamageList:
             first = bisect_left(starts, chunks.start)
             last = bisect_left(starts, max(chunks.end, chunks.start + 1))
             lost = Counter(chunks.messages)
-            for _, told in self._damages[first:last]:
-                lost.subtract(told)
+            for _, counts in self._damages[first:last]:
+                lost.subtract(counts)
             lost = +lost
             if first < last:
-                damage, told = self._damages[last - 1]
+                damage, counts = self._damages[last - 1]
                 if lost or not damage.exact:
                     times = _span(damage.times, chunks.times)
                     damage = replace(damage, exact=chunks.exact, times=times)
-                    self._damages[last - 1] = damage, dict(lost + Counter(told))
+                    self._damages[last - 1] = damage, dict(lost + Counter(counts))
             elif lost or not chunks.exact:
                 damage = Damage(
                     chunks.start, chunks.end, _MORE_IN_INDEX, {}, chunks.exact, chunks.times

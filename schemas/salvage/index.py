@@ -98,8 +98,8 @@ class Index:
         chunks = array("q")
         offset = start
         while offset < end:
-            whole = self._reader.intact(offset)
-            record = whole.record
+            intact = self._reader.intact(offset)
+            record = intact.record
             if isinstance(record, Definition):
                 self.definitions.append(record)
             elif isinstance(record, records.Statistics):
@@ -116,7 +116,7 @@ class Index:
                 self.names[record.offset] = _name_of(record)
             elif not isinstance(record, records.SummaryOffset | UnknownRecord):
                 raise McapError("here should be the index")
-            offset = whole.end
+            offset = intact.end
         table = np.array(chunks, np.int64).reshape(-1, 6)
         table = table[np.argsort(table[:, 0])]
         ends = table[:, :3].sum(axis=1)
@@ -133,27 +133,27 @@ class Index:
             messages.update(_messages_of(record))
         return messages
 
-    def meet(self, whole: IntactRecord) -> None:
+    def meet(self, intact: IntactRecord) -> None:
         """Mark a record as found."""
-        record = whole.record
+        record = intact.record
         if isinstance(record, records.Metadata | IntactAttachment):
             self._unmet_names[_name_of(record)] -= 1
         elif isinstance(record, IntactChunk | LargeChunk):
-            self._meet_chunk(whole, record.stored)
+            self._meet_chunk(intact, record.stored)
 
-    def _meet_chunk(self, whole: IntactRecord, chunk: StoredChunk) -> None:
+    def _meet_chunk(self, intact: IntactRecord, chunk: StoredChunk) -> None:
         chunks = self.chunks
-        span, length = (chunk.start, chunk.end), whole.end - whole.offset
-        row = int(np.searchsorted(chunks[:, 0], whole.offset - self._shift))
-        is_there = row < len(chunks) and chunks[row, 0] == whole.offset - self._shift
+        span, length = (chunk.start, chunk.end), intact.end - intact.offset
+        row = int(np.searchsorted(chunks[:, 0], intact.offset - self._shift))
+        is_there = row < len(chunks) and chunks[row, 0] == intact.offset - self._shift
         if not is_there or (chunks[row, 3:5] != span).any():
             other = self._like(*span, length)
             row = row if is_there and other < 0 else other
         if row < 0:
             return
-        self._row, self._shift = row, whole.offset - int(chunks[row, 0])
-        self._places[row] = whole.offset
-        self._ends[row] = whole.end
+        self._row, self._shift = row, intact.offset - int(chunks[row, 0])
+        self._places[row] = intact.offset
+        self._ends[row] = intact.end
 
     def unmet_names(self) -> list[str]:
         """List the missing metadata records and attachments, as in `names`."""
@@ -282,18 +282,18 @@ class MessageIndexes:
         self._times = _NO_TIMES
         self._start = 0
 
-    def meet(self, whole: IntactRecord) -> None:
+    def meet(self, intact: IntactRecord) -> None:
         """Compare the next record, if it is a message index, with the chunk before it."""
-        if whole.record is None:
+        if intact.record is None:
             with suppress(McapError):
-                channel, entries, _ = self._reader.message_index(whole.offset)
+                channel, entries, _ = self._reader.message_index(intact.offset)
                 self._add(channel, entries)
             return
-        self._close(whole.offset)
-        if isinstance(whole.record, IntactChunk | LargeChunk):
-            chunk = whole.record.stored
+        self._close(intact.offset)
+        if isinstance(intact.record, IntactChunk | LargeChunk):
+            chunk = intact.record.stored
             self._spans.extend([chunk.start, chunk.end])
-            self._begin(whole.end)
+            self._begin(intact.end)
             rows = chunk.entries.items()
             self._own = {channel: np.frombuffer(same, INDEX_ENTRIES) for channel, same in rows}
 

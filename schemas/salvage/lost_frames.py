@@ -157,15 +157,17 @@ class FrameSearch:
         list of LostFrames
             None ends before the last of these times.
         """
-        heard: dict[str, int] = {}
+        recorded_until: dict[str, int] = {}
         for number, end in ends.items():
             name = parse_topic(self._salvage.definitions.channels[number].topic)
             if name is not None and name.labelling == LIVE and name.kind in _OF_SOUND:
-                heard[name.microphone] = max(heard.get(name.microphone, 0), end)
+                recorded_until[name.microphone] = max(recorded_until.get(name.microphone, 0), end)
         last = max(ends.values(), default=0)
         followers = self._followers.items()
         return sorted(
-            each for name, one in followers for each in one.at_end(heard.get(name, 0), last)
+            each
+            for name, one in followers
+            for each in one.at_end(recorded_until.get(name, 0), last)
         )
 
 
@@ -207,14 +209,14 @@ class _FrameFollower:
             self._damages = self._salvage.damage_count
         return lost
 
-    def at_end(self, heard: int, last: int) -> list[LostFrames]:
-        """Return the frames missing at the end; `heard` is the end of the known sound."""
+    def at_end(self, recorded_until: int, last: int) -> list[LostFrames]:
+        """Return the frames missing behind the last known sound."""
         if self._place is None or self._place.number is None or not self._is_damaged():
             return []
         start = self._place.time
         count = self._counted()
         if not count and self._kind == _FEATURES:  # labels end before the sound
-            count = (heard - start) // FRAME_NANOSECONDS
+            count = (recorded_until - start) // FRAME_NANOSECONDS
         return self._lost(start, max(start + count * FRAME_NANOSECONDS, last), count)
 
     def _is_repeated(self, mark: FramePosition) -> bool:

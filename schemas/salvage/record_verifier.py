@@ -275,15 +275,15 @@ class RecordVerifier:
         definitions, escaped = intact_records.read_definitions(content, others)
         leading = int((others < messages[0]).sum()) if len(messages) else len(others)
         stored_chunk = StoredChunk(compression, data, size, checksum, *span, entries)
-        whole = IntactChunk(stored_chunk, definitions, leading)
+        intact = IntactChunk(stored_chunk, definitions, leading)
         if escaped:
-            whole, content = intact_records.with_definitions(whole, content, others)
+            intact, content = intact_records.with_definitions(intact, content, others)
             messages, _ = intact_records.split_content(content)
         if span[1] > LAST_TIME:
-            whole = intact_records.without_late(whole, content, messages)
+            intact = intact_records.without_late(intact, content, messages)
         behind = outer if padded else offset + first + number
         proved = bool(crc) or agrees
-        return IntactRecord(offset, behind, whole, wrong, escaped=tuple(escaped), proved=proved)
+        return IntactRecord(offset, behind, intact, wrong, escaped=tuple(escaped), proved=proved)
 
     def _large_chunk(self, offset: int, end: int) -> LargeChunk:
         """Verify a chunk that is too large for the memory."""

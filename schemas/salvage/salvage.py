@@ -146,27 +146,27 @@ class Salvage:
         while self.offset < self._reader.end:
             offset = self.offset
             try:
-                whole = self._at(offset)
+                intact = self._at(offset)
             except McapError as error:
                 if self._ended and MAGIC.startswith(self._reader.read(offset, len(MAGIC) + 1)):
                     return
                 self.offset = self._pass(offset, str(error))
                 continue
-            if whole.corrected:
-                why = f"{whole.corrected} is wrong"
-                self._damages.add(Damage(offset, whole.end, why, exact=whole.proved))
-            self.escaped.update(dict.fromkeys(whole.escaped))
-            self.offset = whole.end
-            self._last_index = offset if whole.record is None else None
-            (self._index or self._message_indexes).meet(whole)
-            yield from self._take(whole)
-            del whole  # frees memory before the next record, which may be as large
+            if intact.corrected:
+                why = f"{intact.corrected} is wrong"
+                self._damages.add(Damage(offset, intact.end, why, exact=intact.proved))
+            self.escaped.update(dict.fromkeys(intact.escaped))
+            self.offset = intact.end
+            self._last_index = offset if intact.record is None else None
+            (self._index or self._message_indexes).meet(intact)
+            yield from self._take(intact)
+            del intact  # frees memory before the next record, which may be as large
 
     def _at(self, offset: int, *, searching: bool = False, chunk: bool = False) -> IntactRecord:
         """Read the record at an offset; raise McapError if there is no complete one."""
         if self._next is not None and self._next.offset == offset:
-            whole, self._next = self._next, None
-            return whole
+            intact, self._next = self._next, None
+            return intact
         reader = self._reader
         self._cost = 0
         if self._vain > 4 * LIMIT + _VAIN * offset:
@@ -175,17 +175,17 @@ class Salvage:
             raise McapError("the file holds more messages than one of its size can")
         work = reader.work
         try:
-            whole = reader.chunk(offset) if chunk else reader.intact(offset, 3 if searching else 1)
-            self._count_kept(whole)
-            self._doubt(whole, searching=searching)
+            intact = reader.chunk(offset) if chunk else reader.intact(offset, 3 if searching else 1)
+            self._count_kept(intact)
+            self._doubt(intact, searching=searching)
         except McapError:
             self._cost = reader.work - work
             raise
-        return whole
+        return intact
 
-    def _count_kept(self, whole: IntactRecord) -> None:
+    def _count_kept(self, intact: IntactRecord) -> None:
         """Count the bytes to keep of a record; raise McapError if they are too many."""
-        record, size = whole.record, _KEPT_EACH
+        record, size = intact.record, _KEPT_EACH
         if isinstance(record, IntactChunk | LargeChunk):
             size += 16 * len(record.stored.entries)
             size += sum(_size(definition) for definition in record.definitions)
@@ -201,23 +201,23 @@ class Salvage:
             raise McapError("the file holds more definitions than can be kept")
         self._kept += size
 
-    def _doubt(self, whole: IntactRecord, *, searching: bool) -> None:
+    def _doubt(self, intact: IntactRecord, *, searching: bool) -> None:
         """Raise McapError for a possibly misread or accidental record."""
         unproved = records.Message | Definition | UnknownRecord
-        if self._astray and isinstance(whole.record, unproved):
+        if self._astray and isinstance(intact.record, unproved):
             raise McapError("what is in a damaged chunk is not proved")
-        if isinstance(whole.record, records.Message) and self._has_chunks:
+        if isinstance(intact.record, records.Message) and self._has_chunks:
             if searching or self._ended:
                 raise McapError("messages are in chunks here")
-            if self._reader.like_message_index(whole.offset):
+            if self._reader.like_message_index(intact.offset):
                 raise McapError("a message index has become a message")
-        if isinstance(whole.record, UnknownRecord) and self._like_message(whole.record.head):
+        if isinstance(intact.record, UnknownRecord) and self._like_message(intact.record.head):
             raise McapError("a message has become another record")
         if not searching:
             return
-        if isinstance(whole.record, records.Message) and whole.record.log_time > LAST_TIME:
+        if isinstance(intact.record, records.Message) and intact.record.log_time > LAST_TIME:
             raise McapError("a log time is out of range")
-        if not isinstance(whole.record, IntactChunk) and not self._reader.plausible(whole.end):
+        if not isinstance(intact.record, IntactChunk) and not self._reader.plausible(intact.end):
             raise McapError("no record begins where this one ends")
 
     def _like_message(self, record: bytes) -> bool:
@@ -312,9 +312,9 @@ class Salvage:
         chunks |= {place for place in heads if data[place - start] == Opcode.CHUNK}
         return _Places(window, sorted(chunks), sorted(chunks | heads))
 
-    def _take(self, whole: IntactRecord) -> Iterator[Piece]:
+    def _take(self, intact: IntactRecord) -> Iterator[Piece]:
         """Register the contents of a record; yield it if it belongs into the new log."""
-        record = whole.record
+        record = intact.record
         if isinstance(record, records.Header):
             self.header = self.header or record
             self._ended = False
@@ -325,27 +325,27 @@ class Salvage:
                 self.definitions.doubt(record)
         elif isinstance(record, IntactChunk):
             self._ended, self._astray, self._has_chunks = False, False, True
-            yield from self._take_chunk(record, whole)
+            yield from self._take_chunk(record, intact)
         elif isinstance(record, LargeChunk):
             self._ended = False
-            self._has_chunks |= record.data[0] != whole.offset
-            yield from self._take_large(record, whole)
+            self._has_chunks |= record.data[0] != intact.offset
+            yield from self._take_large(record, intact)
         elif isinstance(record, records.Message):
             self._ended = False
-            yield from self._take_message(record, whole)
+            yield from self._take_message(record, intact)
         elif isinstance(record, records.Metadata | IntactAttachment) or (
             isinstance(record, UnknownRecord) and not self._ended
         ):
             yield record
 
-    def _take_large(self, chunk: LargeChunk, whole: IntactRecord) -> Iterator[Piece]:
+    def _take_large(self, chunk: LargeChunk, intact: IntactRecord) -> Iterator[Piece]:
         """Yield a chunk for an unchanged copy, if all its channels are defined."""
         for record in chunk.definitions:
             if not self.definitions.add(record):
                 self.definitions.doubt(record)
         if chunk.unopened:
             why = f"{chunk.unopened}, and is copied unopened,"
-            self._damages.add(Damage(whole.offset, whole.end, why, sound=True))
+            self._damages.add(Damage(intact.offset, intact.end, why, sound=True))
             known = {n: e for n, e in chunk.stored.entries.items() if self.definitions.defines(n)}
             yield chunk._replace(stored=chunk.stored._replace(entries=known))
             return
@@ -356,9 +356,9 @@ class Salvage:
             late[number] = int((times > LAST_TIME).sum())
             if not self.definitions.defines(number):
                 span = int(times.min()), int(times.max())
-                self._damages.add_unnamed(number, len(times), span, whole)
+                self._damages.add_unnamed(number, len(times), span, intact)
                 unknown += 1
-        self._add_late(whole, +late)
+        self._add_late(intact, +late)
         if chunk.stored.entries and not unknown:
             yield chunk
 
@@ -367,24 +367,24 @@ class Salvage:
         for place in range(start, end, _WINDOW):
             yield self._file.read(place, min(_WINDOW, end - place))
 
-    def _take_message(self, message: records.Message, whole: IntactRecord) -> Iterator[Piece]:
+    def _take_message(self, message: records.Message, intact: IntactRecord) -> Iterator[Piece]:
         """Yield a message outside of chunks, if its channel is defined and its time is valid."""
         if message.log_time > LAST_TIME:
-            self._add_late(whole, {message.channel_id: 1})
+            self._add_late(intact, {message.channel_id: 1})
         elif self.definitions.defines(message.channel_id):
             yield message
         else:
             times = message.log_time, message.log_time
-            self._damages.add_unnamed(message.channel_id, 1, times, whole)
+            self._damages.add_unnamed(message.channel_id, 1, times, intact)
 
-    def _add_late(self, whole: IntactRecord, messages: Mapping[int, int]) -> None:
+    def _add_late(self, intact: IntactRecord, messages: Mapping[int, int]) -> None:
         """Register messages that are skipped because readers cannot represent their log times."""
         if messages:
-            self._damages.add(Damage(whole.offset, whole.end, _LATE, sound=True), dict(messages))
+            self._damages.add(Damage(intact.offset, intact.end, _LATE, sound=True), dict(messages))
 
-    def _take_chunk(self, chunk: IntactChunk, whole: IntactRecord) -> Iterator[Piece]:
+    def _take_chunk(self, chunk: IntactChunk, intact: IntactRecord) -> Iterator[Piece]:
         """Yield a chunk if all its channels are defined; else its messages of defined ones."""
-        self._add_late(whole, chunk.late)
+        self._add_late(intact, chunk.late)
         agree = True
         for record in chunk.definitions:
             if not self.definitions.add(record):
@@ -399,7 +399,7 @@ class Salvage:
             if not defined[number]:
                 times = chunk.stored.times(number)
                 span = int(times.min()), int(times.max())
-                self._damages.add_unnamed(number, len(times), span, whole)
+                self._damages.add_unnamed(number, len(times), span, intact)
         if any(defined.values()):
             for message in chunk_messages(chunk.stored):
                 if defined[message.channel_id]:

@@ -60,7 +60,7 @@ def test_another_microphone_hears_the_same_in_a_narrow_band_and_weaker():
     heard = [
         (near.floor.ravel(), narrow.floor.ravel()),
         (near.steady["fridge"].ravel(), narrow.steady["fridge"].ravel()),
-        (near.heard(click, "kitchen"), narrow.heard(click, "kitchen")),
+        (near.received(click, "kitchen"), narrow.received(click, "kitchen")),
     ]
     for before, after in heard:
         frequency = np.fft.rfftfreq(len(before), 1 / 16_000)

@@ -120,9 +120,9 @@ def import_labels(
     coverage = find_coverage(log)
     _check_microphone(log, coverage, microphone)
     options = ImportOptions(microphone, names, choice, strict)
-    asked = queue_file(labels)
-    spans = read_list(asked) if asked.exists() else []
-    check_scenario(asked, spans, scenario, "--scenario")
+    queue = queue_file(labels)
+    spans = read_list(queue) if queue.exists() else []
+    check_scenario(queue, spans, scenario, "--scenario")
     by_log, left_out, moved = read_labels(
         labels, coverage, options, lambda folded: _agree(labels, folded, yes=yes)
     )
@@ -154,15 +154,15 @@ def import_labels(
     existing = sum(map(len, by_log.values())) - len(taken)
     if existing:
         print_notice(f"{number(existing, 'mark')} existed already")
-    if asked.exists():
+    if queue.exists():
         minutes = sum(span.chosen == RANDOM for span in seen)
         print_notice(
-            f"looked at, by {asked}: {number(len(seen) - minutes, 'span')} of the queue, "
+            f"looked at, by {queue}: {number(len(seen) - minutes, 'span')} of the queue, "
             f"{number(minutes, 'minute')} drawn at random"
         )
         if others := outside_requests(spans, taken):
             print_notice(
-                f"{number(len(others), 'mark')} outside the spans of {asked}: your own choice"
+                f"{number(len(others), 'mark')} outside the spans of {queue}: your own choice"
             )
     if taken:
         what, of = (

@@ -182,14 +182,20 @@ def replay(
     losses = list(home.losses)
     longest = max(history(rule) for rule in own.alert)
     with share_done("reading the labels") as progress:
-        heard = read_activity(home, settings.node, first - longest, last, losses.append, progress)
+        activity = read_activity(
+            home, settings.node, first - longest, last, losses.append, progress
+        )
     hidden = home.never_tell().union(map(class_name, settings.never_tell))
-    found = {rule.name: notifications(rule, heard, first, last, zone)[0] for rule in own.alert}
+    found = {rule.name: notifications(rule, activity, first, last, zone)[0] for rule in own.alert}
     found |= {rule.name: [] for rule in own.alert if is_hidden(rule, hidden)}
-    microphones = {source_microphone(name) for name in heard.coverage}
+    microphones = {source_microphone(name) for name in activity.coverage}
     for rule in own.alert:
-        unheard = unknown_microphone(rule, microphones, recorded=True)
-        if text := hidden_class(rule, hidden) or unheard or unknown_class(rule, heard.classes):
+        unrecorded = unknown_microphone(rule, microphones, recorded=True)
+        if (
+            text := hidden_class(rule, hidden)
+            or unrecorded
+            or unknown_class(rule, activity.classes)
+        ):
             print_notice(text)
     if as_json:
         print_json(_as_json(found, (first, last), zone))

@@ -343,15 +343,15 @@ def voices(
         known = load_voices(path)
         with share_done("reading the speech") as progress:
             speech = read_speech(found, *span, progress)
-        heard, of = find_voices(speech, known)
-        _check_numbers(VOICES, heard, [*(undo or []), *names])
-        heard = heard.named(dict.fromkeys(undo or [], "") | names)
+        separated, of = find_voices(speech, known)
+        _check_numbers(VOICES, separated, [*(undo or []), *names])
+        separated = separated.named(dict.fromkeys(undo or [], "") | names)
         if home is not None:
-            _enrol(home, speech, heard, of, names)
-        save_voices(heard, path)
+            _enrol(home, speech, separated, of, names)
+        save_voices(separated, path)
     if output is not None:
-        _write_turns(output, speech, heard, of)
-    summaries = summarise_voices(speech, heard, of, zone)
+        _write_turns(output, speech, separated, of)
+    summaries = summarise_voices(speech, separated, of, zone)
     if as_json:
         result = {"seconds": speech.seconds, "timezone": str(zone), "voices_file": str(path)}
         print_json({**result, "voices": [each.model_dump() for each in summaries]})
@@ -425,9 +425,9 @@ def _print_voices(
         for each in summaries
     ]
     print_table(head, rows, words=3)
-    told = sum(each.minutes for each in summaries)
+    minutes = sum(each.minutes for each in summaries)
     voices = number(len(rows), "voice")
-    print(f"{speech.seconds / 60:.1f} minutes of speech, of which {told:.1f} by {voices}")
+    print(f"{speech.seconds / 60:.1f} minutes of speech, of which {minutes:.1f} by {voices}")
     if speech.without:
         print(f"{number(speech.without, 'log')} without features of voices, or segments")
 

@@ -281,9 +281,9 @@ def _print(
         if not own and len(classes) > 1:
             continue
         apart = sum(event.television for event in own)
-        beside = f", and {apart} while something like a television sounded" if apart else ""
+        television = f", and {apart} while something like a television sounded" if apart else ""
         by_hand = ", only what people marked: the model does not know it" * (name in marked)
-        print(f"{in_words(name)} {span.words}: {len(own) - apart or 'none'}{beside}{by_hand}")
+        print(f"{in_words(name)} {span.words}: {len(own) - apart or 'none'}{television}{by_hand}")
     pauses = [
         f"{local_time(start, zone):{form[:-3]}} to {local_time(end, zone):{form[:-3]}}"
         for start, end in zip(missing.starts.tolist(), missing.ends.tolist(), strict=True)

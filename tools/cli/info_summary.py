@@ -64,7 +64,7 @@ class Overview:
         """Yield three lines: what this is; what was heard; whether all is well, the next step."""
         yield self._what()
         if self._microphones():
-            yield self._heard()
+            yield self._activity()
         state = self._trouble() or "All is well"
         yield f"{state}{f'; next: {following}' * (following is not None)}"
 
@@ -121,12 +121,12 @@ class Overview:
         span = f"{begin} to {end} ({_zone_name(self._zone)})"
         return f"{whose}: {length}, {span}"
 
-    def _heard(self) -> str:
-        whole, listened = self._summary.seconds, self._listened()
+    def _activity(self) -> str:
+        span, listened = self._summary.seconds, self._listened()
         hours = listed([f"{name} {_hours(listened[name])}" for name in sorted(listened)], "and")
         if len(listened) == 1 or len(set(map(_hours, listened.values()))) == 1:
             hours = _hours(next(iter(listened.values())))
-        text = f"Listened: {hours} of {_hours(whole)}"
+        text = f"Listened: {hours} of {_hours(span)}"
         total: Counter[str] = Counter()
         for seconds in self._segments().values():
             total.update(seconds)
@@ -224,12 +224,12 @@ def next_step(summary: LogSummary, path: Path) -> str | None:
     place, latest = shlex.quote(str(path)), summary.streams[-1]
     if not latest["model"]:
         return f"nothing is labelled: hearthlog relabel {place} --model {GENERAL}"
-    heard: Counter[str] = Counter()
+    labelled: Counter[str] = Counter()
     for counts in summary.segments.values():
-        heard.update(map(class_name, counts))
-    if not (heard or summary.label_seconds):
+        labelled.update(map(class_name, counts))
+    if not (labelled or summary.label_seconds):
         return "no sound was recorded, not even silence: hearthlog devices lists the microphones"
-    if not heard.keys() - {SILENCE}:
+    if not labelled.keys() - {SILENCE}:
         return "only silence was recorded so far: leave it recording, or test the microphone"
     marked = any(name.partition("/")[2] == REVIEW for name in summary.segments)
     if marked and latest["starter"] and not _has_learned(summary.layers):
@@ -274,11 +274,11 @@ class Accuracy:
                 "sounds of one class with at most ten seconds between them count once; 90 % "
                 "intervals in brackets"
             )
-            if beside := int(self.minutes.television.sum()):
+            if television := int(self.minutes.television.sum()):
                 names = listed([in_words(name).lower() for name in SET_APART], "and")
                 yield (
-                    f"{names} are left out of {beside} of these minutes, in which something like a "
-                    "television, a radio or company sounded"
+                    f"{names} are left out of {television} of these minutes, in which something "
+                    "like a television, a radio or company sounded"
                 )
         if 0 < len(self.minutes) < FEWEST:
             yield (

@@ -35,7 +35,7 @@ _QUIETEST, _LOUDEST = -70.0, 0.0  # dB of full scale at the ends of a bar
 _BAR, _NAME = 24, 40  # columns
 
 
-def hear(device: str) -> None:
+def show_level(device: str) -> None:
     """Wait for the first sound of a device.
 
     Raise `SourceError` if it cannot be opened or delivers nothing.

@@ -253,8 +253,8 @@ def compare(
     check_features(first, second)
     chosen = scenario_of(first) if scenario is None else load_scenario(scenario)
     left_out: list[SkippedClip] = []
-    heard = next((one for one in (first, second) if one.description.embedding), first)
-    recordings = _recordings(data, logs, chosen, heard, left_out)
+    with_embedding = next((one for one in (first, second) if one.description.embedding), first)
+    recordings = _recordings(data, logs, chosen, with_embedding, left_out)
     if logs is not None and not recordings:
         print_notice("there are no marks: the differences are shown, not which model is better")
         shares = _minutes_in_logs(first, second, logs)

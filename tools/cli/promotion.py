@@ -75,12 +75,12 @@ def _print_changes(evidence: "HomeComparison", model: str, champion: str) -> Non
 
     changes = evidence.changes
     much, end = ("", ":") if changes.pairs() else (f" less than half a minute{changes.each}", "")
-    whole = "" if changes.each else f" of the {time_words(evidence.recorded)} recorded"
+    period = "" if changes.each else f" of the {time_words(evidence.recorded)} recorded"
     day = changes.minutes.sum()
     mean = f" (a day: the {time_words(day)} that a mean day with logs has)"
     end = (mean if changes.each and day < _WHOLE_DAY else "") + end
     print(
-        f"\n{model} in place of {champion} would change{much}{whole}, judged by "
+        f"\n{model} in place of {champion} would change{much}{period}, judged by "
         f"{time_words(evidence.minutes)} of the last two weeks that it was not trained on{end}"
     )
     print_changes(changes, champion, model)

@@ -98,8 +98,8 @@ def replay(
     )
     _check_output(output, path)
     logs = LogSet(find_logs(path), options.kind, microphone)
-    beside = path if path.is_dir() else path.parent
-    models = _Models(model, (Path(), Path("models"), beside, starter_file(GENERAL).parent))
+    folder = path if path.is_dir() else path.parent
+    models = _Models(model, (Path(), Path("models"), folder, starter_file(GENERAL).parent))
     models.report(logs.chosen(options))
     stop = Flag()
     for number in (signal.SIGINT, signal.SIGTERM):

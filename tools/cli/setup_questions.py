@@ -133,7 +133,7 @@ def microphones_of(
         chosen = [(_found(query_devices(), "").identity, configured[0][1])]
     for device, _ in chosen:
         if device not in ours:
-            _check_heard(device)
+            _check_level(device)
     return chosen
 
 
@@ -193,14 +193,14 @@ def _chosen_on_terminal(
     return pairs
 
 
-def _check_heard(device: str) -> None:
+def _check_level(device: str) -> None:
     from hearthlog.recorder.addresses import is_address
     from hearthlog.recorder.sources.process import query_devices
-    from hearthlog.tools.cli.level_meter import hear
+    from hearthlog.tools.cli.level_meter import show_level
 
     if not is_address(device):
         _found(query_devices(), device)
-        hear(device)
+        show_level(device)
 
 
 def node_of(asker: Asker, given: str | None, present: Present) -> str:

@@ -115,16 +115,16 @@ class ReportOnce:
     """Writes repeated messages once per text."""
 
     def __init__(self) -> None:
-        self._told: deque[str] = deque(maxlen=_MOST_TOLD)
+        self._shown: deque[str] = deque(maxlen=_MOST_TOLD)
 
     def __call__(self, what: object) -> None:
         """Write a message unless written recently."""
-        if str(what) not in self._told:
-            self._told.append(str(what))
+        if str(what) not in self._shown:
+            self._shown.append(str(what))
             print_notice(str(what))
 
     def __bool__(self) -> bool:
-        return bool(self._told)
+        return bool(self._shown)
 
 
 def wrong_use(message: str) -> NoReturn:
@@ -206,8 +206,8 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     for row in cells:
         table.add_row(*row)
     # A terminal narrower than a table without heads breaks its lines.
-    whole = max(terminal_width(), sum(widths) + gap * len(widths))
-    console = Console(highlight=False, markup=False, emoji=False, width=whole)
+    total_width = max(terminal_width(), sum(widths) + gap * len(widths))
+    console = Console(highlight=False, markup=False, emoji=False, width=total_width)
     with console.capture() as text:
         console.print(table)
     print(*(line.rstrip() for line in text.get().splitlines()), sep="\n")

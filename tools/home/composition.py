@@ -84,7 +84,7 @@ class Rooms:
         }
         self._responses: dict[str, Float64] = {}
 
-    def heard(self, sound: Float32, room: str) -> Float32:
+    def received(self, sound: Float32, room: str) -> Float32:
         """Return a sound of a room as received by the microphone.
 
         Parameters
@@ -98,12 +98,12 @@ class Rooms:
         if room not in self._responses:
             self._responses[room] = self._response(room)
         length = len(sound) + TAIL_FRAMES * FRAME_SAMPLES
-        heard = np.zeros(length)
+        wet = np.zeros(length)
         full = oaconvolve(sound.astype(np.float64), self._responses[room])[:length]
-        heard[: len(full)] = full
+        wet[: len(full)] = full
         fade = FRAME_SAMPLES
-        heard[-fade:] *= np.linspace(1.0, 0.0, fade)
-        return heard.astype(np.float32)
+        wet[-fade:] *= np.linspace(1.0, 0.0, fade)
+        return wet.astype(np.float32)
 
     def _response(self, room: str) -> Float64:
         """Make the impulse response from a room to the microphone: direct sound and echoes."""
@@ -207,7 +207,7 @@ class Composition:
         self._starts = np.array([sound.start for sound in plan.sounds], np.int64)
         longest = max((sound.frames for sound in plan.sounds), default=0)
         self._reach = longest + TAIL_FRAMES
-        self._heard = ArrayCache(_CACHE_BYTES)
+        self._cache = ArrayCache(_CACHE_BYTES)
         self._powers = ArrayCache(_CACHE_BYTES)
         self._steady_powers = {
             name: float(frame_powers(noise).mean())
@@ -225,15 +225,15 @@ class Composition:
         mix = self._background(first, count)
         for sound in self._sounds(first, first + count):
             begin, end = max(sound.start, first), min(_audible_until(sound), first + count)
-            heard = self._wet(sound)[begin - sound.start : end - sound.start]
-            mix[begin - first : end - first] += heard * np.float32(self._gain(sound))
+            wet = self._wet(sound)[begin - sound.start : end - sound.start]
+            mix[begin - first : end - first] += wet * np.float32(self._gain(sound))
         return _quantised(mix)
 
     def features(self, features: FeatureSet) -> "FeatureStream":
         """Begin a stream of the features of the composed sound."""
         return FeatureStream(self, features)
 
-    def heard(self, first: int, count: int) -> Iterator[AudibleSound]:
+    def audible(self, first: int, count: int) -> Iterator[AudibleSound]:
         """Yield the sounds that begin in some frames, at their received level."""
         places = np.searchsorted(self._starts, (first, first + count))
         for sound in self.plan.sounds[places[0] : places[1]]:
@@ -316,9 +316,9 @@ class Composition:
 
         def make() -> Float32:
             dry = self._library.sound(sound.clip, sound.frames)
-            return self._rooms.heard(dry, sound.room).reshape(-1, FRAME_SAMPLES)
+            return self._rooms.received(dry, sound.room).reshape(-1, FRAME_SAMPLES)
 
-        return self._heard((sound.clip.name, sound.frames, sound.room), make)
+        return self._cache((sound.clip.name, sound.frames, sound.room), make)
 
     def _loudness(self, sound: PlannedSound) -> tuple[Float32, float]:
         """Return the mean square of each frame and the highest sample, for a level of 0 dBFS."""

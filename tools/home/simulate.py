@@ -160,7 +160,7 @@ class TrueEvent(NamedTuple):
 
     plan: PlannedSound
     level: float
-    heard_frames: int
+    audible_frames: int
 
 
 class Truth(NamedTuple):
@@ -184,14 +184,14 @@ def truth_of(composition: Composition) -> Truth:
     held: list[tuple[int, AudibleSound]] = []  # sounds that continue into the next day
     for first in range(0, composition.plan.frames, DAY_FRAMES):
         count = min(DAY_FRAMES, composition.plan.frames - first)
-        begun = enumerate(composition.heard(first, count), start=len(events))
+        begun = enumerate(composition.audible(first, count), start=len(events))
         here = [*held, *begun]
         events += [_event(sound) for _, sound in here[len(held) :]]
         loudest = _loudest(here, composition.floor_power(first, count), first)
         for number, frames in zip(*np.unique(loudest, return_counts=True), strict=True):
             if number >= 0:
                 event = events[number]
-                events[number] = event._replace(heard_frames=event.heard_frames + int(frames))
+                events[number] = event._replace(audible_frames=event.audible_frames + int(frames))
         labels = [SILENCE, *(event.plan.clip.label for event in events)]
         for begin, end, number in _runs(loudest):
             runs.append((first + begin, first + end, labels[number + 1]))
@@ -225,7 +225,7 @@ def _row(event: TrueEvent) -> tuple[object, ...]:
         plan.clip.source_group,
         "yes" if plan.clip.path is None else "no",
         f"{event.level:.1f}",
-        f"{event.heard_frames * FRAME_SECONDS:.2f}",
+        f"{event.audible_frames * FRAME_SECONDS:.2f}",
     )
 
 

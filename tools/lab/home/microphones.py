@@ -27,7 +27,7 @@ class NarrowRooms(Rooms):
         self.floor = _steady(self.floor)
         self.steady = {name: _steady(noise) for name, noise in self.steady.items()}
 
-    def heard(self, sound: Float32, room: str) -> Float32:
+    def received(self, sound: Float32, room: str) -> Float32:
         """Return a sound of a room as the microphone hears it.
 
         Parameters
@@ -39,7 +39,7 @@ class NarrowRooms(Rooms):
         -------
         np.ndarray [shape=((n + TAIL_FRAMES) * FRAME_SAMPLES,)], float32
         """
-        return _passed(super().heard(sound, room))
+        return _passed(super().received(sound, room))
 
 
 def _passed(sound: Float32) -> Float32:
