@@ -378,7 +378,7 @@ def test_an_array_is_heard_to_the_last_bit_of_its_file(labmic, tmp_path):
     guess = labmic.index_at(int(stamps[1]) - realtime_offset()) - FRAME_SAMPLES
     directions = read(logs, "direction")
     samples = data.astype(np.float32) / np.float32(32768)
-    for offset in sorted(range(-400, 401), key=abs):
+    for offset in sorted(range(-1600, 1601), key=abs):  # a busy machine stamps late
         at = (guess + offset + np.arange(len(frames) * FRAME_SAMPLES)) % len(data)
         batch = finder(SQUARE)(samples[at].reshape(-1, FRAME_SAMPLES, 4)[:200], 0)
         if [m.confidence for m in directions[:3]] == batch.confidences[:3].tolist():
