@@ -34,15 +34,12 @@ class MissingModuleError(HearthlogError, ModuleNotFoundError):
 def require(*modules: str) -> None:
     """Check that modules of an extra can be imported, before starting work that needs them.
 
+    Raise `MissingModuleError` if a module is not installed.
+
     Parameters
     ----------
     *modules : str
         Import names.
-
-    Raises
-    ------
-    MissingModuleError
-        If a module is not installed.
     """
     absent = [module for module in modules if find_spec(module) is None]
     if absent:

@@ -223,17 +223,14 @@ _RELEASE = Path("/etc/os-release")
 def support_bundle(folder: Path) -> Iterator[tuple[str, bytes]]:
     """Collect the support bundle of a folder's recorders.
 
+    Raise `LogError` if the folder does not exist.
+
     Yields
     ------
     name : str
     content : bytes
         JSON: recording times, configuration, gaps, health of microphones and machine, and findings
         of the doctor, but no labels, features or levels.
-
-    Raises
-    ------
-    LogError
-        If the folder does not exist.
     """
     yield "machine.json", _json(_machine())
     states = [state for state in examine_live(folder) if _is_shareable(state.subject)]

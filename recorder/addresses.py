@@ -41,15 +41,12 @@ def is_topic(device: str) -> bool:
 def read_topic(address: str) -> TopicAddress:
     """Parse the address of a topic.
 
+    Raise `SourceError` if it is no such address.
+
     Parameters
     ----------
     address : str
         Such as "ros2:///robot/audio?rate=48000&channels=4".
-
-    Raises
-    ------
-    SourceError
-        If it is no such address.
     """
     form = "write it as ros2:///robot/audio, or ros2:///robot/audio?rate=48000&channels=4"
     topic, _, parameters = address.removeprefix(f"{_TOPIC_SCHEME}://").partition("?")

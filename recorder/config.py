@@ -336,16 +336,13 @@ def load_settings(
 
     Earlier sources take precedence.
 
+    Raise `ConfigurationError` if the file is unreadable or not TOML, if an environment variable is
+    unknown or not JSON, or if a key is unknown or its value invalid; the message names it.
+
     Parameters
     ----------
     file : Path or None
         The TOML file; None for no file.
-
-    Raises
-    ------
-    ConfigurationError
-        If the file is unreadable or not TOML, if an environment variable is unknown or not JSON, or
-        if a key is unknown or its value invalid; the message names it.
     """
     return load_with_origins(file, command_line, microphone)[0]
 

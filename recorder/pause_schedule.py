@@ -106,15 +106,12 @@ class PauseSchedule:
 def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
     """Request the recorders of a folder to close their microphones.
 
+    Raise `LogError` if the folder is not writable.
+
     Parameters
     ----------
     duration : timedelta or None
         None until `resume`.
-
-    Raises
-    ------
-    LogError
-        If the folder is not writable.
     """
     end = "" if duration is None else str(int(time.time() + duration.total_seconds()))
     # A recorder of another account must be able to read the end.
@@ -176,15 +173,12 @@ _DATABASE = "zoneinfo/"
 def time_zone(name: str) -> tzinfo:
     """Return a time zone by its name.
 
+    Raise `LogError` if this machine has no such zone.
+
     Parameters
     ----------
     name : str
         Name in the IANA database, such as "Europe/Berlin", or "UTC".
-
-    Raises
-    ------
-    LogError
-        If this machine has no such zone.
     """
     if name == DEFAULT:
         return UTC  # available without a database

@@ -192,15 +192,12 @@ _LARGEST = 10**18
 def parse_size(value: object) -> int:
     """Parse a size.
 
+    Raise `ValueError` if it is neither.
+
     Parameters
     ----------
     value : object
         A number of bytes, or a text such as "500M" or "1.5 GB".
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
     """
     match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,15})?) ?([kmgt]?)b?", str(value).lower())
     if match is None:

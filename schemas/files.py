@@ -290,10 +290,7 @@ class LocalFile:
     def read(self, offset: int, length: int) -> bytes:
         """Read bytes at an offset.
 
-        Raises
-        ------
-        LogError
-            If the file cannot be read.
+        Raise `LogError` if the file cannot be read.
         """
         try:
             return os.pread(self._descriptor, length, offset)
@@ -302,6 +299,8 @@ class LocalFile:
 
     def read_into(self, out: memoryview, offset: int) -> int:
         """Read bytes at an offset into a buffer.
+
+        Raise `LogError` if the file cannot be read.
 
         Parameters
         ----------
@@ -312,11 +311,6 @@ class LocalFile:
         -------
         int
             Number of bytes read: less than the buffer length at the end of the file.
-
-        Raises
-        ------
-        LogError
-            If the file cannot be read.
         """
         try:
             return os.preadv(self._descriptor, [out], offset)
@@ -353,11 +347,8 @@ class StoredFile:
     def read(self, offset: int, length: int) -> bytes:
         """Read bytes at an offset; cache short reads in blocks.
 
-        Raises
-        ------
-        LogError
-            If the store does not answer, refuses, or returns another number of bytes, for example
-            because the file has changed.
+        Raise `LogError` if the store does not answer, refuses, or returns another number of bytes,
+        for example because the file has changed.
         """
         end = min(offset + length, self.size)
         if end - offset >= _BLOCK:
@@ -369,6 +360,9 @@ class StoredFile:
     def read_into(self, out: memoryview, offset: int) -> int:
         """Read bytes at an offset into a buffer.
 
+        Raise `LogError` if the store does not answer, refuses, or returns another number of bytes,
+        for example because the file has changed.
+
         Parameters
         ----------
         out : memoryview
@@ -378,12 +372,6 @@ class StoredFile:
         -------
         int
             Number of bytes read: less than the buffer length at the end of the file.
-
-        Raises
-        ------
-        LogError
-            If the store does not answer, refuses, or returns another number of bytes, for example
-            because the file has changed.
         """
         read = self.read(offset, len(out))
         out[: len(read)] = read
@@ -436,6 +424,8 @@ class Section(io.RawIOBase):
     def readinto(self, out: Any) -> int:
         """Read the next bytes into a buffer.
 
+        Raise `LogError` if the file cannot be read.
+
         Parameters
         ----------
         out : buffer
@@ -445,11 +435,6 @@ class Section(io.RawIOBase):
         -------
         int
             Number of bytes read; 0 at the end of the file.
-
-        Raises
-        ------
-        LogError
-            If the file cannot be read.
         """
         count = self._file.read_into(memoryview(out), self._position)
         self._position += count

@@ -14,6 +14,8 @@ _BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")
 def read_time(text: str) -> int:
     """Parse a time in ISO 8601.
 
+    Raise `ValueError` if the text is not a time.
+
     Parameters
     ----------
     text : str
@@ -24,11 +26,6 @@ def read_time(text: str) -> int:
     -------
     int
         Nanoseconds of UTC since 1970.
-
-    Raises
-    ------
-    ValueError
-        If the text is not a time.
     """
     rest = _BEYOND_MICROSECONDS.search(text)  # datetime has no room for these digits
     moment = datetime.fromisoformat(_BEYOND_MICROSECONDS.sub("", text))

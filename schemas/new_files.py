@@ -98,15 +98,12 @@ def open_lock(path: Path) -> int:
 def hand_over(path: Path, mode: int | None = None) -> None:
     """Set the permissions of a new file or folder; root also gives it to the owner of its parent.
 
+    Raise `OSError` if the path does not exist, or is a link.
+
     Parameters
     ----------
     path : Path
         Local file or folder; a link is not followed.
-
-    Raises
-    ------
-    OSError
-        If the path does not exist, or is a link.
     """
     descriptor, folder = _open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
@@ -148,15 +145,12 @@ def _is_own(made: os.stat_result) -> bool:
 def locked_folder(folder: Path) -> Iterator[None]:
     """Hold a lock on a folder against other processes that lock it.
 
+    Raise `OSError` if the folder cannot be opened.
+
     Parameters
     ----------
     folder : Path
         Local folder. The wait for the lock is unlimited.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be opened.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:

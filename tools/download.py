@@ -62,17 +62,15 @@ def download(
     The data of an interrupted download stays next to the path, readable by this account alone, and
     is resumed.
 
+    Raise `DownloadError` if the file cannot be downloaded, is not the expected file, or cannot be
+    written.
+
     Parameters
     ----------
     path : Path
         Destination, readable by all; an existing file is replaced.
     size : int
         Size of the file in bytes; no more is read.
-
-    Raises
-    ------
-    DownloadError
-        If the file cannot be downloaded, is not the expected file, or cannot be written.
     """
     _check_address(url)
     with _writing(path), _part(path, sha256) as part:

@@ -58,16 +58,13 @@ def read_table(
 ) -> Iterator[tuple[str, list[str]]]:
     """Yield some columns of a table with a header line.
 
+    Raise `DataError` if the file cannot be read, is larger than 128 MB, is no such table, lacks one
+    of the columns, or has a line that ends before them.
+
     Parameters
     ----------
     delimiter : str
         Field separator.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, is larger than 128 MB, is no such table, lacks one of the
-        columns, or has a line that ends before them.
     """
     lines = csv_records(path, read_text(path, "table", _TABLE_LIMIT), delimiter)
     number, header = next(lines, (1, []))

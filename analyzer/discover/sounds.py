@@ -194,6 +194,8 @@ def read_sounds(  # noqa: PLR0913, PLR0917
 ) -> Iterator[HomeSounds]:
     """Read the sounds of a home; their descriptors stay on disk meanwhile.
 
+    Raise `DataError` if no log has features and labels.
+
     Parameters
     ----------
     progress : callable, optional
@@ -201,11 +203,6 @@ def read_sounds(  # noqa: PLR0913, PLR0917
     groups : Groups, optional
         Groups to match: only embeddings of their space are read. Without groups, the space of
         the last log with embeddings is used.
-
-    Raises
-    ------
-    DataError
-        If no log has features and labels.
     """
     entries = home.between(start, end)
     with (
@@ -347,6 +344,8 @@ def discover(
 ) -> tuple[Groups, Int64, Float64]:
     """Group sounds: assign existing groups, then find new groups among the others.
 
+    Raise `DataError` if the groups use other features, or there are too few sounds to group.
+
     Parameters
     ----------
     groups : Groups or None
@@ -361,11 +360,6 @@ def discover(
         Group row of each sound; `NO_CLUSTER` for a sound without a group.
     points : np.ndarray [shape=(n, d)], float64
         Points of the sounds in the feature space.
-
-    Raises
-    ------
-    DataError
-        If the groups use other features, or there are too few sounds to group.
     """
     count = len(sounds.descriptors)
     if groups is not None and groups.features != sounds.features:
@@ -449,15 +443,12 @@ def group_spans(
 ) -> tuple[dict[str, NamedSpans], list[str]]:
     """Find the sounds of existing groups by microphone; no group is added.
 
+    Raise `DataError` if no log has features and labels, or the groups use other features.
+
     Parameters
     ----------
     progress : callable, optional
         Receives the share of the logs read, 0 to 1.
-
-    Raises
-    ------
-    DataError
-        If no log has features and labels, or the groups use other features.
     """
     with read_sounds(home, ALL, start, end, progress, groups) as sounds:
         _, of, _ = discover(sounds, groups)
@@ -492,15 +483,12 @@ def name_groups(  # noqa: PLR0913, PLR0917
 
     Logs are read one at a time, so a box with little memory can name groups found by another.
 
+    Raise `LogError` if a review layer cannot be read or written.
+
     Parameters
     ----------
     progress : callable, optional
         Receives the share of the logs read, 0 to 1.
-
-    Raises
-    ------
-    LogError
-        If a review layer cannot be read or written.
     """
     marked, losses = dict.fromkeys(names, Marked()), list(home.losses)
     logs = home.between()

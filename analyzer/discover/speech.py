@@ -441,6 +441,8 @@ def _turns(stamps: Int64, voice: Int64) -> tuple[Int64, Int64, Int64]:
 def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoices, Int64]:
     """Find the voices of a home in its conversations.
 
+    Raise `DataError` if there are no earlier voices and too little speech to separate voices.
+
     Parameters
     ----------
     known : HomeVoices or None
@@ -450,11 +452,6 @@ def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoice
     -------
     of : np.ndarray [shape=(n,)], int64
         Home voice row of each conversation voice; `NO_CLUSTER` if none matches.
-
-    Raises
-    ------
-    DataError
-        If there are no earlier voices and too little speech to separate voices.
     """
     if known is None and speech.seconds < LEAST_SECONDS:
         raise DataError(

@@ -407,6 +407,8 @@ def examine(
 ) -> list[Findings]:
     """Check logs, or all logs of folders and their sequence.
 
+    Raise `LogError` if there is neither a log nor a leftover file.
+
     Parameters
     ----------
     progress : callable, optional
@@ -420,11 +422,6 @@ def examine(
     list of Findings
         One for each log, in the order of the paths, intact ones too; then one for each file left
         by a killed recorder or command.
-
-    Raises
-    ------
-    LogError
-        If there is neither a log nor a leftover file.
     """
     paths = [paths] if isinstance(paths, Path) else paths
     logs: dict[Path, Path] = {}

@@ -100,17 +100,14 @@ def detect(
 
     The scores are those of sed_eval, on arrays: a day of labels has too many spans for a loop.
 
+    Raise `DataError` if too many events start together for a labelling.
+
     Parameters
     ----------
     reference, predicted : Events
         From 0 on, as returned by `laid_out`.
     duration : int
         Evaluated time in nanoseconds.
-
-    Raises
-    ------
-    DataError
-        If too many events start together for a labelling.
     """
     return Detections(
         segment_based(reference, predicted, classes),
@@ -168,15 +165,12 @@ def event_based(reference: Events, predicted: Events, classes: Sequence[str]) ->
     at most 0.2 s apart, and their offsets at most 0.2 s or half the length of the reference's,
     whichever is more. As many as possible are matched.
 
+    Raise `DataError` if too many events start together for a labelling.
+
     Parameters
     ----------
     reference, predicted : Events
         From 0 on, as returned by `laid_out`.
-
-    Raises
-    ------
-    DataError
-        If too many events start together for a labelling.
     """
     counts = []
     for label in range(len(classes)):
@@ -324,15 +318,12 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> LabellingDiffere
 
     Synonyms in b (see `hearthlog.models.classes`) take the names of a.
 
+    Raise `DataError` if they have no time in common.
+
     Returns
     -------
     LabellingDifference
         With Cohen's kappa; classes of a first, then classes only in b.
-
-    Raises
-    ------
-    DataError
-        If they have no time in common.
     """
     b = b.called_as(a.classes)
     classes = list(dict.fromkeys([*a.classes, *b.classes]))

@@ -206,16 +206,13 @@ def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     `Labellings.read` skips a damaged log; here it is an error, because scores would not show the
     gap.
 
+    Raise `LogError` if there is no log, if one is damaged, if there are no such segments, if they
+    overlap, or if `topic` is None and there are several microphones.
+
     Parameters
     ----------
     topic : str, optional
         Topic of the segments, such as `/mic/segment`; by default that of the only microphone.
-
-    Raises
-    ------
-    LogError
-        If there is no log, if one is damaged, if there are no such segments, if they overlap, or
-        if `topic` is None and there are several microphones.
     """
     selection = select(with_layers(path))
     topic = _segment_topic(selection, topic)

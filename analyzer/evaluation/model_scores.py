@@ -78,15 +78,13 @@ def evaluate_model(
 ) -> ModelEvaluation:
     """Run a model on clips, and compare its output with their labels.
 
+    Raise `DataError` if the classes of the model are not those of the scenario, or no clip has a
+    segment.
+
     Parameters
     ----------
     progress : callable
         Receives the completed share of the clips, 0 to 1.
-
-    Raises
-    ------
-    DataError
-        If the classes of the model are not those of the scenario, or no clip has a segment.
     """
     require_trained(model)
     scenario = fitted(scenario, model)
@@ -340,18 +338,15 @@ def compare_models(
 
     Sources in the training set of either model are excluded.
 
+    Raise `DataError` if the classes of a model are not those of the scenario, the models are for
+    different feature sets, or there is no segment.
+
     Parameters
     ----------
     recordings : iterable of Recording
         With features of the set of both models.
     scenario : Scenario
         With the classes of both.
-
-    Raises
-    ------
-    DataError
-        If the classes of a model are not those of the scenario, the models are for different
-        feature sets, or there is no segment.
     """
     for model in (a, b):
         require_trained(model)

@@ -138,6 +138,8 @@ def compose(
 ) -> Scene:
     """Place clips over noise, 0.5, 2 or 6 s apart, at most 3 to 10 s of each.
 
+    Raise `DataError` if the scene is too short for a sound.
+
     Parameters
     ----------
     clips : mapping of str to sequence
@@ -148,11 +150,6 @@ def compose(
         As from `background`; overwritten.
     gain : float
         Gain of the clips in dB.
-
-    Raises
-    ------
-    DataError
-        If the scene is too short for a sound.
     """
     rng = random.Random(seed)  # noqa: S311  no secret
 
@@ -178,15 +175,12 @@ def compose_single(  # noqa: PLR0913, PLR0917
 
     Each is the loudest 0.3 s of a clip.
 
+    Raise `DataError` if the scene is too short for a sound.
+
     Parameters
     ----------
     clips : sequence
         At least one.
-
-    Raises
-    ------
-    DataError
-        If the scene is too short for a sound.
     """
     rng = random.Random(seed)  # noqa: S311  no secret
 

@@ -324,16 +324,13 @@ def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> BagIn
 
     Layers are omitted: rosbag2 reads files one after the other.
 
+    Raise `LogError` if the folder or a finished log is missing, a log is damaged, a topic has
+    different types or qualities of service, or the file cannot be written.
+
     Parameters
     ----------
     progress : callable
         Receives the completed share, 0 to 1.
-
-    Raises
-    ------
-    LogError
-        If the folder or a finished log is missing, a log is damaged, a topic has different types
-        or qualities of service, or the file cannot be written.
     """
     if not (is_local(folder) and folder.is_dir()):
         raise LogError(f"{folder}: is no folder of this machine; name that of the logs")

@@ -48,15 +48,13 @@ class CsvFile:
     def write(self, pieces: Sequence[TypedColumns]) -> None:
         """Append messages.
 
+        Raise `LogError` if a value has no column, or the names do not match the elements of an
+        array.
+
         Parameters
         ----------
         pieces : sequence of TypedColumns
             Messages of the table. The first call fixes the number of columns of each array.
-
-        Raises
-        ------
-        LogError
-            If a value has no column, or the names do not match the elements of an array.
         """
         is_first = self._schema is None
         if is_first:

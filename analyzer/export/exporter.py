@@ -168,10 +168,7 @@ def warn_of_changes(tables: Sequence[Table]) -> None:
 def one_table(tables: Sequence[Table], remedy: str) -> Table:
     """Return the only table of a topic, and warn of fields that some messages lack.
 
-    Raises
-    ------
-    LogError
-        If there are several, with the remedy.
+    Raise `LogError` if there are several, with the remedy.
     """
     if len(tables) > 1:
         raise LogError(f"{tables[0].topic}: {_why_apart(tables)}, which is no table; {remedy}")
@@ -213,15 +210,12 @@ class OutputFiles:
     def new(self, stem: str) -> Path:
         """Return the path of a new file in the folder, or of the single file.
 
+        Raise `LogError` if the single file already exists.
+
         Parameters
         ----------
         stem : str
             File name without suffix, in a folder; a number is added if the name is taken.
-
-        Raises
-        ------
-        LogError
-            If the single file already exists.
         """
         path = self.path
         if path.is_dir():
@@ -287,17 +281,15 @@ def write_tables(
 
     Topics that the format cannot hold are skipped with a warning, unless no topic is left.
 
+    Raise `LogError` if a log is damaged, if there is no message, or if the format can hold none of
+    them.
+
     Parameters
     ----------
     progress : callable
         Receives the completed share, 0 to 1.
     type_ : str
         The only message type that is written; empty for any.
-
-    Raises
-    ------
-    LogError
-        If a log is damaged, if there is no message, or if the format can hold none of them.
     """
     writing = _Writing(files, opened, type_)
     selection = selection.decodable()
@@ -487,6 +479,9 @@ def export(
 ) -> int:
     """Write messages in another format.
 
+    Raise `LogError` if a log is damaged, there is no message, the format cannot hold a message, or
+    the output cannot be written; no output is left then.
+
     Parameters
     ----------
     progress : callable
@@ -494,12 +489,6 @@ def export(
     folder : bool
         Write a folder with one file per topic (WAV: per clip); otherwise a single file, of one
         topic if the format is `by_topic`.
-
-    Raises
-    ------
-    LogError
-        If a log is damaged, there is no message, the format cannot hold a message, or the
-        output cannot be written; no output is left then.
     """
     new = new_folder if folder or format_.is_folder else new_file
     with new(output) as temporary:

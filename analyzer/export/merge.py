@@ -145,6 +145,9 @@ def merge_logs(
     Channels of equal topic, definition and metadata become one. Metadata records and attachments
     are copied, equal ones once; the `rosbag2` record is rebuilt.
 
+    Raise `LogError` if a log is damaged, there is no message, there are more channels than a log
+    can have, or the output exists or cannot be written.
+
     Parameters
     ----------
     progress : callable
@@ -153,12 +156,6 @@ def merge_logs(
         Begin with the messages that a late subscriber would still receive: for each transient
         local channel without expiry, the last messages before the span up to its depth, with the
         log time of the first message in the span and their own publish times.
-
-    Raises
-    ------
-    LogError
-        If a log is damaged, there is no message, there are more channels than a log can have,
-        or the output exists or cannot be written.
     """
     with new_file(output) as temporary, temporary.open("xb") as stream:
         return write_log(selection, stream, output.name, progress, latched=latched).repeated
@@ -188,15 +185,13 @@ def write_log(
 ) -> WrittenLog:
     """Write the messages of a selection to a stream, as `merge_logs` does to a file.
 
+    Raise `LogError` if a log is damaged, there is no message, or there are more channels than a log
+    can have.
+
     Parameters
     ----------
     progress : callable
         Receives the completed share, 0 to 1.
-
-    Raises
-    ------
-    LogError
-        If a log is damaged, there is no message, or there are more channels than a log can have.
     """
     batches = selection.messages(progress, once=True)
     first = next(batches, None)

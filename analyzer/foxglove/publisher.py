@@ -92,15 +92,12 @@ Damaged = Callable[[LogError], None]
 class RecordedSpan:
     """Messages of some logs between two times.
 
+    Raise `DataError` if there is no message between the two times.
+
     Parameters
     ----------
     start, end : int or None
         Nanoseconds of UTC; `end` is excluded; None for no limit.
-
-    Raises
-    ------
-    DataError
-        If there is no message between the two times.
     """
 
     def __init__(

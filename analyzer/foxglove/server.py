@@ -66,6 +66,8 @@ class Admission:
     def check(self, head: bytes) -> bytes:
         """Check a request.
 
+        Raise `RefusedError` if the client is not allowed.
+
         Parameters
         ----------
         head : bytes
@@ -75,11 +77,6 @@ class Admission:
         -------
         bytes
             Head of the request for the server behind the gate, without unneeded fields.
-
-        Raises
-        ------
-        RefusedError
-            If the client is not allowed.
         """
         target, fields = _parse(head)
         origin = fields.get("origin")

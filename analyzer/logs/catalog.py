@@ -123,6 +123,8 @@ _TABLES = "folders", "files", "labels"
 class Catalog:
     """The catalogue of a folder: rows of its logs, in memory.
 
+    Raise `sqlite3.Error` or `ValueError` if the data is no catalogue, or is damaged.
+
     Parameters
     ----------
     data : bytes, optional
@@ -131,11 +133,6 @@ class Catalog:
         Errors of the file.
     tables : sequence of str
         The tables to check; the others must not be read.
-
-    Raises
-    ------
-    sqlite3.Error, ValueError
-        If the data is no catalogue, or is damaged.
     """
 
     def __init__(
@@ -429,6 +426,8 @@ def find_spans(
 ) -> LogSpans:
     """Find the logs of some folders with their first and last log times.
 
+    Raise `LogError` if there is no such log, or none in a folder.
+
     Parameters
     ----------
     span_of : callable
@@ -437,11 +436,6 @@ def find_spans(
     start, end : int, optional
         Log times in nanoseconds of UTC, from `start` on, before `end`: outside of this span,
         catalogue rows of finished logs are trusted without a check.
-
-    Raises
-    ------
-    LogError
-        If there is no such log, or none in a folder.
     """
     catalogs: list[Catalog] = []
     unknown: dict[str, Path] = {}

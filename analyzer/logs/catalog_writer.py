@@ -82,16 +82,13 @@ class LogInventory:
 def read_contents(path: Path, labelling: str) -> LogInventory:
     """Read the inventory of a log, without decoding its features.
 
+    Raise `LogError` if the log cannot be read, or a required part is damaged.
+
     Parameters
     ----------
     labelling : str
         `live`, `relabel` or `review`; only segments of this labelling, and of its scenarios, are
         counted.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, or a required part is damaged.
     """
     span = time_span(path)
     with LogFile(path) as file:

@@ -73,6 +73,8 @@ def read_clips(
 ) -> Iterator[tuple[int, int, Float32]]:
     """Read the clips of one topic of a log.
 
+    Raise `LogError` if the log is damaged, if the topic holds no clips, or as `clips_of` does.
+
     Parameters
     ----------
     start, end : int, optional
@@ -87,11 +89,6 @@ def read_clips(
         Samples per second.
     samples : np.ndarray [shape=(n,)], float32
         In full scale, -1 to 1; the mean of all channels.
-
-    Raises
-    ------
-    LogError
-        If the log is damaged, if the topic holds no clips, or as `clips_of` does.
     """
     for clip in _clips(path, name, start, end):
         yield clip.start, clip.rate, _mono(clip)
@@ -164,15 +161,12 @@ def wav_bytes(samples: Float32, rate: int) -> bytes:
 def play_sound(samples: Float32, rate: int, *, wait: bool = False) -> None:
     """Play sound on the default output of the machine.
 
+    Raise `LogError` if there is no output, or PortAudio is missing.
+
     Parameters
     ----------
     wait : bool, optional
         Whether to return at the end of the sound.
-
-    Raises
-    ------
-    LogError
-        If there is no output, or PortAudio is missing.
     """
     try:
         import sounddevice  # noqa: PLC0415  PortAudio may be missing

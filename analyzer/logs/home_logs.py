@@ -224,15 +224,12 @@ def days_in_words(days: Sequence[date]) -> str:
 def check_day(logs: HomeLogs, first: date, last: date, zone: tzinfo) -> None:
     """Check that there is a log on at least one of some days.
 
+    Raise `DataError` if there is no log on any of these days.
+
     Parameters
     ----------
     first, last : date
         Range of days, both included.
-
-    Raises
-    ------
-    DataError
-        If there is no log on any of these days.
     """
     days = logs.days(zone)
     if any(first <= day <= last for day in days):

@@ -119,15 +119,12 @@ def all_classes(
 ) -> tuple[str, ...]:
     """List the possible labels: class names stated by logs, then labels that occur.
 
+    Raise `LogError` if there are more than 100.
+
     Parameters
     ----------
     named : iterable of sequence of str
         Names of the probabilities, per label channel.
-
-    Raises
-    ------
-    LogError
-        If there are more than 100.
     """
     classes = tuple(dict.fromkeys([*(name for names in named for name in names), *labels]))
     if len(classes) > MOST_CLASSES:
@@ -138,15 +135,12 @@ def all_classes(
 def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
     """Check that labels are valid class names, and that no segment begins before 1970.
 
+    Raise `LogError` if a label is no valid class name, or the first start is negative.
+
     Parameters
     ----------
     starts : np.ndarray [shape=(n,)], int64
         Nanoseconds of UTC, ascending.
-
-    Raises
-    ------
-    LogError
-        If a label is no valid class name, or the first start is negative.
     """
     for label in labels:
         if not CLASS_NAME.fullmatch(label):
@@ -239,6 +233,9 @@ class Labellings:
     def find(self, microphone: str, text: str) -> str:
         """Find a labelling by its full or short name.
 
+        Raise `DataError` if the microphone has no such labelling, or if a scenario and a model
+        share the name.
+
         Parameters
         ----------
         microphone : str
@@ -250,11 +247,6 @@ class Labellings:
         -------
         str
             `live`, `review`, `scenario/<name>` or `relabel/<model>`.
-
-        Raises
-        ------
-        DataError
-            If the microphone has no such labelling, or if a scenario and a model share the name.
         """
         names = self.names(microphone)
         layers = [name for name in names if name.startswith(f"{RELABEL}/")]
@@ -283,6 +275,9 @@ class Labellings:
 
         Unreadable parts of a damaged log are skipped and added to `losses`.
 
+        Raise `LogError` if there is no segment in this span of time, if segments overlap, if the
+        first begins before 1970, or if labels are too many or no valid class names.
+
         Parameters
         ----------
         microphone, name : str
@@ -292,12 +287,6 @@ class Labellings:
             is no limit.
         progress : callable, optional
             Called with the share of the logs that is done, 0 to 1.
-
-        Raises
-        ------
-        LogError
-            If there is no segment in this span of time, if segments overlap, if the first begins
-            before 1970, or if labels are too many or no valid class names.
         """
         topic = labelling_topic(microphone, name, "segment")
         labelling = self._labelling(topic, start, end, progress)
@@ -399,6 +388,8 @@ class Labellings:
 def find_labellings(*paths: Path) -> Labellings:
     """Find the labellings of logs and their layers, or of folders of logs.
 
+    Raise `LogError` if there is no log, if no log can be read, or if no log has a message.
+
     Parameters
     ----------
     *paths : Path
@@ -408,11 +399,6 @@ def find_labellings(*paths: Path) -> Labellings:
     -------
     Labellings
         Its `losses` name the unreadable logs.
-
-    Raises
-    ------
-    LogError
-        If there is no log, if no log can be read, or if no log has a message.
     """
     opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
     logs = [log for log in opened if isinstance(log, LabelledFile)]

@@ -87,16 +87,13 @@ def find_timed_files(
 ) -> list[TimedFile]:
     """Find the logs and layers with messages in a span of time.
 
+    Raise `LogError` if there is no such log, or none in a folder.
+
     Parameters
     ----------
     start, end : int, optional
         Nanoseconds of UTC: files that may cover the time from `start` on, before `end`. None for
         no limit.
-
-    Raises
-    ------
-    LogError
-        If there is no such log, or none in a folder.
     """
     files = []
     for path in find_with_layers(paths):

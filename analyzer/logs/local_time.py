@@ -17,15 +17,12 @@ Span = tuple[int, int]
 def home_zone(name: str | None, records: Iterable[Mapping[str, str]] = ()) -> tzinfo:
     """Return the time zone of a home.
 
+    Raise `DataError` if there is no such zone.
+
     Parameters
     ----------
     records : iterable of mapping of str to str
         `hearthlog` records of logs; the first zone in them is used, else UTC.
-
-    Raises
-    ------
-    DataError
-        If there is no such zone.
     """
     if name is not None:
         return _zone(name, "use a name such as Europe/Vienna, or UTC")

@@ -106,15 +106,12 @@ class RecorderInfo:
 def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
     """Read the recorder description of each microphone of a log.
 
+    Raise `LogError` if the log is damaged or has invalid values.
+
     Returns
     -------
     list of RecorderInfo
         Sorted by microphone; empty if the log has no such topic, which is normal for layers.
-
-    Raises
-    ------
-    LogError
-        If the log is damaged or has invalid values.
     """
     with LogFile(path) as file:
         if not file.channels:

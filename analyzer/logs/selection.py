@@ -41,16 +41,13 @@ def decode_types(
 ) -> list[Columns]:
     """Decode the messages of the given types and drop all others.
 
+    Raise `LogError` if a message does not match the type of its channel.
+
     Parameters
     ----------
     types : mapping of str to collection of str
         Paths of the fields to decode, by type name; `is_compatible` defines which fields a type
         may have.
-
-    Raises
-    ------
-    LogError
-        If a message does not match the type of its channel.
     """
     decoded: list[Columns] = []
     try:
@@ -161,6 +158,8 @@ class LogSelection:
     ) -> Iterator[list[RawMessages]]:
         """Read the messages of the selection, still encoded, in order of time.
 
+        Raise `LogError` if a log can no longer be read.
+
         Parameters
         ----------
         progress : callable, optional
@@ -172,11 +171,6 @@ class LogSelection:
         ------
         list of RawMessages
             As `iterate_messages` yields them; damaged chunks are skipped with a warning.
-
-        Raises
-        ------
-        LogError
-            If a log can no longer be read.
         """
         first, last = self.span
         damages = Damages()
@@ -190,10 +184,7 @@ class LogSelection:
     def verify(self) -> None:
         """Compare all chunks with their checksums, before reading messages.
 
-        Raises
-        ------
-        LogError
-            If a chunk is damaged.
+        Raise `LogError` if a chunk is damaged.
         """
         for path in self.logs:
             with LogFile(path) as file:
@@ -239,10 +230,7 @@ class LogSelection:
 
         Undecodable channels are not of ROS 2, or the log has no usable definition of their type.
 
-        Raises
-        ------
-        LogError
-            If no channel is left.
+        Raise `LogError` if no channel is left.
         """
         left: dict[str, Sequence[Described]] = {}
         faults: dict[str, str] = {}
@@ -286,6 +274,9 @@ def select(
 
     A damaged log is left out with a warning, unless there is no other.
 
+    Raise `LogError` if there is no such log, if all logs are damaged, or if a pattern matches no
+    topic.
+
     Parameters
     ----------
     paths : iterable of Path
@@ -295,11 +286,6 @@ def select(
     start, end : int, optional
         Log times in nanoseconds of UTC: from `start` on, before `end`. By default there is no
         limit.
-
-    Raises
-    ------
-    LogError
-        If there is no such log, if all logs are damaged, or if a pattern matches no topic.
     """
     damages: dict[Path, LogError] = {}
 
@@ -437,16 +423,13 @@ def array_names(metadata: Mapping[str, str], field: str) -> list[str]:
 def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, ...]:
     """Return the names of the elements of an array, exactly one per element.
 
+    Raise `LogError` if the field is missing, if there are no names or more than 256, if names are
+    not unique, or if the number of names differs from the number of elements.
+
     Parameters
     ----------
     field : str
         Path of the array in the message, such as `values`.
-
-    Raises
-    ------
-    LogError
-        If the field is missing, if there are no names or more than 256, if names are not unique,
-        or if the number of names differs from the number of elements.
     """
     where = f"{path}: {columns.topic}"
     names = _names(columns.metadata, field)

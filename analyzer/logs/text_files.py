@@ -32,15 +32,12 @@ def without_disarming(text: str) -> str:
 def read_text(path: Path, what: str, size_limit: int) -> str:
     """Read a text file in UTF-8, or in UTF-16 with a byte order mark.
 
+    Raise `DataError` if the file is missing, unreadable, too large, or in another encoding.
+
     Parameters
     ----------
     size_limit : int
         Maximum size in bytes.
-
-    Raises
-    ------
-    DataError
-        If the file is missing, unreadable, too large, or in another encoding.
     """
     raw = read_limited(path, what, size_limit, DataError)
     wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -65,6 +62,9 @@ def numbered_lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
 def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
     """Yield the non-blank records of CSV with their line numbers.
 
+    Raise `DataError` if the text is not CSV, has more than a million lines, or a record of more
+    than 1 MiB.
+
     Parameters
     ----------
     delimiter : str
@@ -74,11 +74,6 @@ def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[i
     ------
     line : int
         First line of the record, from 1.
-
-    Raises
-    ------
-    DataError
-        If the text is not CSV, has more than a million lines, or a record of more than 1 MiB.
     """
     for line, record in csv_rows(path, text, delimiter):
         if isinstance(record, csv.Error):
@@ -91,6 +86,8 @@ def csv_rows(
 ) -> Iterator[tuple[int, list[str] | csv.Error]]:
     """Yield the non-blank records of CSV, or the error of each malformed one.
 
+    Raise `DataError` if the text has more than a million lines, or a record of more than 1 MiB.
+
     Parameters
     ----------
     delimiter : str
@@ -100,11 +97,6 @@ def csv_rows(
     ------
     line : int
         First line of the record, from 1.
-
-    Raises
-    ------
-    DataError
-        If the text has more than a million lines, or a record of more than 1 MiB.
     """
     _check_lines(path, text)
     line, length = 1, 0

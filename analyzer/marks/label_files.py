@@ -37,16 +37,13 @@ _CONTROLS = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # C1 control characters,
 def read_rows(path: Path, choice: Choice) -> Iterator[FileLabel | LineError]:
     """Yield the labels of a file, unconverted.
 
+    Raise `DataError` if the file cannot be read, is too large or no label file, or has no columns
+    or tiers to choose.
+
     Yields
     ------
     FileLabel or LineError
         In the order of the file; an error for each line that is no label.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, is too large or no label file, or has no columns or tiers to
-        choose.
     """
     format_ = find_format(path) or AUDACITY
     text = read_text(path, "label file", format_.size_limit)

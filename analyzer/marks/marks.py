@@ -58,17 +58,14 @@ Row = tuple[Any, ...]
 def read_rows(path: Path) -> dict[Key, list[Row]]:
     """Read a review layer.
 
+    Raise `LogError` if the layer cannot be read, is damaged or cut off, or holds other topics.
+
     Returns
     -------
     dict of (str, str) to list of tuple
         By labelling and type: microphone, start and end in nanoseconds of UTC; then label for
         segments; label, reviewer, made, corrects and reason for marks; reviewer, made, corrects
         and chosen for reviewed spans.
-
-    Raises
-    ------
-    LogError
-        If the layer cannot be read, is damaged or cut off, or holds other topics.
     """
     with LogFile(path) as file:
         complete = file.complete
@@ -207,17 +204,14 @@ class Reviewed(NamedTuple):
 def read_review(log: Path) -> dict[str, Reviewed]:
     """Read all marks and reviewed spans of a log.
 
+    Raise `LogError` if the review layer cannot be read, is damaged or cut off, holds other topics,
+    or has marks that are invalid or overlap.
+
     Returns
     -------
     dict of str to Reviewed
         By scenario, with an empty name for the sounds of the home; empty if there is no review
         layer.
-
-    Raises
-    ------
-    LogError
-        If the review layer cannot be read, is damaged or cut off, holds other topics, or has marks
-        that are invalid or overlap.
     """
     return _read_layer(review_path(log))
 

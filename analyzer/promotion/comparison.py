@@ -151,17 +151,14 @@ def gather_evidence(
 ) -> HomeComparison:
     """Run two models over a sample of a home's recent time, and over its known sounds.
 
+    Raise `ModelError` if the feature set of the models, or a kind of classifier, is not installed.
+
     Parameters
     ----------
     before, after : Model
         Of the same feature set; the second would replace the first.
     progress : callable, optional
         Receives the completed share of the sound, 0 to 1.
-
-    Raises
-    ------
-    ModelError
-        If the feature set of the models, or a kind of classifier, is not installed.
     """
     losses: list[str] = []
     known = reference_sounds(logs, losses)

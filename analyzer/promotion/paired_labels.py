@@ -294,15 +294,12 @@ def find_changed_time(
 ) -> ChangedTime:
     """Run two models over the sample of a home's recent time, as `gather_evidence` does.
 
+    Raise `ModelError` if the feature set of the models, or a kind of classifier, is not installed.
+
     Parameters
     ----------
     progress : callable, optional
         Receives the completed share of the sound, 0 to 1.
-
-    Raises
-    ------
-    ModelError
-        If the feature set of the models, or a kind of classifier, is not installed.
     """
     losses: list[str] = []
     learned = learned_by(before, after, reference_sounds(logs, losses))

@@ -296,18 +296,15 @@ def judge(
 ) -> Verdict:
     """Compare a model with the model that labels a home now, and store the result.
 
+    Raise `ModelError` if the model that labels now cannot be found or used, a feature set is not
+    installed, or the result cannot be written.
+
     Parameters
     ----------
     folder : Path
         Folder of the model; its champion labels now, or else the model of the latest logs.
     progress : callable, optional
         Receives the completed share, 0 to 1.
-
-    Raises
-    ------
-    ModelError
-        If the model that labels now cannot be found or used, a feature set is not installed, or the
-        result cannot be written.
     """
     champion = find_champion(folder, home, model)
     evidence, reasons = None, list[str]()
@@ -343,6 +340,8 @@ def other_features(champion: Model, model: Model) -> str:
 def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | None:
     """Find the model that labels a home now.
 
+    Raise `ModelError` if the model that labelled the latest log is missing.
+
     Parameters
     ----------
     folder : Path
@@ -355,11 +354,6 @@ def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | N
     -------
     Model or None
         None if there are no logs with labels.
-
-    Raises
-    ------
-    ModelError
-        If the model that labelled the latest log is missing.
     """
     with suppress(ModelError):
         champion = load(folder, CHAMPION)

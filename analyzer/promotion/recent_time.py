@@ -195,15 +195,12 @@ class ReferenceSound(NamedTuple):
 def reference(log: Path, following: Sequence[Path] = ()) -> list[ReferenceSound]:
     """Return the sounds of known label of a log.
 
+    Raise `LogError` if its review layer is damaged, or the reviewed labelling is missing.
+
     Returns
     -------
     list of ReferenceSound
         Of half a second or more, sorted by start; sounds of random time first.
-
-    Raises
-    ------
-    LogError
-        If its review layer is damaged, or the reviewed labelling is missing.
     """
     marks, drawn = read_marks(log), _drawn(read_reviewed(log))
     labellings = find_labellings(log, *following[:_FOLLOWING]) if drawn else Labellings([])

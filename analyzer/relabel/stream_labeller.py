@@ -175,15 +175,13 @@ def infos_for_model(
 ) -> tuple[list[RecorderInfo], dict[str, str]]:
     """Find the microphones of a log whose features the model supports.
 
+    Raise `LogError` if none has features of the model's set; an `UnreadableError` if the log is
+    damaged.
+
     Returns
     -------
     infos : list of RecorderInfo
         At least one, sorted by microphone name.
-
-    Raises
-    ------
-    LogError
-        If none has features of the model's set; an `UnreadableError` if the log is damaged.
     """
     infos = [info for info in _read_infos(path) if info.first_frame is not None]
     if not infos:
@@ -206,15 +204,13 @@ def read_sound(
 ) -> Iterator[Features | Gap]:
     """Read the features and gaps of a log.
 
+    Raise `UnreadableError` if it is damaged, or was not written by a recorder, or its feature set
+    is not installed.
+
     Parameters
     ----------
     start, end : int
         Log times, in nanoseconds of UTC; `end` is excluded.
-
-    Raises
-    ------
-    UnreadableError
-        If it is damaged, or was not written by a recorder, or its feature set is not installed.
     """
     try:
         sound = read_recorded(info, start, end, sound_only=True, auxiliary=auxiliary)
@@ -232,15 +228,12 @@ def read_sound(
 def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
     """Save the intact parts of a damaged log to a folder.
 
+    Raise `LogError` if nothing can be saved, or the copy cannot be written.
+
     Returns
     -------
     loss : str
         The unsaved parts; empty if nothing is lost.
-
-    Raises
-    ------
-    LogError
-        If nothing can be saved, or the copy cannot be written.
     """
     source, copy = log, folder / log.name
     if not is_local(log):
@@ -378,16 +371,13 @@ def label_span(
     The labels are those of a recorder as far as 150 s of sound before the span, of which 5 s are
     labelled, and 5 s after it decide them.
 
+    Raise `LogError` if the log is damaged, or was not written by a recorder, or its feature set is
+    not installed.
+
     Parameters
     ----------
     start, end : int
         Nanoseconds of UTC; `end` is excluded.
-
-    Raises
-    ------
-    LogError
-        If the log is damaged, or was not written by a recorder, or its feature set is not
-        installed.
     """
     sound = list(read_sound(info, start - _FLOOR_WARM_UP, end + _SETTLING, auxiliary=True))
     label_from, microphone = start - _SETTLING, info.microphone

@@ -130,16 +130,13 @@ class Player:
     def open(self, info: RecorderInfo) -> None:
         """Continue with another log; restart if it is of another recorder run.
 
+        Raise `LogError` if its feature set is not installed, or differs from the model's, or if the
+        new log cannot be written.
+
         Parameters
         ----------
         info : RecorderInfo
             Of the log; a log that is already open changes nothing.
-
-        Raises
-        ------
-        LogError
-            If its feature set is not installed, or differs from the model's, or if the new log
-            cannot be written.
         """
         if info.path == self._opened:
             return
@@ -182,15 +179,12 @@ class Player:
     def finish(self, *, cut: bool) -> None:
         """Complete the log and the comparison.
 
+        Raise `LogError` if the new log cannot be written.
+
         Parameters
         ----------
         cut : bool
             Whether the recorded sound continues: the last segment then differs from the recording.
-
-        Raises
-        ------
-        LogError
-            If the new log cannot be written.
         """
         self._close()
         if not cut and self._options.kind == "features":

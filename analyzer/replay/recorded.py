@@ -93,6 +93,9 @@ def read_recorded(
 ) -> Iterator[RecordedBatch]:
     """Read a log, one span of time after the other.
 
+    Raise `LogError` if the log is damaged, or was not written by a recorder, or its feature set is
+    not installed.
+
     Parameters
     ----------
     start, end : int
@@ -101,12 +104,6 @@ def read_recorded(
         Read only features and gaps, and verify their checksums.
     auxiliary : bool
         Read the directions of an array and the embeddings of a network, too.
-
-    Raises
-    ------
-    LogError
-        If the log is damaged, or was not written by a recorder, or its feature set is not
-        installed.
     """
     width = features_of(info).width
     kinds = _SOUND_TYPES if sound_only else _TYPES
@@ -284,15 +281,12 @@ class ReplayComparison:
     ) -> None:
         """Count the labels of one span of time.
 
+        Raise `LogError` if a recorded message does not have the type stated by its channel.
+
         Parameters
         ----------
         end : int
             Time at which the replay ended, in nanoseconds of UTC.
-
-        Raises
-        ------
-        LogError
-            If a recorded message does not have the type stated by its channel.
         """
         for absent, same in _by_version(recorded).items():
             old = {time: data for time, data in _recorded(same, absent) if time < end}
@@ -309,6 +303,8 @@ class ReplayComparison:
     ) -> None:
         """Count the segments of one span of time.
 
+        Raise `LogError` if a recorded message does not have the type stated by its channel.
+
         Parameters
         ----------
         replayed : sequence of EncodedMessage
@@ -316,11 +312,6 @@ class ReplayComparison:
             replayed.
         end : int
             End of the last replayed frame, in nanoseconds of UTC: no earlier segment comes after.
-
-        Raises
-        ------
-        LogError
-            If a recorded message does not have the type stated by its channel.
         """
         for absent, same in _by_version(recorded).items():
             self._unmatched.update((time, absent, data) for time, data in _recorded(same, absent))

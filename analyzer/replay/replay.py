@@ -28,6 +28,8 @@ _NEVER = (1 << 63) - 1
 class LogSet:
     """Logs of one microphone, in the order of their first messages.
 
+    Raise `LogError` if they hold no message, or one is damaged.
+
     Parameters
     ----------
     paths : sequence of Path
@@ -39,11 +41,6 @@ class LogSet:
     ----------
     first, last : int
         Log times of the first and the last message, in nanoseconds of UTC.
-
-    Raises
-    ------
-    LogError
-        If they hold no message, or one is damaged.
     """
 
     def __init__(self, paths: Sequence[Path], kind: str, microphone: str | None = None) -> None:
@@ -73,15 +70,12 @@ class LogSet:
     def chosen(self, options: ReplayOptions) -> list[RecorderInfo]:
         """Return the logs to replay.
 
+        Raise `LogError` if there is none, and as `between`.
+
         Returns
         -------
         list of RecorderInfo
             At least one, in the order of their first messages.
-
-        Raises
-        ------
-        LogError
-            If there is none, and as `between`.
         """
         infos = self.between(*self.span(options))
         if not infos:
@@ -102,6 +96,9 @@ class LogSet:
     def between(self, start: int, end: int) -> list[RecorderInfo]:
         """Return the logs that have messages in a span of time.
 
+        Raise `LogError` if they are of several microphones or nodes, or one is damaged or listed
+        twice.
+
         Parameters
         ----------
         start, end : int
@@ -111,11 +108,6 @@ class LogSet:
         -------
         list of RecorderInfo
             In the order of their first messages, without logs that lack the replayed kind.
-
-        Raises
-        ------
-        LogError
-            If they are of several microphones or nodes, or one is damaged or listed twice.
         """
         infos: list[RecorderInfo] = []
         for first, last, path in self._spans:

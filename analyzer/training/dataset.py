@@ -226,6 +226,8 @@ def build_dataset(  # noqa: PLR0913, PLR0917
 ) -> Dataset:
     """Cut clips and recordings of a home into segments of a scenario.
 
+    Raise `DataError` if a class has no segments.
+
     Parameters
     ----------
     progress : callable
@@ -245,11 +247,6 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     -------
     Dataset
         Result of `cut_recordings`.
-
-    Raises
-    ------
-    DataError
-        If a class has no segments.
     """
     of_clips = clip_recordings(clips, scenario, progress, features, rooms, embedder, seed)
     data = cut_recordings(chain(of_clips, home), scenario, features)

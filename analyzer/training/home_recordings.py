@@ -163,15 +163,12 @@ def read_sound_of(
 
     Frames logged coarsely for privacy are dropped: their values are not those of real sound.
 
+    Raise `LogError` if the log or its review layer is damaged.
+
     Parameters
     ----------
     limits : (int, int)
         Start and end of the part, in nanoseconds of UTC. Floor tracking starts ten minutes earlier.
-
-    Raises
-    ------
-    LogError
-        If the log or its review layer is damaged.
     """
     marks, reviewed = read_review(log).get(scenario, ((), ()))
     names = {topic(microphone, "features"): microphone for microphone in sorted(microphones)}
@@ -218,17 +215,14 @@ def with_embeddings(
 ) -> HomeSound:
     """Read the embeddings of a part of a log, if a model uses them.
 
+    Raise `LogError` if the log has embeddings that no recorder writes.
+
     Parameters
     ----------
     limits : (int, int)
         Start and end of the part, in nanoseconds of UTC.
     space : EmbeddingSpace or None
         Embeddings that the model uses; None without embeddings.
-
-    Raises
-    ------
-    LogError
-        If the log has embeddings that no recorder writes.
     """
     name = topic(sound.microphone, "embedding")
     start, end = limits[0] - _AROUND, limits[1] + _AROUND

@@ -304,17 +304,14 @@ def load_scenario(name: str) -> Scenario:
     The file has a table `[classes]`, `name = ["label", ...]`, and may have `ignore = ["label",
     ...]` above it.
 
+    Raise `DataError` if there is no such scenario, or if the file cannot be read, is no TOML, has
+    an unknown key, fewer than 2 classes or more than `MOST_CLASSES`, an invalid name of a class, or
+    one label in two places, or if the labels of a class are no list of texts.
+
     Parameters
     ----------
     name : str
         `bathroom`, `general`, or the path of a `.toml` file, whose stem becomes the name.
-
-    Raises
-    ------
-    DataError
-        If there is no such scenario, or if the file cannot be read, is no TOML, has an unknown
-        key, fewer than 2 classes or more than `MOST_CLASSES`, an invalid name of a class, or one
-        label in two places, or if the labels of a class are no list of texts.
     """
     if name in BUILTIN:
         return BUILTIN[name]

@@ -182,15 +182,12 @@ class Method(ABC):
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """Return this method with other parameters.
 
+        Raise `DataError` if the method has no such parameter.
+
         Parameters
         ----------
         values : mapping of str to float
             By parameter name, as in `parameters`; other parameters are unchanged.
-
-        Raises
-        ------
-        DataError
-            If the method has no such parameter.
         """
         if values:
             raise DataError(f"method {self.name} has no {min(values)} to choose")

@@ -272,15 +272,12 @@ def unreviewed_silence(
 ) -> Iterator[Candidates]:
     """Cut silence out of some logs of the last two weeks.
 
+    Raise `LogError` if there is no log.
+
     Parameters
     ----------
     scenario : str, optional
         Scenario of the labels; empty for the sounds of the home.
-
-    Raises
-    ------
-    LogError
-        If there is no log.
     """
     recent = _recent(folders)
     for place in np.linspace(len(recent) - 1, 0, min(len(recent), _SILENT_LOGS)).round():
@@ -295,6 +292,8 @@ def unreviewed_sounds(
 
     The logs are those of the last two weeks with the longest labelled time of these classes.
 
+    Raise `LogError` if there is no log.
+
     Parameters
     ----------
     scenario : str, optional
@@ -304,11 +303,6 @@ def unreviewed_sounds(
     -------
     list of Recording
         Of one second each, at most 60 of a class.
-
-    Raises
-    ------
-    LogError
-        If there is no log.
     """
     recent = _recent(folders)
     amounts = np.array([_labelled_time(log, names, scenario) for log in recent], np.int64)

@@ -99,6 +99,8 @@ def score(
 ) -> Scores:
     """Compute the scores of predicted classes.
 
+    Raise `DataError` if there is no segment.
+
     Parameters
     ----------
     target, predicted : np.ndarray [shape=(n,)], int
@@ -107,11 +109,6 @@ def score(
         Numbers of the source groups, which are the resampling units of the intervals.
     weight : np.ndarray [shape=(n,)], int64, optional
         Number of segments that a row represents, at least 0; 1 by default.
-
-    Raises
-    ------
-    DataError
-        If there is no segment.
     """
     confusions = _confusions(target, predicted, group, len(classes), weight)
     confusion = confusions.sum(axis=0)
@@ -149,6 +146,8 @@ def difference(
 ) -> F1Difference:
     """Compute the macro F1 of model b minus that of model a on the same segments.
 
+    Raise `DataError` if there is no segment.
+
     Parameters
     ----------
     target : np.ndarray [shape=(n,)], int
@@ -157,11 +156,6 @@ def difference(
         Of the two models; the class with the highest probability is the predicted one.
     group : np.ndarray [shape=(n,)], int
         Numbers of the source groups, which are the resampling units of the interval.
-
-    Raises
-    ------
-    DataError
-        If there is no segment.
     """
     first, second = (
         _confusions(target, probabilities.argmax(axis=1), group, len(classes))

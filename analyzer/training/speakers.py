@@ -115,15 +115,12 @@ def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
 def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32, Indices]:
     """Return the training windows of a sound model as silence or unknown of the scenario.
 
+    Raise `DataError` if the model has not stored training inputs of the kind that the method uses.
+
     Returns
     -------
     (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
         Inputs of windows, and the numbers of their classes.
-
-    Raises
-    ------
-    DataError
-        If the model has not stored training inputs of the kind that the method uses.
     """
     description = model.description
     from hearthlog.analyzer.training.learned_inputs import (  # noqa: PLC0415  needs scikit-learn

@@ -74,10 +74,7 @@ def default_method() -> Method:
 def clip_embedder(method: Method) -> ClipEmbedder | None:
     """Return the clip embedder of a method; None if the method uses no embeddings.
 
-    Raises
-    ------
-    ModelError
-        If the network is unknown, missing, a different file, or unusable.
+    Raise `ModelError` if the network is unknown, missing, a different file, or unusable.
     """
     return network_embedder(method.network, method.seed) if method.network else None
 

@@ -238,6 +238,9 @@ def open_workers(
 ) -> Iterator[Workers]:
     """Open workers; unfinished tasks are given up when the block ends.
 
+    Raise `WorkerError` if Dask is not installed, the scheduler does not exist, it has no workers,
+    or a worker has another version.
+
     Parameters
     ----------
     count : int
@@ -246,12 +249,6 @@ def open_workers(
     module : str, optional
         Name of the module of the tasks: processes start and import it at once, not with the first
         task.
-
-    Raises
-    ------
-    WorkerError
-        If Dask is not installed, the scheduler does not exist, it has no workers, or a worker has
-        another version.
     """
     if scheduler is not None:
         with connected(scheduler) as cluster:

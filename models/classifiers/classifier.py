@@ -96,6 +96,9 @@ class Classifier:
 
     The probabilities of a row do not depend on the rows of the same batch, nor on threads.
 
+    Raise `ModelError` if the model's feature set or kind of classifier is not installed, or cannot
+    be imported.
+
     Parameters
     ----------
     model : Model
@@ -118,11 +121,6 @@ class Classifier:
         None if the model uses no network embeddings.
     names : NamesParameters or None
         Only for a model that labels by the names of a network alone.
-
-    Raises
-    ------
-    ModelError
-        If the model's feature set or kind of classifier is not installed, or cannot be imported.
     """
 
     def __init__(self, model: Model) -> None:

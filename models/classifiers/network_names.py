@@ -198,10 +198,7 @@ def is_by_names(model: Model) -> bool:
 def require_trained(model: Model) -> None:
     """Refuse a model that labels by names where a trained model is required.
 
-    Raises
-    ------
-    ModelError
-        If the model labels by names.
+    Raise `ModelError` if the model labels by names.
     """
     if is_by_names(model):
         raise ModelError(

@@ -210,15 +210,12 @@ _LONGEST_LIST = 64  # characters of names in a message
 class OnnxModel:
     """A network with one input, the samples of a window.
 
+    Raise `ModelError` if onnxruntime is not installed, or the file is not such a network.
+
     Parameters
     ----------
     input_name : str, optional
         Name of the input; empty for the only input.
-
-    Raises
-    ------
-    ModelError
-        If onnxruntime is not installed, or the file is not such a network.
     """
 
     def __init__(

@@ -94,6 +94,8 @@ def band_powers(features: Float32) -> Float64:
 def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     """Compute the values for the inputs `above_floor` from the features of each frame.
 
+    Raise `TypeError` if there are no floors.
+
     Parameters
     ----------
     features : np.ndarray [shape=(n, 21)], float32
@@ -104,11 +106,6 @@ def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     -------
     np.ndarray [shape=(n, 53)], float64
         As from `band_values`.
-
-    Raises
-    ------
-    TypeError
-        If there are no floors.
     """
     return above_floor(features, floors)[0]
 
@@ -119,6 +116,8 @@ def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Flo
     The floor is subtracted from the powers (Berouti, Schwartz and Makhoul, "Enhancement of speech
     corrupted by acoustic noise", 1979). The other values allow no subtraction; the smaller the
     share of energy above the floor, the closer they are moved to the values of silence.
+
+    Raise `TypeError` if there are no floors.
 
     Parameters
     ----------
@@ -132,11 +131,6 @@ def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Flo
         As from `values_above_floor`.
     share : np.ndarray [shape=(n, 1)], float64
         From 0 to 1.
-
-    Raises
-    ------
-    TypeError
-        If there are no floors.
     """
     if floors is None:
         raise TypeError("these inputs need the floor of the room")

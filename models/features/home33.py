@@ -109,6 +109,8 @@ def band_powers(features: Float32) -> Float64:
 def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     """Compute the values for the inputs `above_floor` from the features of each frame.
 
+    Raise `TypeError` if there are no floors.
+
     Parameters
     ----------
     features : np.ndarray [shape=(n, 33)], float32
@@ -120,11 +122,6 @@ def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     np.ndarray [shape=(n, 65)], float64
         The values of `auros21`, then peakiness and flatness, which are closer to their values in
         silence the smaller the share of energy above the floor.
-
-    Raises
-    ------
-    TypeError
-        If there are no floors.
     """
     values, share = auros21.above_floor(features[:, :_WIDTH], floors)
     shape = _OF_SILENCE + share * (features[:, _WIDTH:] - _OF_SILENCE)

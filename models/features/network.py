@@ -124,15 +124,12 @@ def find_card(name: str) -> Path:
 def read_card(path: Path) -> NetworkCard:
     """Read a card.
 
+    Raise `ModelError` if the card cannot be read or is invalid.
+
     Parameters
     ----------
     path : Path
         A file `NAME.toml`; the network is `NAME.onnx` next to it, and is not opened.
-
-    Raises
-    ------
-    ModelError
-        If the card cannot be read or is invalid.
     """
     content = read_toml(path, "card of a network", ModelError)
     network = path.with_suffix(_NETWORK)
@@ -196,16 +193,13 @@ _SOUND_SEED = 20_261_125
 class Network:
     """A network in memory.
 
+    Raise `ModelError` if the file is not the network of the card, its input or output contradicts
+    the card, or onnxruntime is not installed.
+
     Attributes
     ----------
     of_silence : np.ndarray [shape=(width,)], float32
         Embedding of digital silence.
-
-    Raises
-    ------
-    ModelError
-        If the file is not the network of the card, its input or output contradicts the card, or
-        onnxruntime is not installed.
     """
 
     def __init__(self, card: NetworkCard) -> None:

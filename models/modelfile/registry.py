@@ -144,16 +144,14 @@ class ModelEntry:
 def list_models(folder: Path) -> list[ModelEntry]:
     """Load every model of a folder and the starter models; list the targets of broken aliases too.
 
+    Raise `ModelError` if the path is not a folder, or an alias is not a link to a model file in the
+    folder.
+
     Returns
     -------
     list of ModelEntry
         Sorted by name; an unusable entry has a `problem`. Only the starter models if the folder
         does not exist.
-
-    Raises
-    ------
-    ModelError
-        If the path is not a folder, or an alias is not a link to a model file in the folder.
     """
     if os.path.lexists(folder):
         _check_folder(folder)
@@ -170,15 +168,12 @@ def list_models(folder: Path) -> list[ModelEntry]:
 def target(folder: Path, alias: str) -> str | None:
     """Return the name of an alias's target.
 
+    Raise `ModelError` if the alias exists but is not a link to a model file in the folder.
+
     Returns
     -------
     str or None
         None if there is no such alias. The target need not exist.
-
-    Raises
-    ------
-    ModelError
-        If the alias exists but is not a link to a model file in the folder.
     """
     link = _path(folder, alias)
     if not os.path.lexists(link):
@@ -195,16 +190,13 @@ def target(folder: Path, alias: str) -> str | None:
 def resolve(folder: Path, name: str) -> str:
     """Resolve a model name or an alias to the name of a model.
 
+    Raise `ModelError` if the alias does not exist or is not a link to a model file, or the name
+    points outside the folder.
+
     Parameters
     ----------
     name : str
         Name of a model or of its file, or an alias. The model need not exist.
-
-    Raises
-    ------
-    ModelError
-        If the alias does not exist or is not a link to a model file, or the name points outside the
-        folder.
     """
     name = name.removesuffix(SUFFIX)
     if name in ALIASES:
@@ -220,16 +212,13 @@ def resolve(folder: Path, name: str) -> str:
 def load(folder: Path, name: str) -> Model:
     """Load a model of a folder, or a starter model.
 
+    Raise `ModelError` if the folder does not exist, or `resolve` or `load_model` refuses the model.
+
     Parameters
     ----------
     name : str
         Name of a model or of its file, or an alias; without such a file, a starter model or
         `audioset`.
-
-    Raises
-    ------
-    ModelError
-        If the folder does not exist, or `resolve` or `load_model` refuses the model.
     """
     stem = name.removesuffix(SUFFIX)
     if stem in {*STARTERS, AUDIOSET} and not os.path.lexists(_path(folder, stem)):

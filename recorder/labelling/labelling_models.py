@@ -77,16 +77,13 @@ class ModelChange(NamedTuple):
 class LabellingModels:
     """The models of some microphones, and their possible replacements.
 
+    Raise `ConfigurationError` if a scenario's model is for another feature set, or two models
+    except the candidate label the same class.
+
     Parameters
     ----------
     watch : ModelWatch or None
         Source of the live models; None for no labels.
-
-    Raises
-    ------
-    ConfigurationError
-        If a scenario's model is for another feature set, or two models except the candidate label
-        the same class.
     """
 
     def __init__(

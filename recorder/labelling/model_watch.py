@@ -60,6 +60,8 @@ class ReloadRequests:
 class ModelWatch:
     """Checks in a thread every second whether a model file was replaced.
 
+    Raise `ModelError` if the model at the start cannot be used.
+
     Parameters
     ----------
     path : Path
@@ -75,11 +77,6 @@ class ModelWatch:
         Name of the starter model at the start; empty for a file.
     ready : Loaded or None
         The last replacement; the user sets it to None.
-
-    Raises
-    ------
-    ModelError
-        If the model at the start cannot be used.
     """
 
     def __init__(

@@ -426,16 +426,14 @@ def _frames_in(layer: Path, start: int, end: int) -> int:
 class ClipRecorder:
     """Writes the clips of a recording, if configured, and always deletes old clips.
 
+    Raise `ConfigurationError` if sound is to be kept and a model lacks a class that must not be
+    kept.
+
     Parameters
     ----------
     file_at : callable
         Maps a time in nanoseconds of UTC to the log that contains it and the end of that log; see
         `RollingLog.file_at`.
-
-    Raises
-    ------
-    ConfigurationError
-        If sound is to be kept and a model lacks a class that must not be kept.
     """
 
     def __init__(

@@ -80,6 +80,8 @@ def active_logs(root: Path, node: str) -> list[Path]:
 def complete_log(active: Path) -> list[Recovered]:
     """Complete one log as `recover_active` does.
 
+    Raise `LogError` or `OSError` if it cannot be read or completed.
+
     Parameters
     ----------
     active : Path
@@ -89,11 +91,6 @@ def complete_log(active: Path) -> list[Recovered]:
     -------
     list of Recovered
         Zero or one.
-
-    Raises
-    ------
-    LogError, OSError
-        If it cannot be read or completed.
     """
     if not active.exists():
         return []

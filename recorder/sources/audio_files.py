@@ -41,6 +41,10 @@ class FileSource:
 
     Trailing samples that do not fill a frame are dropped.
 
+    Raise `SourceError` if a file is missing, is not audio, is empty, has an unsupported sample
+    rate, other channels than the array, or not the selected one; if the times are out of the range
+    of a log.
+
     Parameters
     ----------
     start : int
@@ -56,12 +60,6 @@ class FileSource:
         Selected channel, counted from 1.
     progress : callable
         Called with the share of the sound read so far, 0 to 1.
-
-    Raises
-    ------
-    SourceError
-        If a file is missing, is not audio, is empty, has an unsupported sample rate, other channels
-        than the array, or not the selected one; if the times are out of the range of a log.
     """
 
     def __init__(  # noqa: PLR0913
@@ -298,15 +296,12 @@ def find_audio(
 ) -> tuple[list[Path], list[str]]:
     """Replace folders by the audio files in them and their subfolders.
 
+    Raise `SourceError` if a folder has no readable audio.
+
     Returns
     -------
     list of Path
         Files of a folder in the order of their names, without hidden ones.
-
-    Raises
-    ------
-    SourceError
-        If a folder has no readable audio.
     """
     found: list[Path] = []
     refused: list[str] = []

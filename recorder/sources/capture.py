@@ -191,16 +191,14 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
 def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Device:
     """Find a microphone by its name.
 
+    Raise `DeviceError` if there is no microphone, or none or several match; then the message lists
+    all of them.
+
     Parameters
     ----------
     name : str
         A case-insensitive name or part of one; or a port or serial number in the form of
         `UsbPlace`; empty for the default microphone.
-
-    Raises
-    ------
-    DeviceError
-        If there is no microphone, or none or several match; then the message lists all of them.
     """
     if not devices:
         raise DeviceError(closed_card() or _NO_MICROPHONE)

@@ -382,6 +382,9 @@ def read_audio(  # noqa: PLR0913
     Channels are averaged, unless they cancel or hide each other; then the best channel is used.
     Other rates are resampled. Samples that are not finite are NaN.
 
+    Raise `SourceError` if the file is missing, is not audio, is empty, or has a sample rate below 1
+    kHz or above 768 kHz.
+
     Parameters
     ----------
     start, end : float
@@ -398,12 +401,6 @@ def read_audio(  # noqa: PLR0913
     ------
     np.ndarray [shape=(n,) or (n, channels)], float32
         Samples in full scale, -1 to 1, at 16 kHz.
-
-    Raises
-    ------
-    SourceError
-        If the file is missing, is not audio, is empty, or has a sample rate below 1 kHz or above
-        768 kHz.
     """
     mix = finite_or_nan if channels is not None else ChannelMixer(channel, chosen)
     with open_audio(path) as audio:
@@ -418,6 +415,8 @@ def read_audio(  # noqa: PLR0913
 def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
     """Convert samples of any rate and channel count; bit-equal to reading an audio file.
 
+    Raise `SourceError` if the shape, the type or the rate is not supported.
+
     Parameters
     ----------
     sound : np.ndarray [shape=(n,) or (n, channels)]
@@ -429,11 +428,6 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
     -------
     np.ndarray [shape=(m,)], float32
         Same as `read_audio`, in one piece.
-
-    Raises
-    ------
-    SourceError
-        If the shape, the type or the rate is not supported.
     """
     sound = np.asarray(sound)
     if sound.ndim not in {1, 2} or sound.dtype.kind not in "if":
@@ -452,17 +446,14 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
 def check_channels(path: Path, channels: int | None, channel: int | None = None) -> None:
     """Check that an audio file has the channels of an array, or a selected channel.
 
+    Raise `SourceError` if the channels do not match; also as `open_audio`.
+
     Parameters
     ----------
     channels : int or None
         Channels of the array; None allows any number.
     channel : int or None
         Selected channel, counted from 1; None allows any.
-
-    Raises
-    ------
-    SourceError
-        If the channels do not match; also as `open_audio`.
     """
     with open_audio(path) as audio:
         if channel is not None and channel > audio.channels:

@@ -103,6 +103,8 @@ def file_time(
     The sources are, in this order: the name of the file, its metadata (AudioMoth's comment, GUANO,
     Broadcast Wave), its modification time minus its length, as recorders close a file at its end.
 
+    Raise `SourceError` if the file is unreadable, or its name does not match the pattern.
+
     Parameters
     ----------
     zone : tzinfo
@@ -112,11 +114,6 @@ def file_time(
     has_zone : bool or None
         Whether a dash and four digits after a time are a zone, unless the name decides it; None
         (unknown): they are a number.
-
-    Raises
-    ------
-    SourceError
-        If the file is unreadable, or its name does not match the pattern.
     """
     if not path.exists():
         raise SourceError(f"{path}: no such file")

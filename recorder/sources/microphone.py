@@ -67,6 +67,9 @@ class MicrophoneSource:
 
     After the first successful start only the same device is used again, or the fallback.
 
+    Raise `SourceError` if this machine cannot capture microphones, or cannot capture this one and
+    `waits` is false; if an address is invalid.
+
     Parameters
     ----------
     device : str
@@ -87,12 +90,6 @@ class MicrophoneSource:
     device : str
         Name of the current or last device; before that, as given. Without the user and the password
         of an address.
-
-    Raises
-    ------
-    SourceError
-        If this machine cannot capture microphones, or cannot capture this one and `waits` is false;
-        if an address is invalid.
     """
 
     def __init__(  # noqa: PLR0913

@@ -112,6 +112,8 @@ class Capture:
     def blocks(self, timeout: float) -> list[SampleBlock] | None:
         """Return the blocks that have arrived.
 
+        Raise `DeviceError` if the process has ended with a reason.
+
         Parameters
         ----------
         timeout : float
@@ -121,11 +123,6 @@ class Capture:
         -------
         list of SampleBlock or None
             In the order of their samples, may be empty; None if the process has ended.
-
-        Raises
-        ------
-        DeviceError
-            If the process has ended with a reason.
         """
         if not self._wait(timeout):
             return []

@@ -116,16 +116,13 @@ class ArrayGeometry:
 def array_geometry(positions: Sequence[Sequence[float]]) -> ArrayGeometry:
     """Check the microphone positions of an array.
 
+    Raise `ConfigurationError` if the number of microphones is out of range, a position is invalid
+    or used twice, or the distances are too small or too large for direction finding.
+
     Parameters
     ----------
     positions : sequence of sequence of float
         [x, y] or [x, y, z] of each channel's microphone, in metres.
-
-    Raises
-    ------
-    ConfigurationError
-        If the number of microphones is out of range, a position is invalid or used twice, or the
-        distances are too small or too large for direction finding.
     """
     count = len(positions)
     if not 2 <= count <= MOST_MICROPHONES:

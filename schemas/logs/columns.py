@@ -126,6 +126,9 @@ def read_columns(  # noqa: PLR0913
 ) -> dict[str, Columns]:
     """Read topics of logs as one series per topic.
 
+    Raise `LogError` if a log cannot be read or is damaged, or two logs have different types on one
+    topic.
+
     Parameters
     ----------
     logs : iterable of Path
@@ -145,11 +148,6 @@ def read_columns(  # noqa: PLR0913
         By topic, without topics that have no messages. If the files of a topic differ in metadata
         or fields, only the common entries are kept. Undecodable messages are skipped with a
         `HearthlogWarning`, as in `decode_readable`.
-
-    Raises
-    ------
-    LogError
-        If a log cannot be read or is damaged, or two logs have different types on one topic.
     """
     logs = list(logs)
     unlimited = start is None and end is None
@@ -173,6 +171,8 @@ def iterate_columns(  # noqa: PLR0913
 ) -> Iterator[list[Columns]]:
     """Read topics of logs piece by piece.
 
+    Raise `LogError` if a log cannot be read or is damaged.
+
     Parameters
     ----------
     start, end : int, optional
@@ -184,11 +184,6 @@ def iterate_columns(  # noqa: PLR0913
         The next span of time: one item for each topic with messages in it, or more if its channels
         differ in type, fields or metadata. No message is older than those yielded before.
         Undecodable messages are skipped with a `HearthlogWarning`, as in `decode_readable`.
-
-    Raises
-    ------
-    LogError
-        If a log cannot be read or is damaged.
     """
     function = partial(decode_readable, fields=fields)
     pieces = iterate_pieces(logs, topics, start, end, function, on_damage=on_damage)
@@ -197,6 +192,9 @@ def iterate_columns(  # noqa: PLR0913
 
 def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
     """Decode messages into one `Columns` for each topic, type, set of fields and metadata.
+
+    Raise `LogError` if messages are not of the type of their channel, or not encoded as CDR, or the
+    definition of the type cannot be parsed.
 
     Parameters
     ----------
@@ -208,12 +206,6 @@ def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = Non
     -------
     list of Columns
         In the order of their first messages in `messages`.
-
-    Raises
-    ------
-    LogError
-        If messages are not of the type of their channel, or not encoded as CDR, or the definition
-        of the type cannot be parsed.
     """
     return _joined([_decode(raw, fields) for raw in messages])
 
@@ -357,15 +349,12 @@ def _with_valid_times(columns: Columns) -> Columns:
 def join(parts: Sequence[Columns]) -> Columns:
     """Concatenate pieces of one topic, with the fields that all pieces have.
 
+    Raise `LogError` if the pieces have different types.
+
     Parameters
     ----------
     parts : sequence of Columns
         At least one, in order of time.
-
-    Raises
-    ------
-    LogError
-        If the pieces have different types.
     """
     builder = _ColumnBuilder()
     for part in parts:

@@ -224,15 +224,12 @@ def as_metadata(contents: LogContents) -> dict[str, str] | None:
 def stated_contents(file: LogFile) -> LogContents | None:
     """Read the contents record of a finished log.
 
+    Raise `LogError` if the file cannot be read, or its last metadata record is damaged.
+
     Returns
     -------
     Contents or None
         None without a record, or if it contradicts the statistics: the messages must be counted.
-
-    Raises
-    ------
-    LogError
-        If the file cannot be read, or its last metadata record is damaged.
     """
     places = [place for place in file.record_locations if place.opcode == Opcode.METADATA]
     if file.statistics is None or not places or places[-1].length > _LARGEST + _ROOM:

@@ -62,15 +62,12 @@ CUT = "_cut"  # ends the name, without suffix, of a file cut from a log
 def check_node_name(name: str) -> str:
     """Return the name of a node if it is valid at the start of a file name on all systems.
 
+    Raise `LogError` if the name has another form.
+
     Parameters
     ----------
     name : str
         At most 64 letters, digits, '-' and '_'; the first is a letter or a digit.
-
-    Raises
-    ------
-    LogError
-        If the name has another form.
     """
     if not is_node_name(name):
         raise LogError(
@@ -190,6 +187,9 @@ def is_log(path: Path) -> bool:
 def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
     """List the logs in a folder, or a single log, including active ones.
 
+    Raise `LogError` if there is no log, this user may not read it, the path is a pipe, a socket or
+    a device, or the store of the path cannot be used.
+
     Parameters
     ----------
     path : Path
@@ -202,12 +202,6 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
     list of Path
         Logs and layers, sorted by name. Unreadable logs in the folder are skipped with a
         `HearthlogWarning`.
-
-    Raises
-    ------
-    LogError
-        If there is no log, this user may not read it, the path is a pipe, a socket or a device, or
-        the store of the path cannot be used.
     """
     every = _find_local(path) if is_local(path) else _find_stored(path)
     depth = len(path.parts)
@@ -352,15 +346,12 @@ _SIZE_LIMIT = 1 << 20  # maximum bytes of the records of one kind
 def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
     """Return the first and the last log time of a log.
 
+    Raise `LogError` if the log cannot be read, is not an MCAP file, or is damaged.
+
     Returns
     -------
     tuple of int, or None
         The two log times in nanoseconds of UTC; None if the log has no messages.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, is not an MCAP file, or is damaged.
     """
     stated = stated_span(path)
     if stated is not None:
@@ -372,16 +363,13 @@ def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
 def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
     """Return the first and the last log time of a log from its statistics only.
 
+    Raise `LogError` if the log cannot be read.
+
     Returns
     -------
     tuple or None
         A pair of log times in nanoseconds of UTC, or None without messages, in a tuple. None if
         the log is unfinished or its index is damaged: only a scan finds its span.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read.
     """
     try:
         _, opened = open_log(path)

@@ -150,6 +150,8 @@ def follow_messages(  # noqa: PLR0913
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
     """Read the encoded messages of logs as they are written; as `follow` does.
 
+    Raise `LogError` if the folder does not exist, or any error that `damaged` raises.
+
     Parameters
     ----------
     start : int, optional
@@ -173,11 +175,6 @@ def follow_messages(  # noqa: PLR0913
     messages : list of RawMessages
         Messages written to the log since the last time; possibly empty, as after each log that is
         not being written, to return control to the caller.
-
-    Raises
-    ------
-    LogError
-        If the folder does not exist, or any error that `damaged` raises.
     """
     stop = stop or Event()
     if not folder.is_dir():

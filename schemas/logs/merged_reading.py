@@ -55,16 +55,13 @@ def time_spans(
 ) -> list[tuple[int, int, Path]]:
     """Return the first and the last log time of each log with messages.
 
+    Raise `LogError` if a log cannot be read, is not an MCAP file, or is damaged.
+
     Parameters
     ----------
     span_of : callable
         Called with a log; returns its first and last log time in nanoseconds of UTC, or None
         without messages.
-
-    Raises
-    ------
-    LogError
-        If a log cannot be read, is not an MCAP file, or is damaged.
     """
     paths = list(logs)
     pairs = zip(map_logs(span_of, paths), paths, strict=True)
@@ -164,6 +161,8 @@ def iterate_messages(  # noqa: PLR0913
 ) -> Iterator[list[RawMessages]]:
     """Read the encoded messages of several logs.
 
+    Raise `LogError` if a log cannot be read, is not an MCAP file, or is damaged.
+
     Parameters
     ----------
     start, end : int, optional
@@ -176,11 +175,6 @@ def iterate_messages(  # noqa: PLR0913
     list of RawMessages
         Messages of the next span of time, one or more items for each channel with messages in it.
         No message is older than those yielded before.
-
-    Raises
-    ------
-    LogError
-        If a log cannot be read, is not an MCAP file, or is damaged.
     """
     query = _query(topics, start, end)._replace(on_damage=on_damage, once=once)
     return _iterate(logs, query, list)
@@ -198,6 +192,9 @@ def iterate_pieces(  # noqa: PLR0913
 ) -> Iterator[list[Piece]]:
     """Apply a function to the messages of each span of time, in the reader threads.
 
+    Raise `LogError` if a log cannot be read, is not an MCAP file, or is damaged; also any error of
+    `function`.
+
     Parameters
     ----------
     topics : collection of str, callable or None
@@ -211,11 +208,6 @@ def iterate_pieces(  # noqa: PLR0913
     ------
     list of Piece
         Results of the next span of time; none is older than those yielded before.
-
-    Raises
-    ------
-    LogError
-        If a log cannot be read, is not an MCAP file, or is damaged; also any error of `function`.
     """
     query = _query(topics, start, end)._replace(every=every, on_damage=on_damage)
     return _iterate(logs, query, function)

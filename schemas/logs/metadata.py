@@ -46,15 +46,12 @@ def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
 
     A record of a newer version causes a `HearthlogWarning`.
 
+    Raise `LogError` if a record is damaged.
+
     Returns
     -------
     list of mapping of str to str
         One record, or those of all merged logs; empty if the file is not from hearthlog.
-
-    Raises
-    ------
-    LogError
-        If a record is damaged.
     """
     records = provenance_records(file)
     for record in records:
@@ -353,15 +350,12 @@ def log_digest(log: Path) -> str:
     The end of a log contains its index, or the end of it, and the checksum of the index. It
     identifies the log without reading all of it.
 
+    Raise `LogError` if the log cannot be read, or is not an MCAP file.
+
     Returns
     -------
     str
         64 hexadecimal digits.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, or is not an MCAP file.
     """
     with LogFile(log, indexed=False) as file:
         size = file.size

@@ -93,15 +93,12 @@ class ChunkRow:
 def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     """Return the row of a chunk, or of a message outside of chunks, from the start of its record.
 
+    Raise `McapError` if the head is too short, or a size is 2**63 or more.
+
     Returns
     -------
     ChunkRow
         Without channels; `index_length` is 0 for a chunk and -1 for a message.
-
-    Raises
-    ------
-    McapError
-        If the head is too short, or a size is 2**63 or more.
     """
     opcode, offset, length = location
     try:
@@ -212,15 +209,12 @@ def read_records(
 ) -> Iterator[tuple[RecordLocation, bytes]]:
     """Read the records of a section one by one.
 
+    Raise `McapError` if a record is longer than the section, or than `LIMIT`.
+
     Parameters
     ----------
     start, end : int
         Byte range of the section.
-
-    Raises
-    ------
-    McapError
-        If a record is longer than the section, or than `LIMIT`.
     """
     with io.BufferedReader(Section(file, start), 1 << 20) as stream:
         while start < end:

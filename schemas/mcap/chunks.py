@@ -70,6 +70,9 @@ def read_chunks(
 ) -> list[RawMessages]:
     """Read the messages of the selected topics from chunks of a log.
 
+    Raise `LogError` if the log cannot be read, a chunk is damaged, an index does not match its
+    chunk, or no undamaged chunk defines the channel of a message.
+
     Parameters
     ----------
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
@@ -77,12 +80,6 @@ def read_chunks(
     topics : collection of str or callable, optional
         Topics to read, or a predicate: None for all; empty for none, which only adds
         definitions.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, a chunk is damaged, an index does not match its chunk, or no
-        undamaged chunk defines the channel of a message.
     """
     chunks = in_parts(file, chunks)
     apart = (chunks["part"] >= 0) | (chunks["size"] > LIMIT)
@@ -157,6 +154,9 @@ def read_in_batches(
 ) -> Iterator[list[RawMessages]]:
     """Read chunks as `read_chunks` does, in batches of `BATCH_SIZE`.
 
+    Raise `LogError` if the log cannot be read, a chunk is damaged, an index does not match its
+    chunk, or no undamaged chunk defines the channel of a message.
+
     Parameters
     ----------
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
@@ -164,12 +164,6 @@ def read_in_batches(
     topics : collection of str or callable, optional
         Topics to read, or a predicate: None for all; empty for none, which only adds
         definitions.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, a chunk is damaged, an index does not match its chunk, or no
-        undamaged chunk defines the channel of a message.
     """
     chunks = in_parts(file, chunks, on_damage)
     batches = np.cumsum(chunks["size"] + chunks["length"]) // BATCH_SIZE
@@ -185,6 +179,8 @@ def in_parts(
 ) -> NDArray[np.void]:
     """Split chunks larger than `LIMIT` into parts, and verify the checksums of these chunks.
 
+    Raise `LogError` if the log cannot be read, or a large chunk is damaged.
+
     Parameters
     ----------
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
@@ -193,11 +189,6 @@ def in_parts(
     -------
     np.ndarray [shape=(m,)], of dtype `CHUNKS`
         Sorted by start time if any chunk was split; a message larger than `LIMIT` is a part.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, or a large chunk is damaged.
     """
     large = (chunks["part"] < 0) & (chunks["index_length"] >= 0)
     large &= (chunks["size"] > LIMIT) | (chunks["length"] > LIMIT)
@@ -305,15 +296,13 @@ def _part_content(file: LogFile, offset: int, first: int, size: int) -> bytes:
 def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
     """Verify the checksums of chunks.
 
+    Raise `LogError` if the log cannot be read, a chunk is damaged, or a record behind one is no
+    message index.
+
     Parameters
     ----------
     chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
         Rows of `file.chunks`.
-
-    Raises
-    ------
-    LogError
-        If the log cannot be read, a chunk is damaged, or a record behind one is no message index.
     """
     for _ in read_in_batches(file, chunks, topics=()):
         pass

@@ -280,6 +280,8 @@ def most_content(length: Any) -> Any:
 class ContentStream:
     """Stream of the decompressed records of a chunk.
 
+    Raise `McapError` if there is no chunk at the offset, or it is larger than hearthlog reads.
+
     Parameters
     ----------
     read : callable
@@ -291,11 +293,6 @@ class ContentStream:
     ----------
     position : int
         Number of uncompressed bytes read.
-
-    Raises
-    ------
-    McapError
-        If there is no chunk at the offset, or it is larger than hearthlog reads.
     """
 
     def __init__(self, read: Read, offset: int) -> None:
@@ -381,17 +378,14 @@ def _decompressing(compression: bytes, source: io.BufferedReader) -> Any:
 def stated_size(compression: bytes, data: bytes) -> int | None:
     """Return the decompressed size stated by compressed data; None if there is none.
 
+    Raise `McapError` if no such data begin there.
+
     Parameters
     ----------
     compression : bytes
         `zstd`, `lz4`, or empty.
     data : bytes
         The first 32 bytes of the data, or more.
-
-    Raises
-    ------
-    McapError
-        If no such data begin there.
     """
     try:
         if compression == b"zstd":

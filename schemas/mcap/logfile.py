@@ -84,6 +84,8 @@ class _Lost:
 class LogFile:
     """Log, open for reading.
 
+    Raise `LogError` if the file cannot be read, is not an MCAP file, or is damaged.
+
     Parameters
     ----------
     indexed : bool
@@ -106,11 +108,6 @@ class LogFile:
         Whether there may be messages with log times after `LAST_TIME`, which are skipped.
     statistics : mcap.records.Statistics or None
         None without a valid index or statistics.
-
-    Raises
-    ------
-    LogError
-        If the file cannot be read, is not an MCAP file, or is damaged.
     """
 
     def __init__(self, path: Path, *, indexed: bool = True, partial: bool = False) -> None:
@@ -177,40 +174,31 @@ class LogFile:
     def read(self, offset: int, length: int) -> bytes:
         """Read bytes at an offset.
 
-        Raises
-        ------
-        LogError
-            If the file cannot be read.
+        Raise `LogError` if the file cannot be read.
         """
         return self._file.read(offset, length)
 
     def read_into(self, out: memoryview, offset: int) -> None:
         """Read bytes at an offset into a buffer.
 
+        Raise `LogError` if the file cannot be read.
+
         Parameters
         ----------
         out : memoryview
             Filled from its start; partly at the end of the file.
-
-        Raises
-        ------
-        LogError
-            If the file cannot be read.
         """
         self._file.read_into(out, offset)
 
     def record(self, location: RecordLocation) -> McapRecord | None:
         """Read a metadata record, an attachment, or another record without messages.
 
+        Raise `LogError` if the record is larger than `LIMIT`, damaged, or cannot be read.
+
         Returns
         -------
         McapRecord or None
             None for a chunk, a message, a message index, or a kind that MCAP does not define.
-
-        Raises
-        ------
-        LogError
-            If the record is larger than `LIMIT`, damaged, or cannot be read.
         """
         if location.length > LIMIT:
             what = "an attachment" if location.opcode == Opcode.ATTACHMENT else "a record"
@@ -409,16 +397,13 @@ class LogFile:
     def scan_new(self) -> NDArray[np.void]:
         """Scan the records that were written since the last scan.
 
+        Raise `LogError` if a record is damaged, or the file cannot be read.
+
         Returns
         -------
         np.ndarray [shape=(n,)], of dtype `CHUNKS`
             New chunks and runs of messages outside of chunks, by start time. They are also added to
             `chunks`.
-
-        Raises
-        ------
-        LogError
-            If a record is damaged, or the file cannot be read.
         """
         rows = array("q")
         if self.partial:

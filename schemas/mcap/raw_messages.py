@@ -127,6 +127,8 @@ def iterate_records(
 ) -> Iterator[tuple[int, int, int]]:
     """Iterate over the records in the content of a chunk.
 
+    Raise `McapError` if the last record is incomplete, or longer than the content.
+
     Parameters
     ----------
     start : int
@@ -138,11 +140,6 @@ def iterate_records(
     ------
     start, end : int
         Range of the record in the content, including its opcode.
-
-    Raises
-    ------
-    McapError
-        If the last record is incomplete, or longer than the content.
     """
     last = len(content) if end is None else end
     unpack = HEAD.unpack_from

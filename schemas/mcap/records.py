@@ -237,15 +237,12 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
 def begun_chunk_head(content: bytes | memoryview) -> ChunkHead:
     """Read the head of a chunk from the start of its content, without checks.
 
+    Raise `McapError` if the content is too short.
+
     Parameters
     ----------
     content : bytes-like
         Chunk record without opcode and length, at least up to its compressed records.
-
-    Raises
-    ------
-    McapError
-        If the content is too short.
     """
     try:
         start, end, size, crc, length = CHUNK.unpack_from(content)
@@ -261,15 +258,12 @@ def begun_chunk_head(content: bytes | memoryview) -> ChunkHead:
 def decompress(head: ChunkHead, content: bytes | memoryview) -> bytes:
     """Decompress the records of a chunk, and verify their checksum.
 
+    Raise `McapError` if the compression is unknown, or the data are damaged.
+
     Returns
     -------
     bytes
         Concatenated records: `head.size` bytes.
-
-    Raises
-    ------
-    McapError
-        If the compression is unknown, or the data are damaged.
     """
     out = bytearray(head.size)
     decompress_into(memoryview(out), head, content)
@@ -279,15 +273,12 @@ def decompress(head: ChunkHead, content: bytes | memoryview) -> bytes:
 def decompress_into(out: memoryview, head: ChunkHead, content: bytes | memoryview) -> None:
     """Decompress the records of a chunk into a buffer, and verify their checksum.
 
+    Raise `McapError` if the compression is unknown, or the data are damaged.
+
     Parameters
     ----------
     out : memoryview
         Exactly `head.size` bytes.
-
-    Raises
-    ------
-    McapError
-        If the compression is unknown, or the data are damaged.
     """
     try:
         size = _DECOMPRESS[head.compression](content[head.data], out)

@@ -35,6 +35,9 @@ def encode_groups(
 ) -> Iterator[tuple[Indices, NDArray[np.void]]]:
     """Encode `count` messages from one column per field.
 
+    Raise `LogError` if the type is unknown, an array of messages in it is not empty, or a message
+    would be larger than 100 MiB.
+
     Parameters
     ----------
     columns : mapping from field path, such as "header.frame_id", to its values
@@ -49,12 +52,6 @@ def encode_groups(
         Indices of messages with equal string lengths.
     payloads : np.ndarray [shape=(m,)], of a structured dtype
         Payloads, identical to those of the typestore.
-
-    Raises
-    ------
-    LogError
-        If the type is unknown, an array of messages in it is not empty, or a message would be
-        larger than 100 MiB.
     """
     kind = message_type(typename)
     arrays: dict[str, NDArray[Any]] = {}
@@ -177,6 +174,8 @@ def decode_rows(  # noqa: PLR0913
 ) -> Fields:
     """Decode messages of one type into one column per field.
 
+    Raise `LogError` if a payload does not match the type, or a string in it is not UTF-8.
+
     Parameters
     ----------
     buffer : np.ndarray [shape=(b,)], uint8
@@ -191,11 +190,6 @@ def decode_rows(  # noqa: PLR0913
     -------
     dict of str to np.ndarray [shape=(n, ...)]
         By field path, as in `Columns`; arrays of any length have no elements if n is 0.
-
-    Raises
-    ------
-    LogError
-        If a payload does not match the type, or a string in it is not UTF-8.
     """
     parts = [
         (rows, _decode(layout.leaves, block, fields, undecodable))
@@ -226,6 +220,8 @@ def rows_by_layout(
 ) -> Iterator[tuple[Layout, Indices, NDArray[np.void]]]:
     """Group messages of one type by layout.
 
+    Raise `LogError` if a payload does not match the type.
+
     Parameters
     ----------
     buffer : np.ndarray [shape=(b,)], uint8
@@ -242,11 +238,6 @@ def rows_by_layout(
         Indices of the messages with the layout.
     payloads : np.ndarray [shape=(m,)], of the dtype of the layout
         Copy of the messages.
-
-    Raises
-    ------
-    LogError
-        If a payload does not match the type.
     """
     for size, rows in _by_size(sizes):
         payloads = gather(buffer, offsets[rows], size)

@@ -80,6 +80,8 @@ def _type(base: str) -> str:
 def common_fields(definitions: Sequence[Mapping[str, Field]]) -> dict[str, Field]:
     """Return the union of the fields of several definitions of a type, widened to fit all.
 
+    Raise `LogError` if no number type holds all values of a field, or the kinds of a field differ.
+
     Parameters
     ----------
     definitions : sequence of mapping of str to Field
@@ -89,11 +91,6 @@ def common_fields(definitions: Sequence[Mapping[str, Field]]) -> dict[str, Field
     -------
     dict of str to Field
         By path: fields of the first definition in its order, then additional fields of others.
-
-    Raises
-    ------
-    LogError
-        If no number type holds all values of a field, or the kinds of a field differ.
     """
     common = dict(definitions[0])
     for fields in definitions[1:]:
@@ -137,16 +134,13 @@ def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
 
     Fields appended to hearthlog types do not count: they have defaults.
 
+    Raise `LogError` if the definition contains itself, refers to an undefined type, or is too
+    large, or ROS 2 and hearthlog have no type of this name.
+
     Returns
     -------
     list of str
         Sorted.
-
-    Raises
-    ------
-    LogError
-        If the definition contains itself, refers to an undefined type, or is too large, or ROS 2
-        and hearthlog have no type of this name.
     """
     theirs, ours = fields_of(kind), fields_of(message_type(kind.name))
     return sorted(p for p in paths if p not in theirs or not _fits(theirs[p], ours.get(p)))

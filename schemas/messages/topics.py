@@ -114,15 +114,12 @@ def check_microphone_name(name: str) -> str:
 def check_scenario_name(name: str) -> str:
     """Return the name of a scenario if it is valid in a ROS topic.
 
+    Raise `LogError` if the name has another form.
+
     Parameters
     ----------
     name : str
         Same form as a microphone name, up to 64 characters.
-
-    Raises
-    ------
-    LogError
-        If the name has another form.
     """
     if len(name) > _LONGEST_SCENARIO or not re.fullmatch(_MICROPHONE, name):
         raise LogError(

@@ -364,15 +364,12 @@ class MessageType:
     def layout_of(self, payload: memoryview, words: dict[int, bytes] | None = None) -> Layout:
         """Find the layout of an encoded message.
 
+        Raise `LogError` if the payload is not plain CDR, or not of this type.
+
         Parameters
         ----------
         payload : memoryview
             CDR of either byte order.
-
-        Raises
-        ------
-        LogError
-            If the payload is not plain CDR, or not of this type.
         """
         words = {} if words is None else words
         words[0] = bytes(payload[:2])
@@ -401,16 +398,13 @@ class MessageType:
     def layout_for(self, lengths: Mapping[str, int]) -> Layout:
         """Return the layout of a little-endian message with given string and sequence lengths.
 
+        Raise `LogError` if the type is not defined, contains itself, or has a field of an
+        unsupported type, or the message would be larger than 100 MiB or have too many fields.
+
         Parameters
         ----------
         lengths : mapping of str to int
             By field path: bytes of a string, with its end, or number of elements of a sequence.
-
-        Raises
-        ------
-        LogError
-            If the type is not defined, contains itself, or has a field of an unsupported type, or
-            the message would be larger than 100 MiB or have too many fields.
         """
         key = tuple(lengths.items())
         if key not in self._made:
@@ -426,17 +420,15 @@ class MessageType:
 def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageType:
     """Parse the definition of a message type.
 
+    Raise `LogError` if the encoding is unknown, or the text is larger than 256 KiB or cannot be
+    parsed.
+
     Parameters
     ----------
     encoding : str
         `ros2msg` or `ros2idl`; empty for the built-in definition of ROS 2 or hearthlog.
     text : bytes
         Definition in that encoding, in UTF-8; other bytes are allowed in comments only.
-
-    Raises
-    ------
-    LogError
-        If the encoding is unknown, or the text is larger than 256 KiB or cannot be parsed.
     """
     ours = {key: fields for key, (_, fields) in store_of(name).fielddefs.items()}
     theirs = {key: fields for key, (_, fields) in defined_types(name, encoding, text).items()}

@@ -131,17 +131,14 @@ Whole = IntactChunk | LargeChunk | IntactAttachment | UnknownRecord
 def split_content(content: bytes) -> tuple[Int64, Int64]:
     """Find the offsets of messages and definitions in a chunk.
 
+    Raise `McapError` if a record is damaged, or not allowed in a chunk.
+
     Returns
     -------
     messages : np.ndarray [shape=(m,)], int64
         Offsets of messages in the content, at their opcodes, ascending.
     definitions : np.ndarray [shape=(d,)], int64
         Offsets of schemas and channels, likewise.
-
-    Raises
-    ------
-    McapError
-        If a record is damaged, or not allowed in a chunk.
     """
     messages, definitions = array("q"), array("q")
     kind, shortest = int(Opcode.MESSAGE), MESSAGE.size
@@ -206,15 +203,12 @@ def _with_records(
 def read_definitions(content: bytes, starts: Int64) -> tuple[list[Definition], list[str]]:
     """Read the schemas and channels of a chunk.
 
+    Raise `McapError` if one is damaged, or there are more than 524288.
+
     Parameters
     ----------
     starts : np.ndarray [shape=(d,)], int64
         Offsets in the content, at their opcodes.
-
-    Raises
-    ------
-    McapError
-        If one is damaged, or there are more than 524288.
     """
     if len(starts) > _DEFINITIONS_LIMIT:
         raise McapError("a chunk holds more definitions than can be kept")

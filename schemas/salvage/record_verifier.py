@@ -86,10 +86,7 @@ class RecordVerifier:
     def read(self, offset: int, length: int) -> bytes:
         """Read bytes at an offset.
 
-        Raises
-        ------
-        LogError
-            If the file cannot be read.
+        Raise `LogError` if the file cannot be read.
         """
         data = self._file.read(offset, max(min(length, self.end - offset), 0))
         self.work += len(data)
@@ -98,15 +95,12 @@ class RecordVerifier:
     def head(self, offset: int) -> tuple[int, int]:
         """Read the opcode and the length of a record, without checks.
 
+        Raise `McapError` if the file ends within opcode and length.
+
         Returns
         -------
         length : int
             Stated size of its content, in bytes.
-
-        Raises
-        ------
-        McapError
-            If the file ends within opcode and length.
         """
         data = self.read(offset, HEAD.size)
         if len(data) < HEAD.size:
@@ -117,6 +111,8 @@ class RecordVerifier:
     def ends(self, offset: int, kind: int | None = None) -> tuple[int, int]:
         """Find the end of a record by its length, and by its inner lengths.
 
+        Raise `McapError` if the file ends within opcode and length.
+
         Returns
         -------
         outer : int
@@ -124,11 +120,6 @@ class RecordVerifier:
         inner : int
             Offset of the end by the inner lengths. Equal to `outer` for a message or an invalid
             record; `UNKNOWN` if the file ends before one of these lengths.
-
-        Raises
-        ------
-        McapError
-            If the file ends within opcode and length.
         """
         opcode, length = self.head(offset)
         outer = offset + HEAD.size + length
@@ -173,6 +164,8 @@ class RecordVerifier:
     def intact(self, offset: int, chained: int = 1) -> IntactRecord:
         """Read a complete record.
 
+        Raise `McapError` if there is no record at the offset, or it is incomplete.
+
         Parameters
         ----------
         offset : int
@@ -180,11 +173,6 @@ class RecordVerifier:
         chained : int
             Number of plausible records required behind a message outside of chunks, which has no
             other check. Counting ends at the first record that is no message.
-
-        Raises
-        ------
-        McapError
-            If there is no record at the offset, or it is incomplete.
         """
         opcode, length = self.head(offset)
         if opcode == Opcode.CHUNK:
@@ -228,10 +216,7 @@ class RecordVerifier:
     def chunk(self, offset: int) -> IntactRecord:
         """Read a chunk with a verified content, whatever its head states.
 
-        Raises
-        ------
-        McapError
-            If there is no chunk at the offset, or its content cannot be verified.
+        Raise `McapError` if there is no chunk at the offset, or its content cannot be verified.
         """
         name = HEAD.size + CHUNK.size  # offset of the compression name
         head = self.read(offset, name + 4 + UINT64.size)
@@ -440,17 +425,14 @@ class RecordVerifier:
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
         """Read a message index.
 
+        Raise `McapError` if there is no message index, or it is damaged.
+
         Returns
         -------
         entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
             Entries with log times up to `LAST_TIME`.
         end : int
             Offset of its end.
-
-        Raises
-        ------
-        McapError
-            If there is no message index, or it is damaged.
         """
         if self.head(offset)[0] != Opcode.MESSAGE_INDEX:
             raise McapError("here should be a message index")

@@ -61,6 +61,8 @@ class _Places(NamedTuple):
 class Salvage:
     """Reader of the undamaged pieces of a truncated or damaged MCAP file.
 
+    Raise `LogError` if the file cannot be read.
+
     Attributes
     ----------
     unnamed : dict of int to tuple
@@ -72,11 +74,6 @@ class Salvage:
         Number of bytes passed by `pieces` so far.
     escaped : dict of str
         Names found so far that are not UTF-8, or of records with other texts that are not.
-
-    Raises
-    ------
-    LogError
-        If the file cannot be read.
     """
 
     def __init__(self, path: Path, definitions: Iterable[Definition] = ()) -> None:

@@ -120,6 +120,8 @@ class ClipLibrary:
     def sound(self, clip: HomeClip, frames: int) -> Float32:
         """Return a clip at a common loudness, cut or repeated to a length.
 
+        Raise `SimulationError` if the recording is damaged.
+
         Parameters
         ----------
         frames : int
@@ -129,11 +131,6 @@ class ClipLibrary:
         -------
         np.ndarray [shape=(frames * FRAME_SAMPLES,)], float32
             Its loud frames have a mean square of 1; the ends are faded.
-
-        Raises
-        ------
-        SimulationError
-            If the recording is damaged.
         """
         samples = self._decoded(clip.name, lambda: _decode(clip))
         sound = _extended(samples, frames * FRAME_SAMPLES)

@@ -60,15 +60,12 @@ def attenuation(room: str, microphone: str) -> float:
 class Rooms:
     """The acoustics of a home from the position of a microphone.
 
+    Raise `SimulationError` if there is no such room.
+
     Attributes
     ----------
     floor : np.ndarray [shape=(PERIOD_FRAMES, FRAME_SAMPLES)], float32
         Periodic noise of the room.
-
-    Raises
-    ------
-    SimulationError
-        If there is no such room.
     """
 
     def __init__(self, microphone: str, seed: int) -> None:

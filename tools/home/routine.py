@@ -197,15 +197,12 @@ class Habits:
 def plan_days(days: int, library: ClipLibrary, habits: Habits) -> HomePlan:
     """Plan days from midnight to midnight.
 
+    Raise `SimulationError` if `days` or the seed is out of range.
+
     Parameters
     ----------
     days : int
         From 1 to 3660. Fewer days give the beginning of more.
-
-    Raises
-    ------
-    SimulationError
-        If `days` or the seed is out of range.
     """
     if not 1 <= days <= MOST_DAYS:
         raise SimulationError(f"a home is simulated for 1 to {MOST_DAYS} days, not {days}")
@@ -479,17 +476,14 @@ def plan_short_day(minutes: float, library: ClipLibrary, seed: int) -> HomePlan:
     A shorter day has less silence between the sounds, and then fewer of them (10 minutes hold about
     three quarters of what 24 do).
 
+    Raise `SimulationError` if `minutes` or `seed` lies beyond its limits.
+
     Parameters
     ----------
     minutes : float
         At least a frame, at most 1440.
     seed : int
         Not negative.
-
-    Raises
-    ------
-    SimulationError
-        If `minutes` or `seed` lies beyond its limits.
     """
     frames = round(minutes * 60.0 / FRAME_SECONDS) if 0 < minutes <= _MAX_MINUTES else 0
     if frames < 1:

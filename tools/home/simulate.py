@@ -270,6 +270,9 @@ _CLIP_SECONDS = (3.0, 5.0)
 def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
     """Write clips of 3 to 5 s of every sound, and a manifest of them.
 
+    Raise `SimulationError` if the folder is not empty or cannot be written, or if one of the
+    numbers is too low.
+
     Parameters
     ----------
     folder : Path
@@ -284,11 +287,6 @@ def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
     Path
         `manifest.csv` in the folder: path (relative to the folder), label, source_group (one per
         clip), source, licence, seconds.
-
-    Raises
-    ------
-    SimulationError
-        If the folder is not empty or cannot be written, or if one of the numbers is too low.
     """
     if clips_per_class < 1:
         raise SimulationError(f"a training set has at least 1 clip a class, not {clips_per_class}")

@@ -336,6 +336,9 @@ class RoomTone:
 def synthesize(label: str, seconds: float, seed: int) -> Float32:
     """Synthesise one sound, with the room's background noise.
 
+    Raise `SimulationError` if there is no such sound, its duration is out of range, or the seed is
+    negative.
+
     Parameters
     ----------
     seconds : float
@@ -347,11 +350,6 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
     -------
     np.ndarray [shape=(n,)], float32
         Full scale is -1 to 1, at 16 kHz.
-
-    Raises
-    ------
-    SimulationError
-        If there is no such sound, its duration is out of range, or the seed is negative.
     """
     samples = round(seconds * SAMPLE_RATE) if 0 < seconds <= _MAX_SECONDS else 0
     if samples < 1:
@@ -363,15 +361,12 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
 def generator(*seed: int) -> np.random.Generator:
     """Return the random generator of a seed.
 
+    Raise `SimulationError` if one of them is negative.
+
     Parameters
     ----------
     *seed : int
         A seed, and further integers that distinguish its uses. None is negative.
-
-    Raises
-    ------
-    SimulationError
-        If one of them is negative.
     """
     if min(seed) < 0:
         raise SimulationError(f"a seed is a whole number from 0, not {min(seed)}")
@@ -380,6 +375,8 @@ def generator(*seed: int) -> np.random.Generator:
 
 def dry_sound(label: str, samples: int, rng: np.random.Generator) -> Float64:
     """Synthesise one sound without the room; its ends are faded.
+
+    Raise `SimulationError` if there is no such sound.
 
     Parameters
     ----------
@@ -390,11 +387,6 @@ def dry_sound(label: str, samples: int, rng: np.random.Generator) -> Float64:
     -------
     np.ndarray [shape=(samples,)], float64
         Full scale is -1 to 1, at 16 kHz.
-
-    Raises
-    ------
-    SimulationError
-        If there is no such sound.
     """
     if label not in _SOUNDS:
         raise SimulationError(f"no sound is called {label!r}; there are {', '.join(LABELS)}")

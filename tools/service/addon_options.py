@@ -157,15 +157,12 @@ def read_options(file: Path) -> AddonOptions:
 def find_broker(options: AddonOptions, supervisor: str, token: str) -> AddonBroker:
     """Return the broker of the options, or else the one that the Supervisor knows.
 
+    Raise `BrokerError` if there is none, with the reason.
+
     Parameters
     ----------
     supervisor : str
         Address of the Supervisor's API.
-
-    Raises
-    ------
-    BrokerError
-        If there is none, with the reason.
     """
     if options.mqtt_host:
         port = options.mqtt_port or 1883
@@ -201,15 +198,12 @@ def write_configuration(
 ) -> None:
     """Write the configuration, the broker's password, and the definitions of the inputs.
 
+    Raise `ConfigurationError` if the user's file or a value is wrong; the files are then as before.
+
     Parameters
     ----------
     account : str or None
         Account that runs the services; None for this one.
-
-    Raises
-    ------
-    ConfigurationError
-        If the user's file or a value is wrong; the files are then as before.
     """
     own = folders.own_keys
     text = ""

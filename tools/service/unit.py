@@ -89,15 +89,12 @@ def bridge_unit(
 ) -> str:
     """Return the unit of the bridge as a system service.
 
+    Raise `ServiceError` if a unit cannot contain one of the names.
+
     Parameters
     ----------
     account : str or None
         User that runs the service; None for a user created by systemd.
-
-    Raises
-    ------
-    ServiceError
-        If a unit cannot contain one of the names.
     """
     own = f"DynamicUser=yes\nSupplementaryGroups={recorder}"
     # The bridge waits for a folder that does not exist yet.
@@ -212,15 +209,13 @@ def is_packaged(name: str) -> bool:
 def check_unit(unit: Path, verb: str, config: Path, folder: Path | None) -> None:
     """Check that an existing unit starts this installation, for a configuration and a folder.
 
+    Raise `ServiceError` if it starts another installation, or a user's service records in another
+    folder.
+
     Parameters
     ----------
     folder : Path or None
         Of a user's service.
-
-    Raises
-    ------
-    ServiceError
-        If it starts another installation, or a user's service records in another folder.
     """
     if not unit.exists():
         return

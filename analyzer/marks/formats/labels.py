@@ -216,15 +216,13 @@ def with_point(number: str) -> str:
 def add_seconds(where: str, start: str, duration: str) -> str:
     """Return the end of a label from its start and duration.
 
+    Raise `LineError` if a value is no number, or has more than 10 digits before the point or 18
+    after it.
+
     Parameters
     ----------
     start, duration : str
         Decimal numbers of seconds, with or without an exponent.
-
-    Raises
-    ------
-    LineError
-        If a value is no number, or has more than 10 digits before the point or 18 after it.
     """
     return f"{_seconds(where, start) + _seconds(where, duration):f}"
 

@@ -28,15 +28,12 @@ _NO_TASK = "unreadable task"
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
     """Yield the items of a Label Studio JSON export or import file.
 
+    Raise `DataError` if the text is not JSON.
+
     Yields
     ------
     FileLabel or LineError
         In the order of the file; an error for each entry that is no task.
-
-    Raises
-    ------
-    DataError
-        If the text is not JSON.
     """
     try:
         # Numbers stay text, so that no digits are lost and no length is too large.

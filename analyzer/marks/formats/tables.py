@@ -57,16 +57,13 @@ def read_table(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | Li
     The field separator is the most frequent of tab, semicolon and comma in the first line. Unless
     it is the comma, numbers may have decimal commas.
 
+    Raise `DataError` if required columns are missing or ambiguous, or if the text has too many or
+    too long lines.
+
     Parameters
     ----------
     choice : Choice
         Columns by name, or by number from 1 if the first line has no names.
-
-    Raises
-    ------
-    DataError
-        If required columns are missing or ambiguous, or if the text has too many or too long
-        lines.
     """
     first = _first_line(text)
     delimiter = max("\t;,", key=first.count)
