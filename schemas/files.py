@@ -358,21 +358,7 @@ class StoredFile:
         return read[offset % _BLOCK :][: max(end - offset, 0)]
 
     def read_into(self, out: memoryview, offset: int) -> int:
-        """Read bytes at an offset into a buffer.
-
-        Raise `LogError` if the store does not answer, refuses, or returns another number of bytes,
-        for example because the file has changed.
-
-        Parameters
-        ----------
-        out : memoryview
-            Filled from its start; its length is the number of bytes to read.
-
-        Returns
-        -------
-        int
-            Number of bytes read: less than the buffer length at the end of the file.
-        """
+        """Read bytes at an offset into a buffer, as `LocalFile.read_into`."""
         read = self.read(offset, len(out))
         out[: len(read)] = read
         return len(read)

@@ -82,17 +82,7 @@ class Findings:
         offset: int | None = None,
         time: int | None = None,
     ) -> None:
-        """Add an incomplete part or a loss.
-
-        Parameters
-        ----------
-        advice : str
-            What to do; empty if `what` is sufficient.
-        offset : int, optional
-            Byte of the file at which the record begins.
-        time : int, optional
-            Log time in nanoseconds of UTC.
-        """
+        """Add an incomplete part or a loss, as `error`."""
         self._add(Finding(self.path, "warning", rule, what, advice, offset, time))
 
     def rows(  # noqa: PLR0913

@@ -203,21 +203,7 @@ class StatisticsStream:
         self._values = None
 
     def __call__(self, features: Float32, floors: Float64 | None = None) -> Float32:
-        """Compute the inputs at successive frames.
-
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-        floors : np.ndarray [shape=(n, b)], float64, optional
-            Floor of the room at each frame, from `FloorTracker`; inputs that need it raise
-            TypeError without.
-
-        Returns
-        -------
-        np.ndarray [shape=(m, width)], float32
-            At the last m of these frames: frames with a complete window since the start or the last
-            restart.
-        """
+        """Compute the inputs at successive frames, as `InputStream`."""
         kind, length = self._inputs, self._inputs.window_frames
         values = kind.values_of(features, floors)
         if self._values is not None:

@@ -152,19 +152,7 @@ def read_in_batches(
     topics: TopicChoice | None = None,
     on_damage: OnDamage | None = None,
 ) -> Iterator[list[RawMessages]]:
-    """Read chunks as `read_chunks` does, in batches of `BATCH_SIZE`.
-
-    Raise `LogError` if the log cannot be read, a chunk is damaged, an index does not match its
-    chunk, or no undamaged chunk defines the channel of a message.
-
-    Parameters
-    ----------
-    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        Rows of `file.chunks`.
-    topics : collection of str or callable, optional
-        Topics to read, or a predicate: None for all; empty for none, which only adds
-        definitions.
-    """
+    """Read chunks as `read_chunks` does, in batches of `BATCH_SIZE`."""
     chunks = in_parts(file, chunks, on_damage)
     batches = np.cumsum(chunks["size"] + chunks["length"]) // BATCH_SIZE
     for batch in np.split(chunks, np.flatnonzero(np.diff(batches)) + 1):
