@@ -236,16 +236,31 @@ def test_minutes_and_events_are_those_of_the_segments_that_a_recorder_wrote(reco
         if name != "silence":
             assert 0 < day.count(name).labelled <= len(own)
     text = text_of(page_of(recorded, tmp_path, start))
-    assert "Less than an hour of " in text
+    assert re.search(r"day from [0-2]\d:\d\d to [0-2]\d:\d\d: ", text)
     assert not re.search("of these: [^.]*not sure", text)
 
 
-def test_the_headline_and_the_text_name_the_same_length_of_what_was_recorded(tmp_path):
-    missing = [(at("10:00"), 0.5, "overrun")]  # of the only hour
-    write_day(tmp_path, DAY, [(at("10:30"), 60, "speech", 0.8)], hours=[10], gaps=missing)
-    text = text_of(page_of(tmp_path, tmp_path))
-    assert "Only 1 of the 24 hours of Sunday was recorded." in text
-    assert "Recorded: 1 h 00 min of the day" in text
+def text_beside_picture(page):
+    return text_of(re.sub(r"<desc.*?</desc>", "", page))
+
+
+def test_what_is_missing_of_a_day_is_stated_once_and_why_below(tmp_path):
+    write_day(tmp_path, DAY, [(at("10:30"), 60, "speech", 0.8)], hours=[10])
+    text = text_beside_picture(page_of(tmp_path, tmp_path))
+    assert "Sunday from 10:00 to 11:00: talking. The other 23 hours were not recorded." in text
+    assert "In the rest of the day the recorder was off, or its logs are not here." in text
+    for again in ("Recorded:", "Not recorded:", "The report knows nothing", "Most of the sound"):
+        assert again not in text
+
+
+def test_the_reason_of_a_gap_is_below_the_headline_that_counts_its_hours(tmp_path):
+    gap = (at("10:00"), 2 * HOUR, "silent")
+    write_day(tmp_path, DAY, hours=range(8, 14), gaps=[gap])
+    text = text_beside_picture(page_of(tmp_path, tmp_path))
+    assert "In the 4 recorded hours of Sunday: nothing but quiet. The other 20 hours were" in text
+    assert "The recorder was off for 18 h 00 min of the time not recorded, or its logs" in text
+    assert "2 h 00 min, once (10:00 to 12:00)" in text
+    assert "Not recorded:" not in text
 
 
 # What nobody listened to
@@ -270,8 +285,9 @@ def test_of_a_day_that_was_hardly_heard_nothing_is_said_not_to_have_been(tmp_pat
     assert text.count("Too little was recorded to tell anything.") == 1, "of the night"
     assert "was quiet" not in text
     assert (
-        "1 of the 24 hours of Sunday was recorded. By the sound of it, one bout of coughing" in text
-    )
+        "Sunday from 12:00 to 13:00: talking. By the sound of it, one bout of coughing by day "
+        "(12:05). The other 23 hours were not recorded."
+    ) in text
 
 
 @pytest.mark.parametrize(("last", "known"), [(16, False), (18, True)])
@@ -449,13 +465,57 @@ def test_a_day_is_quiet_if_at_most_six_of_its_hours_have_five_minutes_of_sound(
     ("hours", "text"),
     [
         (range(5, 24), "Sunday was quiet, as far as it was recorded (19 of 24 hours)."),
-        (range(6, 18), "Only 12 of the 24 hours of Sunday were recorded."),
-        ([*range(8), *range(13, 24)], "Only 19 of the 24 hours of Sunday were recorded."),
+        (
+            range(6, 18),
+            "Sunday from 06:00 to 18:00: nothing but quiet. The other 12 hours were not recorded.",
+        ),
+        (
+            [*range(8), *range(13, 24)],
+            (
+                "In the 19 recorded hours of Sunday: nothing but quiet. The other 5 hours were not "
+                "recorded."
+            ),
+        ),
     ],
 )
 def test_a_day_is_not_called_quiet_where_nobody_listened(tmp_path, hours, text):
     write_day(tmp_path / "logs", DAY, hours=hours)
     assert headline(tmp_path / "logs", tmp_path) == text
+
+
+_TALK, _SONG = (at("22:10"), 300, "speech", 0.9), (at("22:20"), 900, "music", 0.9)
+_CLATTER = (at("23:20"), 40, "objects_activity", 0.9)
+
+
+@pytest.mark.parametrize(
+    ("hours", "sounds", "text"),
+    [
+        ([22, 23], [_TALK, _SONG, _CLATTER], "from 22:00 to 24:00: music, talking and household"),
+        ([22, 23], [(at("22:10"), 20, "speech", 0.9)], "from 22:00 to 24:00: under 1 min of sound"),
+        ([22, 23], [(at("22:10"), 240, "unknown", 0.4)], "from 22:00 to 24:00: 4 min of sound."),
+        ([3, 22], [_TALK], "In the recorded 2 h 00 min of Sunday: talking. The other 22 hours"),
+    ],
+)
+def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
+    tmp_path, hours, sounds, text
+):
+    write_day(tmp_path / "logs", DAY, sounds, hours=hours)
+    assert text in headline(tmp_path / "logs", tmp_path)
+
+
+def test_a_minute_of_a_day_is_no_hour_and_leaves_the_rest_of_the_day(tmp_path):
+    rest = [(at("10:00") + edge, 1500, "gone") for edge in (0, 2100)]
+    write_day(tmp_path / "logs", DAY, hours=[10], gaps=rest)
+    assert headline(tmp_path / "logs", tmp_path) == (
+        "Sunday from 10:25 to 10:35: nothing but quiet. The rest of the day was not recorded."
+    )
+
+
+def test_what_is_beside_a_television_does_not_describe_the_recorded_time(tmp_path):
+    talking = [(at("22:10") + 20 * i, 15, "speech", 0.9) for i in range(60)]
+    clatter = [(second + 15, 5, "objects_activity", 0.9) for second, *_ in talking[10:40]]
+    write_day(tmp_path / "logs", DAY, [*talking, *clatter], hours=[22])
+    assert headline(tmp_path / "logs", tmp_path).startswith("Sunday from 22:00 to 23:00: talking.")
 
 
 def test_a_week_has_a_headline_of_its_days(tmp_path):
@@ -498,6 +558,41 @@ def test_the_picture_has_a_title_and_tells_in_words_what_it_shows(tmp_path):
     assert page.count('role="img"') == 1
     assert '<title id="picture-title">The sounds of Sunday, 1 March 2026</title>' in page
     assert '<desc id="picture-text">Coughing 2. Not recorded: 20:00 to 00:00.</desc>' in page
+
+
+@pytest.mark.parametrize(
+    ("hours", "text"),
+    [
+        ([18, 19], "Only 18:00 to 21:00 is shown."),
+        ([0], "Only 00:00 to 03:00 is shown."),
+        ([23], "Only 21:00 to 24:00 is shown."),
+        ([8, 15], "Only 08:00 to 16:00 is shown."),
+        (range(8, 17), "From midnight to midnight."),
+        ([3, 22], "From midnight to midnight."),
+    ],
+)
+def test_the_picture_covers_the_hours_of_a_recording_of_at_most_a_third_of_the_day(
+    tmp_path, hours, text
+):
+    write_day(tmp_path / "logs", DAY, hours=hours)
+    assert text in text_of(page_of(tmp_path / "logs", tmp_path))
+
+
+def test_the_png_of_an_evening_is_as_wide_as_its_hours(tmp_path):
+    events = [(at("18:00"), HOUR, "music", 1.0), (at("20:00"), HOUR, "crying", 1.0)]
+    write_day(tmp_path / "logs", DAY, events, hours=[18, 19, 20])
+    page_of(tmp_path / "logs", tmp_path)
+    with Image.open(next(tmp_path.glob("*.png"))) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    lefts = {
+        name: np.nonzero((abs(pixels - colour(name)) <= 3).all(axis=2).sum(axis=0) > 10)[0]
+        for name in ("music", "crying")
+    }
+    for columns in lefts.values():
+        assert 360 < np.ptp(columns) < 520, "an hour of three"
+    assert lefts["crying"][0] - lefts["music"][0] == pytest.approx(
+        2 * np.ptp(lefts["music"]), rel=0.02
+    )
 
 
 def test_a_page_of_a_restless_week_is_small(tmp_path):

@@ -203,8 +203,56 @@ def test_what_sounded_beside_a_television_is_pale_and_the_table_says_so(browser,
     assert "By the sound of it, one bout of coughing by day (16:00)." in text
 
 
-def test_a_printed_day_has_two_sheets_with_the_assessment(browser, short_sounds, tmp_path):
-    browser.open(report_of(short_sounds, tmp_path))
+@pytest.fixture(scope="module")
+def evening(tmp_path_factory):
+    """Logs of two hours and five minutes."""
+    folder = tmp_path_factory.mktemp("evening") / "logs"
+    gap = (at("20:05"), 55 * 60, "off")
+    events = [(at("18:20"), 1, "phone_ring", 0.9), (at("19:00"), 1800, "phone_ring", 0.9)]
+    write_day(folder, DAY, events, hours=[18, 19, 20], gaps=[gap])
+    return folder
+
+
+@pytest.mark.parametrize("width", [390, 1366])
+def test_the_sounds_of_an_evening_are_drawn_as_wide_as_its_hours(browser, evening, width, tmp_path):
+    set_size(browser, width, 1000, mobile=width < 600)
+    browser.open(report_of(evening, tmp_path))
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    ticks = [text for text, *_ in boxes(browser, ".hours span")]
+    assert ticks == (
+        ["18:00", "19:00", "20:00"]
+        if width < 600
+        else [f"{hour}:{minute}" for hour in (18, 19, 20) for minute in ("00", "30")]
+    )
+    edges = boxes(browser, ".hours span")
+    assert all(a + w < b for (_, a, w, _), (_, b, *_) in pairwise(edges)), "no tick over another"
+    strip = boxes(browser, ".day .row:not(.axis, .bars) .strip")[0][2] - 2
+    image = pixels(browser.picture())
+    yellow = (image[..., 0] > 180) & (image[..., 2] < 150) & (image[..., 1] > 180)
+    yellow[:, : 40 if width < 600 else int(width * 0.3)] = False  # names
+    columns = yellow[np.argmax(yellow.sum(axis=1))]
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], columns.astype(int), [0]]))).reshape(-1, 2)
+    assert 2 <= np.diff(edges[0]) <= 4
+    assert np.diff(edges[1]) == pytest.approx(strip / 6, abs=1.5)
+    assert edges[1][0] - edges[0].mean() == pytest.approx(strip * 40 / 180, abs=2)
+    (gap,) = {(left, width) for _, left, width, _ in boxes(browser, ".day .gap")}
+    assert gap[1] == pytest.approx(strip * 55 / 180, abs=1)
+    assert not boxes(browser, ".bars .gap"), "an hour of which five minutes were recorded"
+
+
+def test_bars_stand_on_hatching_only_in_hours_without_a_record(browser, tmp_path):
+    write_day(tmp_path / "logs", DAY, gaps=[(at("11:30"), 2.5 * HOUR, "off")])
+    set_size(browser, *SIZES[0])
+    browser.open(report_of(tmp_path / "logs", tmp_path))
+    ((_, left, width, _),) = boxes(browser, ".bars .gap")
+    (_, start, strip, _), *_ = boxes(browser, ".bars .strip")
+    assert (left - start - 1) / (strip - 2) == pytest.approx(12 / 24, abs=0.002)
+    assert width / (strip - 2) == pytest.approx(2 / 24, abs=0.002)
+
+
+@pytest.mark.parametrize("logs", ["short_sounds", "evening"])
+def test_a_printed_day_has_two_sheets_with_the_assessment(browser, logs, request, tmp_path):
+    browser.open(report_of(request.getfixturevalue(logs), tmp_path))
     assert not boxes(browser, "details table")
     browser.call("Emulation.setEmulatedMedia", media="print")
     try:

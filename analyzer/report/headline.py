@@ -5,11 +5,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
-from hearthlog.analyzer.activity.event_counts import MINUTE
-from hearthlog.analyzer.activity.values import Count, rounded
+from hearthlog.analyzer.activity.event_counts import MINUTE, SET_APART
+from hearthlog.analyzer.activity.values import Count, Duration, rounded
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
-from hearthlog.analyzer.logs.spans import common, one
-from hearthlog.analyzer.report.report_data import counted_events
+from hearthlog.analyzer.logs.spans import common, joined, one, without
+from hearthlog.analyzer.report.report_data import counted_events, television_spans
 from hearthlog.analyzer.report.wording import (
     clock_text,
     number_in_words,
@@ -17,7 +17,7 @@ from hearthlog.analyzer.report.wording import (
     short_day,
     weekday,
 )
-from hearthlog.models.classes import COUGHING, CRYING, YELLING, in_words
+from hearthlog.models.classes import COUGHING, CRYING, SILENCE, UNKNOWN, YELLING, in_words
 from hearthlog.schemas.arrays import Bool
 from hearthlog.schemas.errors import listed
 
@@ -28,15 +28,20 @@ _TIMES = 3
 _WORRYING = COUGHING, CRYING, YELLING
 _MISSING_HOURS = 1.0  # fewer hours without a record are not in the headline
 _ONE_MORE = 2
+_PAUSE = 5 * MINUTE  # longest between recorded spans of one stretch
+_NAMED = MINUTE // 2  # shortest sound that a partly recorded day is described by
+_NAMES = 3
+_EXACT_HOURS = 3  # fewer recorded hours are given to the minute
 
 
 def day_headline(day: DayMetrics) -> str:
     """Return the headline of a day: whether it was quiet, coughing, crying and shouting.
 
     A day is quiet if three quarters of it, and of the time from 07:00 to 22:00, were recorded,
-    and if at most six of its hours have five minutes of sound or more.
+    and if at most six of its hours have five minutes of sound or more. Of a day with less than
+    that: what was labelled, and how much is missing.
     """
-    return " ".join([_day(day), *_by_sound(list(_sounds(day)))])
+    return " ".join([_day(day), *_by_sound(list(_sounds(day))), *_missing(day)])
 
 
 def week_headline(days: Sequence[DayMetrics]) -> str:
@@ -113,11 +118,8 @@ def _day(day: DayMetrics) -> str:
     name = weekday(day.day)
     hours = rounded(day.coverage.length / MINUTE) / 60  # as the page says it
     hours_of_day = rounded(day.span.length / HOUR)
-    if not _is_known(day):
-        if hours < 1:
-            return f"Less than an hour of {name} was recorded."
-        were = _were(int(hours))
-        return f"Only {int(hours)} of the {hours_of_day} hours of {name} {were} recorded."
+    if states_missing_time(day):
+        return _recorded_part(day)
     lively = _lively(day)
     partly = ""
     if day.span.length / HOUR - hours >= _MISSING_HOURS:
@@ -131,6 +133,52 @@ def _day(day: DayMetrics) -> str:
         listed(runs, "and") if len(runs) <= _RUNS else f"{number_in_words(int(lively.sum()))} hours"
     )
     return f"{name} was quiet but for {but}{partly}."
+
+
+def states_missing_time(day: DayMetrics) -> bool:
+    """Whether the headline says how much was not recorded, and what was labelled in the rest."""
+    return not _is_known(day)
+
+
+def _recorded_part(day: DayMetrics) -> str:
+    """Return when a partly recorded day was recorded, and what was labelled then."""
+    name = weekday(day.day)
+    if day.coverage.length < MINUTE:
+        return f"Less than a minute of {name} was recorded."
+    stretches = joined(*day.coverage, _PAUSE)
+    hours = rounded(day.coverage.length / HOUR)
+    if len(stretches.starts) == 1:
+        start, end = (clock_text(int(edge[0]), day.zone) for edge in stretches)
+        when = f"{name} from {start} to {'24:00' if end == '00:00' else end}"
+    elif hours >= _EXACT_HOURS:
+        when = f"In the {hours} recorded hours of {name}"
+    else:
+        when = f"In the recorded {Duration(day.coverage.length / MINUTE).text} of {name}"
+    return f"{when}: {_labelled(day)}."
+
+
+def _labelled(day: DayMetrics) -> str:
+    """Return the classes labelled longest, but those that have a sentence of their own."""
+    lengths: list[tuple[int, str]] = []
+    for name in set(day.home.classes) - {SILENCE, UNKNOWN, *_WORRYING}:
+        spans = common(day.home.spans[name], day.span)
+        if name in SET_APART:
+            spans = without(spans, television_spans(day))
+        if spans.length >= _NAMED:
+            lengths.append((-spans.length, in_words(name).lower()))
+    if lengths:
+        return listed([words for _, words in sorted(lengths)[:_NAMES]], "and")
+    sound = common(day.home.sound, day.span).length
+    return f"{Duration(sound / MINUTE).text} of sound" if sound else "nothing but quiet"
+
+
+def _missing(day: DayMetrics) -> Iterator[str]:
+    """Yield how much of a partly recorded day was not recorded."""
+    if not states_missing_time(day) or day.coverage.length < MINUTE:
+        return
+    hours = rounded(day.coverage.length / HOUR)
+    other = f"other {rounded(day.span.length / HOUR) - hours} hours were"
+    yield f"The {other if hours else 'rest of the day was'} not recorded."
 
 
 def _is_known(day: DayMetrics) -> bool:

@@ -11,7 +11,7 @@ from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import joined, without
-from hearthlog.analyzer.report.headline import amount
+from hearthlog.analyzer.report.headline import amount, states_missing_time
 from hearthlog.analyzer.report.report_data import Account, television_spans
 from hearthlog.analyzer.report.wording import (
     WEEK,
@@ -35,11 +35,10 @@ _MORNING, _MIDNIGHT = 4 * 60 + 30, 23 * 60 + 30  # minutes
 
 def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
     """Summarise a day in a few sentences, compared with earlier days."""
-    recorded = "The whole day was recorded."
-    if day.span.length - day.coverage.length >= _MINUTE:
-        minutes = Duration(day.coverage.length / _MINUTE).text
-        recorded = f"Recorded: {minutes} of the day ({percent(day.share)})."
-    yield f"{recorded} {_loudest(day)}".strip()
+    if states_missing_time(day):  # and what sounded
+        yield _off_for_the_rest(account)
+    else:
+        yield f"{_recorded(day)} {_loudest(day)}".strip()
     yield _television(day)
     if account.comparable:
         yield _changes(account, day)
@@ -98,11 +97,13 @@ def not_recorded(account: Account) -> Iterator[str]:
     Yields
     ------
     str
-        A sentence or two, the total first; none with complete coverage.
+        A sentence or two, the total first, unless the headline has it; none with complete
+        coverage.
     """
     length = sum(day.span.length for day in account.days)
     missing = length - sum(day.coverage.length for day in account.days)
-    if missing >= _MINUTE:
+    is_stated = len(account.days) == 1 and states_missing_time(account.days[0])
+    if missing >= _MINUTE and not is_stated:
         text = Duration(missing / _MINUTE).text
         share = percent(missing / length)
         yield f"Not recorded: {text} ({share}). The report knows nothing about that time."
@@ -110,9 +111,11 @@ def not_recorded(account: Account) -> Iterator[str]:
         if hours * HOUR > missing + _MINUTE:  # another microphone covers this time
             text = Duration(hours * 60).text
             yield f"The microphone {plain(microphone)} did not record for {text}."
-    if (unexplained := _unexplained(account)) >= _MINUTE:
+    unexplained = _unexplained(account)
+    is_explained = missing - unexplained >= _MINUTE
+    if unexplained >= _MINUTE and (is_explained or not is_stated):
         text = Duration(unexplained / _MINUTE).text
-        which = "then" if missing - unexplained < _MINUTE else f"for {text} of this time"
+        which = f"for {text} of the time not recorded" if is_explained else "then"
         yield f"The recorder was off {which}, or its logs are not here."
     for reason, same in _by_lasting(account.gaps, lambda gap: gap.text):
         yield f"{reason[:1].upper()}{reason[1:]}: {_when(account, same)}."
@@ -159,6 +162,21 @@ def percent(share: float) -> str:
 def plain(name: str) -> str:
     """Return a name with spaces for `_`."""
     return name.replace("_", " ")
+
+
+def _recorded(day: DayMetrics) -> str:
+    if day.span.length - day.coverage.length < _MINUTE:
+        return "The whole day was recorded."
+    minutes = Duration(day.coverage.length / _MINUTE).text
+    return f"Recorded: {minutes} of the day ({percent(day.share)})."
+
+
+def _off_for_the_rest(account: Account) -> str:
+    """Return why the time missing in the headline was not recorded, if no gap explains it."""
+    missing = sum(day.span.length - day.coverage.length for day in account.days)
+    if missing - _unexplained(account) >= _MINUTE:
+        return ""
+    return "In the rest of the day the recorder was off, or its logs are not here."
 
 
 def _loudest(day: DayMetrics) -> str:

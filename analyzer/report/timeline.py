@@ -10,25 +10,38 @@ from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Duration, UsualRange, usual_range
 from hearthlog.analyzer.colours import Colour, colour_on_paper
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, common, joined, without
+from hearthlog.analyzer.logs.spans import (
+    EVENT_PAUSE,
+    Spans,
+    common,
+    joined,
+    lengths,
+    one,
+    without,
+)
+from hearthlog.analyzer.report.wording import clock_text
 from hearthlog.models.classes import SILENCE, in_words
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 
 PHONE_LANES = 12
 _LEAST_HATCHED = 2  # minutes
-# Marks are at least three pixels wide: of the widest page 5.5 minutes, of the narrowest 16.
-_TOUCHING, _SHORT, _LONG = 5, 16.0, 2.0  # minutes
+# Marks are at least three pixels wide: of the widest page 5.5 steps, of the narrowest 16.
+_TOUCHING, _SHORT, _LONG = 5, 16.0, 2.0  # steps
+_STEPS = 1440  # of an axis; minutes, where it is a day
+_MOST_CLOSE = 1 / 3  # of a day: a shorter recording is drawn as wide as a day
+_FEWEST_HOURS = 3  # of an axis
+_FEW_HOURS, _MANY_HOURS = 4, 12  # on an axis: half hours are written, and only even hours
 
 
 class TimelineBlock(NamedTuple):
-    """Part of a day, in per cent of its width."""
+    """Part of an axis, in per cent of its width."""
 
     left: float
     width: float
 
 
 class MarkPaths(NamedTuple):
-    """SVG paths in a box as wide as the minutes of a day, and 1 high.
+    """SVG paths in a box as wide as the steps of an axis, and 1 high.
 
     Attributes
     ----------
@@ -46,7 +59,7 @@ class MarkPaths(NamedTuple):
 
 
 class TimelineLane(NamedTuple):
-    """Events of a class on a day, in minutes since midnight.
+    """Events of a class on a day, in steps of the axis.
 
     Attributes
     ----------
@@ -97,14 +110,24 @@ class HourBar(NamedTuple):
 
 
 class DayTimeline(NamedTuple):
-    """Picture of a day, without its form."""
+    """Picture of a day, or of the recorded hours of it, without its form."""
 
     day: DayMetrics
-    minutes: int  # 1440, but for days on which the clock is changed
+    span: Spans  # a single span: that of the axis
+    steps: int  # 1440, but for days on which the clock is changed
     lanes: Sequence[TimelineLane]
     gaps: Sequence[TimelineBlock]  # nobody listened
+    empty_hours: Sequence[TimelineBlock]  # in which nobody listened
     nights: Sequence[TimelineBlock]
     ticks: Sequence[HourTick]
+
+    @property
+    def hours_shown(self) -> str:
+        """The hours of the axis, `18:00 to 21:00`; empty if it is the day."""
+        if self.span.length == self.day.span.length:
+            return ""
+        start, end = (clock_text(int(edge[0]), self.day.zone) for edge in self.span)
+        return f"{start} to {'24:00' if end == '00:00' else end}"
 
     @property
     def phone_lanes(self) -> frozenset[str]:
@@ -125,20 +148,20 @@ class DayTimeline(NamedTuple):
     @property
     def night_path(self) -> str:
         """SVG path of the night."""
-        share = self.minutes / 100
+        share = self.steps / 100
         spans = [(block.left * share, block.width * share) for block in self.nights]
         return "".join(f"M{left:g} 0h{width:g}v1h{-width:g}z" for left, width in spans)
 
     @property
     def hour_lines(self) -> str:
         """SVG path of the hours that are written below."""
-        return "".join(f"M{tick.left / 100 * self.minutes:g} 0v1" for tick in self.ticks[1:])
+        return "".join(f"M{tick.left / 100 * self.steps:g} 0v1" for tick in self.ticks[1:])
 
     @property
     def coarse_lines(self) -> str:
         """SVG path of the hours that a phone writes."""
         coarse = (tick for tick in self.ticks[1:] if tick.coarse)
-        return "".join(f"M{tick.left / 100 * self.minutes:g} 0v1" for tick in coarse)
+        return "".join(f"M{tick.left / 100 * self.steps:g} 0v1" for tick in coarse)
 
 
 def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimeline:
@@ -147,24 +170,39 @@ def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimel
     Parameters
     ----------
     names : sequence of str, optional
-        Classes of the lanes; by default all that can occur, but silence.
+        Classes of the lanes, on an axis that is the day; by default all that can occur, but
+        silence, on that of `shown_span`.
     """
+    span = shown_span(day) if names is None else day.span
     if names is None:
         names = [name for name in day.home.classes if name != SILENCE]
-    clock = [local_time(int(time), day.zone).hour for time in day.hours[:-1]]
-    lefts = _percent(day, day.hours)
+    hours = _edges(day, span)
+    clock = [local_time(int(time), day.zone).hour for time in hours[:-1]]
+    lefts = _percent(span, hours)
+    night = np.array([not MORNING <= hour < EVENING for hour in clock])
     return DayTimeline(
         day,
-        int(day.span.length // MINUTE),
-        [_lane(day, name) for name in names],
-        list(_blocks(day, without(day.span, day.coverage))),
-        list(_nights(lefts, clock)),
-        [
-            HourTick(f"{hour:02}", left, hour % 6 == 0)
-            for hour, left in zip(clock, lefts.tolist(), strict=False)
-            if hour % 2 == 0
-        ],
+        span,
+        round(span.length / _step(day, span)),
+        [_lane(day, span, name) for name in names],
+        list(_blocks(span, without(span, day.coverage))),
+        list(_runs(lefts, lengths(day.coverage, hours) < MINUTE)),
+        list(_runs(lefts, night)),
+        list(_ticks(lefts, clock)),
     )
+
+
+def shown_span(day: DayMetrics) -> Spans:
+    """Return the span of the axis: the day, or the hours of a recording much shorter than it."""
+    if not day.coverage.length:
+        return day.span
+    first, last = day.coverage.starts[0], day.coverage.ends[-1]
+    if last - first > _MOST_CLOSE * day.span.length:
+        return day.span
+    start = int(np.searchsorted(day.hours, first, side="right")) - 1
+    end = max(int(np.searchsorted(day.hours, last)), start + _FEWEST_HOURS)
+    end = min(end, len(day.hours) - 1)
+    return one(int(day.hours[min(start, end - _FEWEST_HOURS)]), int(day.hours[end]))
 
 
 def occurring_classes(days: Sequence[DayMetrics]) -> list[str]:
@@ -177,49 +215,78 @@ def occurring_classes(days: Sequence[DayMetrics]) -> list[str]:
 def hour_bars(day: DayMetrics, earlier: Sequence[DayMetrics]) -> list[HourBar]:
     """Return the minutes with sound in each hour; nothing is usual where the clock was changed."""
     same = [each.sound_by_hour for each in earlier if len(each.hours) == len(day.hours)]
-    lefts = _percent(day, day.hours)
-    usual: list[UsualRange | None] = [None] * len(day.sound_by_hour)
+    span = shown_span(day)
+    edges = _edges(day, span)
+    first = int(np.searchsorted(day.hours, edges[0]))
+    rows = slice(first, first + len(edges) - 1)
+    lefts = _percent(span, edges)
+    usual: list[UsualRange | None] = [None] * (len(edges) - 1)
     if same:
-        usual = [usual_range([Duration(float(n)) for n in hour]) for hour in np.array(same).T]
-    columns = lefts[:-1].tolist(), np.diff(lefts).tolist(), day.sound_by_hour.tolist(), usual
+        hours = np.array(same).T[rows]
+        usual = [usual_range([Duration(float(n)) for n in hour]) for hour in hours]
+    columns = lefts[:-1].tolist(), np.diff(lefts).tolist(), day.sound_by_hour[rows].tolist(), usual
     return [HourBar(*row) for row in zip(*columns, strict=True)]
 
 
-def _lane(day: DayMetrics, name: str) -> TimelineLane:
+def _edges(day: DayMetrics, span: Spans) -> Int64:
+    """Return the edges of the hours of an axis."""
+    return day.hours[(day.hours >= span.starts[0]) & (day.hours <= span.ends[0])]
+
+
+def _ticks(lefts: Float64, clock: Sequence[int]) -> Iterable[HourTick]:
+    """Return what is written below an axis: even hours of a day; all or half of an evening."""
+    widths = np.diff(lefts).tolist()
+    for hour, left, width in zip(clock, lefts.tolist(), widths, strict=False):
+        if len(clock) > _MANY_HOURS:
+            if hour % 2 == 0:
+                yield HourTick(f"{hour:02}", left, hour % 6 == 0)
+            continue
+        yield HourTick(f"{hour:02}:00", left, len(clock) <= _FEW_HOURS or hour % 2 == 0)
+        if len(clock) <= _FEW_HOURS:
+            yield HourTick(f"{hour:02}:30", left + width / 2, coarse=False)
+
+
+def _lane(day: DayMetrics, span: Spans, name: str) -> TimelineLane:
     spans = day.home.spans[name]
     events = joined(spans.starts, spans.ends, EVENT_PAUSE)
     counts = np.isin(events.starts, day.home.minutes.counted(name, events.starts))
-    gaps = without(without(day.span, day.home.listened[name]), without(day.span, day.coverage))
+    gaps = without(without(span, day.home.listened[name]), without(span, day.coverage))
+    step = _step(day, span)
+    counted, uncounted = (
+        (np.stack(common(Spans(events.starts[own], events.ends[own]), span), axis=1) - span.starts)
+        / step
+        for own in (counts, ~counts)
+    )
     return TimelineLane(
         name,
         in_words(name),
         colour_on_paper(name),
-        _in_minutes(day, events, counts),
-        _in_minutes(day, events, ~counts),
-        list(_blocks(day, gaps)),
+        counted,
+        uncounted,
+        list(_blocks(span, gaps)),
     )
 
 
-def _in_minutes(day: DayMetrics, events: Spans, which: Bool) -> Float64:
-    own = common(Spans(events.starts[which], events.ends[which]), day.span)
-    return (np.stack(own, axis=1) - day.span.starts[0]) / MINUTE
+def _step(day: DayMetrics, span: Spans) -> float:
+    """Return the nanoseconds of a step of an axis."""
+    return MINUTE if span.length == day.span.length else span.length / _STEPS
 
 
-def _blocks(day: DayMetrics, spans: Spans) -> Iterable[TimelineBlock]:
+def _blocks(span: Spans, spans: Spans) -> Iterable[TimelineBlock]:
     long = spans.ends - spans.starts >= _LEAST_HATCHED * MINUTE
-    lefts, rights = (_percent(day, edges[long]).tolist() for edges in spans)
+    lefts, rights = (_percent(span, edges[long]).tolist() for edges in spans)
     return (TimelineBlock(left, right - left) for left, right in zip(lefts, rights, strict=True))
 
 
-def _nights(lefts: Float64, clock: Sequence[int]) -> Iterable[TimelineBlock]:
-    night = np.array([not MORNING <= hour < EVENING for hour in clock])
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], night, [False]]).astype(int)))
+def _runs(lefts: Float64, which: Bool) -> Iterable[TimelineBlock]:
+    """Return the runs of hours that have something."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], which, [False]]).astype(int)))
     bounds = lefts[edges].reshape(-1, 2).tolist()
     return (TimelineBlock(left, right - left) for left, right in bounds)
 
 
-def _percent(day: DayMetrics, times: Int64) -> Float64:
-    return (times - day.span.starts[0]) / day.span.length * 100
+def _percent(span: Spans, times: Int64) -> Float64:
+    return (times - span.starts[0]) / span.length * 100
 
 
 def _paths(events: Float64) -> MarkPaths:

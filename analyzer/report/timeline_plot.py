@@ -24,7 +24,7 @@ from hearthlog.schemas.arrays import Float64
 
 _INK, _HATCH, _NIGHT, _LINE = "#1d2733", "#8a94a0", "#e9ecf1", "#c5ccd4"
 _DOTS = 150  # per inch
-_LEAST = 4.0  # minutes: three pixels of the picture
+_LEAST = 4.0  # steps: three pixels of the picture
 _PALE = 0.36
 _UNCOUNTED = (210 / 255, 94 / 255, 1 / 255, _PALE)
 
@@ -66,7 +66,7 @@ def _draw_lanes(axes: Any, timelines: Sequence[DayTimeline]) -> None:
         names = [short_day(timeline.day.day) for timeline in timelines]
         axes.set_yticks((np.arange(len(names)) + 0.5) * each, names)
     axes.set_ylim(height, 0)
-    _draw_axis(axes, max(timelines, key=lambda timeline: timeline.minutes))
+    _draw_axis(axes, max(timelines, key=lambda timeline: timeline.steps))
 
 
 def _draw_lane(axes: Any, lane: TimelineLane, top: int) -> None:
@@ -95,7 +95,7 @@ def _draw_blocks(
     band: tuple[float, float],
     **look: Any,
 ) -> None:
-    share = timeline.minutes / 100
+    share = timeline.steps / 100
     spans = [(block.left * share, block.width * share) for block in blocks]
     axes.broken_barh(spans, band, lw=0, **look)
 
@@ -110,8 +110,8 @@ def _draw_gaps(
 def _draw_hours(axes: Any, timeline: DayTimeline, bars: Sequence[HourBar]) -> None:
     """Draw the minutes with sound in each hour."""
     _draw_blocks(axes, timeline, timeline.nights, (0, 75), color=_NIGHT)
-    _draw_gaps(axes, timeline, timeline.gaps, (0, 75))
-    share = timeline.minutes / 100
+    _draw_gaps(axes, timeline, timeline.empty_hours, (0, 75))
+    share = timeline.steps / 100
     for bar in bars:
         left, width = bar.left * share, bar.width * share
         axes.bar(left, bar.minutes, width * 0.84, align="edge", color="#5b6b7c", zorder=2)
@@ -128,14 +128,16 @@ def _draw_hours(axes: Any, timeline: DayTimeline, bars: Sequence[HourBar]) -> No
     label = "minutes with sound\nin each hour"
     axes.set_ylabel(label, fontsize=8.5, rotation=0, ha="right", va="center", color=_INK)
     _draw_axis(axes, timeline)
+    if timeline.hours_shown:
+        axes.set_xlabel(f"only {timeline.hours_shown} is shown", fontsize=8.5, color=_INK)
 
 
 _NUMBERED = 0.5
 
 
 def _draw_axis(axes: Any, timeline: DayTimeline) -> None:
-    axes.set_xlim(0, timeline.minutes)
-    places = [tick.left / 100 * timeline.minutes for tick in timeline.ticks]
+    axes.set_xlim(0, timeline.steps)
+    places = [tick.left / 100 * timeline.steps for tick in timeline.ticks]
     axes.set_xticks(places, [tick.text for tick in timeline.ticks])
     axes.grid(axis="x", color=_LINE, linewidth=0.5, zorder=0)
     axes.set_axisbelow(True)
@@ -148,7 +150,8 @@ def _draw_legend(figure: Any, timelines: Sequence[DayTimeline]) -> None:
     """Write what colours and hatching mean; the lanes of a day have their names beside them."""
     lanes = timelines[0].lanes if len(timelines) > 1 else []
     entries = [Patch(color=_shade(lane), label=_plain(lane.words)) for lane in lanes]
-    entries.append(Patch(color=_NIGHT, label="night"))
+    if any(timeline.nights for timeline in timelines):
+        entries.append(Patch(color=_NIGHT, label="night"))
     if any(timeline.has_gaps for timeline in timelines):
         gap = Patch(facecolor="white", edgecolor=_HATCH, hatch="////", label="not recorded")
         entries.append(gap)

@@ -276,6 +276,8 @@ def _count(truth: TrueDay, name: str) -> float:
 
 def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
     day, first, *rest = truth.metrics, *re.split(r"(?<=\.) ", text)
+    if ": " in first:  # of a part of the day, and not of its hours
+        first = ""
     hours, modest = day.sound_by_hour, is_modest(first)
     lively = hours >= LIVELY_MINUTES
     if runs := _RUN.findall(first):
