@@ -1,7 +1,10 @@
 """A quarter of a simulated home is lived, learned from and scored week by week."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
@@ -13,8 +16,8 @@ from hearthlog.tools.home.composition import Rooms
 from hearthlog.tools.home.routine import Habits, plan_days, plan_short_day
 from hearthlog.tools.lab import quarter
 from hearthlog.tools.lab.home.microphones import NarrowRooms
-from hearthlog.tools.lab.quarter_picture import line_of, save_picture
-from hearthlog.tools.lab.quarter_scores import scored
+from hearthlog.tools.lab.quarter_picture import line_of, quarter_figure, save_picture
+from hearthlog.tools.lab.quarter_scores import Week, scored
 
 START = 1_772_323_200_000_000_000
 
@@ -51,6 +54,34 @@ def test_a_labelling_is_scored_by_time_and_by_events_that_are_none():
     assert one.f1(["coughing", "silence", "music"]) == {"coughing": 4 / 18, "silence": 8 / 12}
     assert one.macro_f1(["silence"]) == pytest.approx(2 / 3)
     assert one.false_events == {"coughing": 24 * 3600 / 20}
+
+
+def test_the_picture_of_a_quarter_has_level_words_that_cover_no_curve():
+    truth = labelling((0, 60, "silence"), (60, 90, "cough"), (90, 200, "music"))
+    weeks = []
+    for number in range(1, 14):
+        noise = number * 7 % 11 + 1
+        said = [labelling((0, 60 - n, "silence"), (60 - n, 200, "yelling")) for n in (noise, 40)]
+        scores = [scored(truth, each) for each in said]
+        weeks.append(Week(number, "home", *scores, 9.0, 5, 20, 4, True, number not in {9, 12}))
+    figure = quarter_figure(weeks)
+    figure.draw_without_rendering()
+    words = [
+        text
+        for text in figure.findobj(Text)
+        if text.get_visible() and text.get_text() and not text.get_text()[0].isdigit()
+    ]
+    found = {text.get_text() for text in words}
+    assert {"Wrong marks", "Another microphone", "Starter model alone"} <= found
+    for text in words:
+        assert text.get_rotation() == 0
+        assert text.get_text()[0].isupper()
+    boxes = [text.get_window_extent() for text in words]
+    for one, other in combinations(boxes, 2):
+        assert not one.overlaps(other)
+    for axes in figure.axes:
+        for box in boxes:
+            assert not box.overlaps(axes.get_window_extent())
 
 
 def test_another_microphone_hears_the_same_in_a_narrow_band_and_weaker():

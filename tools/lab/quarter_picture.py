@@ -11,7 +11,8 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.tools.lab.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Scored, Week
 
 _INCHES = (9.0, 7.5)
-_BAD = (WRONG_WEEK, "wrong marks"), (MICROPHONE_WEEK, "another microphone")
+_BAD = (WRONG_WEEK, "Wrong marks"), (MICROPHONE_WEEK, "Another microphone")
+_CIRCLE, _ALONE, _GREY = "#0072b2", "#d55e00", "#8a94a0"  # told apart without red and green
 
 
 def line_of(week: Week) -> str:
@@ -34,7 +35,7 @@ def line_of(week: Week) -> str:
 
 
 def save_picture(path: Path, weeks: Sequence[Week]) -> None:
-    """Draw F1 of frames, false events a day and the marks of each week, as PNG.
+    """Draw F1 of frames, false events a day and the minutes of review of each week, as PNG.
 
     Parameters
     ----------
@@ -47,23 +48,34 @@ def save_picture(path: Path, weeks: Sequence[Week]) -> None:
     LogError
         If the file exists, or cannot be written.
     """
+    save_figure(quarter_figure(weeks), path)
+
+
+def quarter_figure(weeks: Sequence[Week]) -> Any:
+    """Return the figure of a quarter: three panels over the weeks."""
     known = _known()
-    figure = new_figure(_INCHES, "a quarter of a simulated home, ten minutes of review a week")
-    f1, false, asked = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
+    figure = new_figure(_INCHES, "A quarter of a simulated home, ten minutes of review a week")
+    f1, false, minutes = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
     _draw_two(f1, weeks, lambda one: one.macro_f1(known))
-    f1.set(ylabel="macro F1 of frames", ylim=(0, 1))
-    f1.legend(loc="lower left")
+    f1.set(ylim=(0, 1))
+    f1.set_title("How much is labelled right (macro F1 of frames)", loc="left", pad=22)
+    _draw_two(false, weeks, lambda one: sum(one.false_events.values()))
+    false.set(yscale="log")
+    false.yaxis.set_major_formatter("{x:,.0f}")
+    false.set_title("False events a day", loc="left")
+    numbers = [week.number for week in weeks]
+    minutes.bar(numbers, [week.minutes for week in weeks], color=_GREY)
+    minutes.set(xlabel="Week", xticks=numbers)
+    minutes.yaxis.get_major_locator().set_params(integer=True)
+    minutes.set_title("Minutes of questions a week", loc="left")
     for number, name in _BAD:
         if number <= len(weeks):
-            f1.text(number, 0.02, name, ha="center", va="bottom", rotation=90, color="tab:red")
-    _draw_two(false, weeks, lambda one: sum(one.false_events.values()))
-    false.set(ylabel="false events in 24 h", yscale="log")
-    numbers = [week.number for week in weeks]
-    asked.bar(numbers, [week.minutes for week in weeks], color="tab:blue", alpha=0.5)
-    asked.set(ylabel="minutes asked", xlabel="week", xticks=numbers)
-    for axes in (f1, false, asked):
-        _shade(axes, len(weeks))
-    save_figure(figure, path)
+            above = f1.get_xaxis_transform()
+            f1.text(number, 1.02, name, ha="center", va="bottom", transform=above)
+            for axes in (f1, false, minutes):
+                axes.axvspan(number - 0.5, number + 0.5, color=_GREY, alpha=0.25, lw=0, zorder=0)
+    figure.legend(*f1.get_legend_handles_labels(), loc="outside lower left", ncols=3, frameon=False)
+    return figure
 
 
 def _known() -> list[str]:
@@ -74,19 +86,10 @@ def _known() -> list[str]:
 
 def _draw_two(axes: Any, weeks: Sequence[Week], figure: Callable[[Scored], float]) -> None:
     numbers, alone = [week.number for week in weeks], [figure(week.alone) for week in weeks]
-    axes.plot(numbers, alone, "s--", color="grey", label="starter alone")
-    axes.plot(numbers, [figure(week.circle) for week in weeks], "-", color="tab:blue")
-    for promoted, face, name in (
-        (True, "tab:blue", "circle, its next model let label"),
-        (False, "white", "circle, its next model refused"),
-    ):
-        some = [week for week in weeks if week.promoted == promoted]
-        values = [figure(week.circle) for week in some]
-        places = [week.number for week in some]
-        axes.plot(places, values, "o", color="tab:blue", markerfacecolor=face, label=name)
-
-
-def _shade(axes: Any, weeks: int) -> None:
-    for number, _ in _BAD:
-        if number <= weeks:
-            axes.axvspan(number - 0.5, number + 0.5, color="tab:red", alpha=0.1)
+    circle = [figure(week.circle) for week in weeks]
+    axes.plot(numbers, circle, "o-", color=_CIRCLE, label="Corrected every week: the circle")
+    refused = [row for row, week in enumerate(weeks) if not week.promoted]
+    places, values = ([each[row] for row in refused] for each in (numbers, circle))
+    look = {"color": _CIRCLE, "markerfacecolor": "white"}
+    axes.plot(places, values, "o", label="Its next model is refused", **look)
+    axes.plot(numbers, alone, "s--", color=_ALONE, label="Starter model alone")
