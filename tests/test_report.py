@@ -578,6 +578,17 @@ def test_the_picture_covers_the_hours_of_a_recording_of_at_most_a_third_of_the_d
     assert text in text_of(page_of(tmp_path / "logs", tmp_path))
 
 
+@pytest.mark.parametrize(("hours", "stripes"), [([18, 19], 0), (range(24), 1)])
+def test_sounds_two_minutes_apart_are_two_marks_on_an_evening_and_stripes_on_a_day(
+    tmp_path, hours, stripes
+):
+    coughs = [(at(time), 1, "coughing", 0.9) for time in ("18:40", "18:42")]
+    write_day(tmp_path / "logs", DAY, coughs, hours=hours)
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert page.count('class="many"') == stripes
+    assert len(re.findall(r'class="short" d="M\d+ 0v1M\d+ 0v1"', page)) == 1
+
+
 def test_the_png_of_an_evening_is_as_wide_as_its_hours(tmp_path):
     events = [(at("18:00"), HOUR, "music", 1.0), (at("20:00"), HOUR, "crying", 1.0)]
     write_day(tmp_path / "logs", DAY, events, hours=[18, 19, 20])
