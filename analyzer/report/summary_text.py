@@ -38,7 +38,8 @@ def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
     if states_missing_time(day):  # and what sounded
         yield _off_for_the_rest(account)
     else:
-        yield f"{_recorded(day)} {_loudest(day)}".strip()
+        is_partly = day.span.length - day.coverage.length >= _MINUTE  # `not_recorded` says so
+        yield f"{'' if is_partly else 'The whole day was recorded.'} {_loudest(day)}".strip()
     yield _television(day)
     if account.comparable:
         yield _changes(account, day)
@@ -162,13 +163,6 @@ def percent(share: float) -> str:
 def plain(name: str) -> str:
     """Return a name with spaces for `_`."""
     return name.replace("_", " ")
-
-
-def _recorded(day: DayMetrics) -> str:
-    if day.span.length - day.coverage.length < _MINUTE:
-        return "The whole day was recorded."
-    minutes = Duration(day.coverage.length / _MINUTE).text
-    return f"Recorded: {minutes} of the day ({percent(day.share)})."
 
 
 def _off_for_the_rest(account: Account) -> str:
