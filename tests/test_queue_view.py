@@ -3,6 +3,7 @@
 import subprocess
 from contextlib import suppress
 from dataclasses import replace
+from operator import ge
 
 import numpy as np
 import psutil
@@ -13,8 +14,9 @@ from viewers import patiently, pixels
 from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.review.lanes import FEATURES, SHARES, features_image
-from hearthlog.analyzer.review.timeline import Key, Question, SoundClip
+from hearthlog.analyzer.review.timeline import Key, LabelledSpans, Question, SoundClip
 from hearthlog.analyzer.review.timeline_reader import read_timeline
+from hearthlog.analyzer.review.viewer.drawing import placed_lanes
 from hearthlog.analyzer.review.viewer.viewer import open_hidden
 from hearthlog.models.classes import ordered
 
@@ -64,13 +66,13 @@ def ask(view, logs, start, end):
     view.show(start, end, MARGIN)
 
 
-def is_asked(picture, start, end):
+def is_asked(picture, start, end, beyond=4):
     """Whether a light band lies from the start of a span to its end, and ends there."""
     left = _LEFT
     scale = (picture.shape[1] - left) / (end - start + 2 * MARGIN)
     first, last = (left + round(edge * scale) for edge in (MARGIN, MARGIN + end - start))
     inside = picture[:, first + 3 : last - 3].min(axis=2) > 150
-    beside = picture[:, [first - 4, last + 4]].min(axis=2) < 100
+    beside = picture[:, [first - beyond, last + beyond]].min(axis=2) < 100
     return (inside.all(axis=1) & beside.all(axis=1)).sum() >= 10
 
 
@@ -131,6 +133,78 @@ def test_close_ups_are_right_and_the_span_is_marked_also_when_the_queue_jumps_ba
     assert view.state().errors == []
 
 
+def test_a_drag_in_a_queue_is_seen_on_what_is_asked_until_it_is_the_same_span(view, logs, timeline):
+    start = timeline.grid.start + 60 * SECOND
+    asked, dragged = (start, start + 6 * SECOND), (start + 2 * SECOND, start + 12 * SECOND)
+    ask(view, logs, *asked)
+    for span in (dragged, asked, dragged):
+        view.show(*span, MARGIN)
+
+        def is_right(png, span=span):
+            view.refresh()  # as a session does several times a second
+            picture = pixels(png)
+            scale = (picture.shape[1] - _LEFT) / (span[1] - span[0] + 2 * MARGIN)
+            only_asked = _LEFT + round((asked[0] - span[0] + MARGIN + SECOND) * scale)
+            grey = np.ptp(picture[:, only_asked], axis=1) < 20
+            grey &= np.abs(picture[:, only_asked].mean(axis=1) - 90) < 12
+            is_behind = grey.sum() >= 20
+            return is_asked(picture, *span, beyond=6) and is_behind == (span == dragged)
+
+        patiently(view.picture, is_right)
+
+
+def runs(lit, gap):
+    """The first and the last of the places that are lit, for each run of them."""
+    places = np.flatnonzero(lit)
+    parts = np.split(places, np.flatnonzero(np.diff(places) > gap) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]
+
+
+_TOP, _QUESTION = 38, 400  # pixels above the question, and as many columns as it has
+_NAMES = ["talking", "music", "telephone ringing", "coughing", "household sounds", "shouting"]
+
+
+def test_the_question_is_large_and_all_is_shown_on_a_small_screen(timeline):
+    """Lanes beside their names, the probabilities, the question, and two lines of keys."""
+    keys = [Key(str(number), name) for number, name in enumerate(_NAMES * 2)]
+    question = Question("Is all of this minute labelled right?", "1 of 10", keys)
+    start = timeline.grid.start + 60 * SECOND
+    recorder = timeline.microphones["mic"].labellings[0]
+    kept = recorder.spans.texts != "laughing"  # eight lanes, as of the general model
+    recorder.spans = LabelledSpans(*(part[kept] for part in recorder.spans))
+    recorder.classes = [name for name in recorder.classes if name != "laughing"]
+    assert len(placed_lanes(timeline)) == 8
+    with open_hidden(size=(1366, 768)) as viewer:
+        viewer.draw(timeline, close_up=True)
+        viewer.wait_until_drawn()
+        viewer.ask(start, start + 5 * SECOND, question)
+        viewer.show(start, start + 5 * SECOND, MARGIN)
+
+        def is_right(png):
+            viewer.refresh()
+            picture = pixels(png)
+            light = picture.min(axis=2) > 110
+            scale = (1366 - _LEFT) / (45 * SECOND)
+            band = _LEFT + round(22 * SECOND * scale)
+            bands = runs(light[_TOP:, band - 30 : band + 30].all(axis=1), 1)
+            top = bands[0][0] if bands else 0  # not drawn yet
+            large = runs(light[_TOP : _TOP + top, :_QUESTION].any(axis=1), 2)
+            small = runs(light[_TOP : _TOP + top, _QUESTION + 20 :].any(axis=1), 1)
+            heights = [last - first for first, last in large]
+            cursor = _LEFT + round(MARGIN * scale)
+            lines = runs(light[:, cursor - 4 : cursor + 5].any(axis=1), 4)
+            views = [last - first for first, last in lines if last - first > 60][:2]
+            return (
+                len(large) == 1
+                and len(small) == 3
+                and heights[0] > 1.4 * max(last - first for first, last in small)
+                and max(large[-1][1], small[-1][1]) < top - 2
+                and [*map(ge, views, (8 * 27, 90))] == [True, True]
+            )
+
+        patiently(viewer.picture, is_right)
+
+
 @pytest.mark.parametrize(
     ("size", "halves"),
     [((1920, 1080), (60 * SECOND, 10 * SECOND, SECOND)), ((2560, 1440), (60 * SECOND,))],
@@ -171,8 +245,7 @@ def test_where_no_sound_was_kept_there_are_features_one_below_the_other(timeline
     microphone, grid = timeline.microphones["mic"], timeline.grid
     image, text = features_image(microphone, grid, (66, 1000))
     plot = microphone.plots[FEATURES, ""]
-    assert text.startswith("No sound was kept here: features, from zero_crossing_rate down to")
-    assert text.endswith("energy")
+    assert text == "No sound was kept here: features, energy last"
     energy = plot.values[np.arange(1000) * grid.count // 1000, plot.names.index("energy")]
     order = np.argsort(energy)
     assert (np.diff(image[-1, order]) >= 0).all()

@@ -253,8 +253,10 @@ def reviewed_lane(
     return marked._replace(spans=spans, colours=colours)
 
 
-def selected_lane(microphone: str, spans: LabelledSpans) -> Lane:
-    """Make the lane of the selected span."""
+def selected_lane(microphone: str, span: tuple[int, int] | None = None) -> Lane:
+    """Make the lane of the selected span (ns of UTC), if there is one."""
+    edges = np.array([] if span is None else [span], np.int64).reshape(-1, 2)
+    spans = LabelledSpans(*edges.T, np.full(len(edges), SELECTED, object))
     return Lane(microphone, "", SELECTED, spans, {SELECTED: SELECTED_COLOUR})
 
 
@@ -302,7 +304,7 @@ def _shared_lanes(
         if len(spans):
             yield _lane_in_words(microphone.name, name, spans)
     if marking:
-        yield selected_lane(microphone.name, no_spans())
+        yield selected_lane(microphone.name)
     marks = {one.name: one.spans for one in microphone.labellings if is_review(one.name)}
     for scenario, looked_at in {"": microphone.reviewed, **microphone.reviewed_scenarios}.items():
         own = marks.get(review_labelling(scenario), no_spans())
@@ -547,8 +549,7 @@ def features_image(
     shades = _shades(plot.values)[:, order]
     of_column = np.arange(columns) * grid.count // columns
     of_row = np.arange(rows) * len(order) // rows
-    first, last = plot.names[order[0]], plot.names[order[-1]]
-    text = f"No sound was kept here: features, from {first} down to {last}"
+    text = f"No sound was kept here: features, {plot.names[order[-1]]} last"
     return np.nan_to_num(shades)[of_column][:, of_row].T, text
 
 

@@ -234,6 +234,20 @@ class Plot(NamedTuple):
             return self.title
         return f"From above: {', '.join(map(in_words, ordered(self.names)))}"
 
+    def between(self, start: int | None, end: int | None) -> "Plot":
+        """Return the frames that begin in a span (ns of UTC; None for no limit)."""
+        first = 0 if start is None else int(np.searchsorted(self.times, start))
+        last = len(self.times) if end is None else int(np.searchsorted(self.times, end))
+        return self._replace(times=self.times[first:last], values=self.values[first:last])
+
+    def fifths(self) -> "Plot":
+        """Average over each fifth of a second, enough to show the noise of a room."""
+        fifths = self.times // (NANOSECONDS // 5)
+        first = np.flatnonzero(np.diff(fifths, prepend=-1))
+        sizes = np.diff(first, append=len(self.times))
+        means = np.add.reduceat(self.values, first, axis=0) / sizes[:, np.newaxis]
+        return self._replace(times=self.times[first], values=means.astype(np.float32))
+
 
 PlotKey = tuple[PlotKind, str]  # with the labelling
 

@@ -1,7 +1,7 @@
 """Rerun entities of a timeline, and the views that show them."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from hearthlog.analyzer.review.lanes import (
     LEVEL,
     REVIEWED,
     SELECTED,
+    SELECTED_COLOUR,
     SHARES,
     Checked,
     Lane,
@@ -30,6 +31,7 @@ from hearthlog.analyzer.review.timeline import (
     Question,
     Style,
     Timeline,
+    no_spans,
     spectrogram,
 )
 from hearthlog.analyzer.review.viewer.canvas import ROWS_HEIGHT, Canvas
@@ -41,9 +43,11 @@ LINES, CLIP, WORDS, HOURS = "events", "clip", "words", "hours"
 SPECTRUM = "spectrum"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # suffix of a microphone's name
-ASKED, ASKED_WORDS, ASKED_NAME = "asked", "words/asked", "words/asked_name"
+ASKED, ASKED_NAME = "asked", "words/asked_name"
+QUESTION, ANSWERS = "words/question", "words/asked"
 _ASKED_STROKES = 600  # maximum strokes of a band
-_ASKED: Colour = (245, 240, 225)
+_ASKED, _ASKED_BELOW = SELECTED_COLOUR, (95, 92, 84)
+_SELECTED_PLACE = 0.65, 0.35  # the lower edge of the row is out of sight
 
 _THICKNESS = 0.5  # of a strip, in lanes, without the width of its lines
 _HOUR = 3600 * NANOSECONDS
@@ -56,8 +60,9 @@ _Strip = tuple[int, int, str]
 class DrawnLane:
     """A lane in the viewer; drawn states can be hidden, but not changed."""
 
-    def __init__(self, root: str, height: float) -> None:
-        self._root, self._height = root, height
+    def __init__(self, root: str, height: float, thickness: float | None = None) -> None:
+        self._root = root
+        self._places = height, thickness or _THICKNESS * LANE_HEIGHT
         self._parts: dict[str, set[_Strip]] = {}
         self._count = 0
 
@@ -73,11 +78,10 @@ class DrawnLane:
         parts = self._divide(fresh).items()
         for text, strips in sorted(parts, key=lambda part: (-_length(part[1]), part[0])):
             layer = 0 if text == REVIEWED else 1  # the viewer draws in name order
-            places = self._height, _THICKNESS * LANE_HEIGHT
             entity = f"{self._root}/{layer}/{self._count:06}"
             times = np.array(sorted(strip[:2] for strip in strips))
             spans = Spans(times[:, 0], times[:, 1])
-            canvas.draw_strips(entity, places, spans, text, lane.colours[text])
+            canvas.draw_strips(entity, self._places, spans, text, lane.colours[text])
             self._parts[entity] = strips
             self._count += 1
 
@@ -175,11 +179,9 @@ def _draw_hours(timeline: Timeline, canvas: Canvas) -> None:
     canvas.change_states(HOURS, times, [*names[:-1], None])
 
 
-def write_checked(
-    timeline: Timeline, checked: Checked, canvas: Canvas, *, marking: bool = False
-) -> None:
+def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
     """Write next to the recorder's classes how many of their sounds were right in this home."""
-    for lane, place in placed_lanes(timeline, marking=marking):
+    for lane, place in placed_lanes(timeline):  # other lanes are below the classes
         known = checked.get((lane.microphone, lane.name))
         if lane.labelling == LIVE and known is not None:
             canvas.write(place.name, f"{lane.name} · {known.right}/{known.labelled} right")
@@ -201,24 +203,43 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
         canvas.show_image(f"{microphone.name}/{SPECTRUM}", grid.start, shade, text)
 
 
-def draw_requested(number: int, start: int, end: int, question: Question, canvas: Canvas) -> None:
-    """Draw the requested span and its question, in place of the previous ones.
+class RequestedSpan(DrawnLane):
+    """The row of the requested span; a selected span is drawn on it, and brighter."""
 
-    Parameters
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    """
-    if number:
-        canvas.hide(f"{ASKED}/{number - 1}")
-    entity, middle = f"{ASKED}/{number}", np.array([(start + end) // 2])
-    canvas.configure(entity, Style.BANDS, [question.text], [_ASKED])
-    canvas.add_bands(entity, middle, np.ones((1, 1)), end - start, _ASKED_STROKES)
-    keys = " · ".join(f"**{_plain(one.cap)}** {_plain(one.text)}" for one in question.keys)
-    where = f"{_plain(question.keys_in)}: " if question.keys_in else ""
-    text = f"**{_plain(question.text)}** {_plain(question.place)}\n\n{where}{keys}"
-    canvas.write(ASKED_WORDS, text, rr.MediaType.MARKDOWN)
-    canvas.write(ASKED_NAME, "Asked about")
+    def __init__(self) -> None:
+        super().__init__(f"{ASKED}/selected", *_SELECTED_PLACE)
+        self._number, self._span, self._text = 0, (0, 0), ""
+
+    def ask(self, start: int, end: int, question: Question, canvas: Canvas) -> None:
+        """Draw the span (ns of UTC) and its question, in place of the previous ones."""
+        if self._number:
+            canvas.hide(self._entity)
+        self._number += 1
+        self._span, self._text = (start, end), question.text
+        self._colour(_ASKED, canvas)
+        middle = np.array([(start + end) // 2])
+        canvas.add_bands(self._entity, middle, np.ones((1, 1)), end - start, _ASKED_STROKES)
+        keys = " · ".join(f"**{_plain(one.cap)}** {_plain(one.text)}" for one in question.keys)
+        where = f"{_plain(question.keys_in)}: " if question.keys_in else ""
+        canvas.write(QUESTION, f"# {_plain(question.text)}", rr.MediaType.MARKDOWN)
+        canvas.write(ANSWERS, f"{_plain(question.place)}\\\n{where}{keys}", rr.MediaType.MARKDOWN)
+        canvas.write(ASKED_NAME, "Asked about")
+
+    def show(self, lane: Lane, canvas: Canvas) -> None:
+        """Draw a selected span, unless it is the requested one."""
+        starts, ends, _ = spans = lane.spans
+        if (*starts.tolist(), *ends.tolist()) == self._span:
+            spans = no_spans()
+        super().show(lane._replace(spans=spans), canvas)
+        self._colour(_ASKED_BELOW if len(spans) else _ASKED, canvas)
+        canvas.write(ASKED_NAME, "Light: selected" if len(spans) else "Asked about")
+
+    @property
+    def _entity(self) -> str:
+        return f"{ASKED}/{self._number}"
+
+    def _colour(self, shade: Colour, canvas: Canvas) -> None:
+        canvas.configure(self._entity, Style.BANDS, [self._text], [shade])
 
 
 def _plain(text: str) -> str:
@@ -240,10 +261,11 @@ def draw_frames(
         for key, frames in microphone.frames.items():
             plot = microphone.plots[key]
             entity = frames_entity(plot)
-            parts = _between(frames, start, end)
+            near = (part.between(start, end) for part in frames)
+            parts = (part for part in near if len(part.times))
             configure_plot(plot, entity, canvas, Style.LINE)
             if plot.kind is LEVEL:
-                parts = map(_fifths, parts)
+                parts = (part.fifths() for part in parts)
             canvas.draw_frames(entity, plot.names, parts, plot.kind.frame_step)
 
 
@@ -302,24 +324,6 @@ def _length(strips: Iterable[_Strip]) -> int:
     return sum(end - start for start, end, _ in strips)
 
 
-def _between(parts: Sequence[Plot], start: int | None, end: int | None) -> Iterator[Plot]:
-    """Yield the frames that begin in a span of time."""
-    for part in parts:
-        first = 0 if start is None else int(np.searchsorted(part.times, start))
-        last = len(part.times) if end is None else int(np.searchsorted(part.times, end))
-        if first < last:
-            yield part._replace(times=part.times[first:last], values=part.values[first:last])
-
-
-def _fifths(part: Plot) -> Plot:
-    """Average over each fifth of a second, enough to show the noise of a room."""
-    fifths = part.times // (NANOSECONDS // 5)
-    first = np.flatnonzero(np.diff(fifths, prepend=-1))
-    sizes = np.diff(first, append=len(part.times))
-    means = np.add.reduceat(part.values, first, axis=0) / sizes[:, np.newaxis]
-    return part._replace(times=part.times[first], values=means.astype(np.float32))
-
-
 def _word(name: str) -> str:
     """Replace the characters that need escaping in the name of an entity."""
     return name.removeprefix("relabel/").replace("/", "-").replace(" ", "_")
@@ -329,18 +333,17 @@ APPLICATION = "hearthlog"
 # The viewer keeps the shared range of linked time axes under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
-_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 29, 50, 90, 140, 30
-_QUESTION_HEIGHT = 62
-_CLOSE_HEIGHT = 88  # of a plot in a close-up
+_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 27, 50, 90, 140, 28
+_QUESTION_HEIGHT = 62  # of a heading, with the space that the viewer leaves above it
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
 # Numbers of the lanes' axis are as wide as those of the plots below: the plots begin at one place.
 LANE_HEIGHT = 0.1
-_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 74
+_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 42
 _SPECTRUM_SHAPE = (64, 2240)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 # Widths of a text and a plot, until that of the window is known; the hours have no axis.
-COLUMNS, ASKED_COLUMNS, HOUR_COLUMNS = (2, 10), (2, 12), (2, 11)
+COLUMNS, ASKED_COLUMNS, HOUR_COLUMNS, _QUESTION_COLUMNS = (2, 10), (2, 12), (2, 11), (3, 7)
 Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
 
@@ -453,7 +456,7 @@ def review_layout(
     plots: dict[str, list[Plot]] = {name: [] for name in timeline.microphones}
     for plot in timeline_plots(timeline):
         plots[plot.microphone].append(plot)
-    places = placed_lanes(timeline, marking=marking)
+    places = placed_lanes(timeline, marking=marking and not close_up)
     stacks: dict[str, list[Row]] = {}
     for name, microphone in timeline.microphones.items():
         own = [(lane.labelling, place) for lane, place in places if lane.microphone == name]
@@ -468,8 +471,7 @@ def review_layout(
             more[1:1] = level
         else:
             rows += [(_LEVEL_HEIGHT, view) for view in level]
-        height = _CLOSE_HEIGHT if close_up else _PLOT_HEIGHT
-        stacks[name] = [*rows, (height, tabs(more))] if more else rows
+        stacks[name] = [*rows, (_PLOT_HEIGHT, tabs(more))] if more else rows
     panel = rrb.TimePanel(
         state="expanded" if marking else "collapsed", timeline=clock.name, play_state="paused"
     )
@@ -478,10 +480,8 @@ def review_layout(
         for time in (timeline.grid.start, timeline.grid.end)
     )
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
-    question: list[Row] = [
-        (_QUESTION_HEIGHT, _text(ASKED_WORDS)),
-        (_ASKED_HEIGHT, _requested_view()),
-    ]
+    words = rrb.Horizontal(_text(QUESTION), _text(ANSWERS), column_shares=_QUESTION_COLUMNS)
+    question: list[Row] = [(_QUESTION_HEIGHT, words), (_ASKED_HEIGHT, _requested_view())]
     homes = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []
     everything = [*(question if close_up else hours), homes]

@@ -29,7 +29,6 @@ from hearthlog.analyzer.review.timeline import (
     Question,
     Timeline,
     TimelineGrid,
-    no_spans,
 )
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
@@ -40,10 +39,10 @@ from hearthlog.analyzer.review.viewer.drawing import (
     HOUR_COLUMNS,
     SHARED_AXIS,
     DrawnLane,
+    RequestedSpan,
     draw,
     draw_close_up,
     draw_frames,
-    draw_requested,
     review_layout,
     write_checked,
 )
@@ -112,7 +111,7 @@ class Viewer(ABC):
         self._opening: Any = None  # range of the time axes
         self._axes: dict[str, list[float]] = {}  # vertical ranges, by component of the blueprint
         self._selected: tuple[int, int] | None = None  # as drawn
-        self._requests = 0
+        self._requested = RequestedSpan()
         self._close = NONE  # spans of the close-ups
         self._sent = False
 
@@ -188,12 +187,14 @@ class Viewer(ABC):
         name_recording(self._recording, timeline)
         self._canvas = Canvas(self._recording, timeline.clock)
         self._grid = timeline.grid
-        self._lanes = draw(timeline, self._canvas, marking=True)
+        self._lanes = draw(timeline, self._canvas, marking=not close_up)
+        if close_up:
+            self._lanes["", SELECTED] = self._requested
         self._flush()
 
     def write_checked(self, timeline: Timeline, checked: Checked) -> None:
         """Draw the precision of each class of a timeline next to its name."""
-        write_checked(timeline, checked, self._canvas, marking=True)
+        write_checked(timeline, checked, self._canvas)
         self._flush()
 
     def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
@@ -222,8 +223,7 @@ class Viewer(ABC):
         """Draw the requested span, in place of the previous one."""
         if not self.address:
             question = question._replace(keys_in="Press in the terminal")
-        draw_requested(self._requests, start, end, question, self._canvas)
-        self._requests += 1
+        self._requested.ask(start, end, question, self._canvas)
         self._flush()
 
     def redraw_marks(
@@ -267,14 +267,11 @@ class Viewer(ABC):
         if selection == self._selected:
             return
         self._selected = selection
-        spans = no_spans()
-        if selection is not None:
-            starts, ends = (np.array([edge], np.int64) for edge in selection)
-            spans = LabelledSpans(starts, ends, np.array([SELECTED], object))
         assert self._grid is not None
         for (microphone, name), drawn in self._lanes.items():
             if name == SELECTED:
-                drawn.show(selected_lane(microphone, cut_spans(spans, self._grid)), self._canvas)
+                lane = selected_lane(microphone, selection)
+                drawn.show(lane._replace(spans=cut_spans(lane.spans, self._grid)), self._canvas)
         self._flush()
 
     def wait_until_drawn(self, is_over: Callable[[], bool] = bool) -> ViewerState | None:

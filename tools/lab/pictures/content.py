@@ -23,10 +23,10 @@ from hearthlog.analyzer.review.timeline import Key, Question
 from hearthlog.analyzer.review.timeline_reader import read_frames, read_timeline
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
+    RequestedSpan,
     draw,
     draw_close_up,
     draw_frames,
-    draw_requested,
     review_layout,
     write_checked,
 )
@@ -70,7 +70,7 @@ def day_text(logs: Path) -> str:
     canvas = Canvas(drawn, timeline.clock)
     drawn.add_layout(review_layout(timeline, marking=True))
     draw(timeline, canvas, marking=True)
-    write_checked(timeline, class_precision(timeline, find_home_logs([logs])), canvas, marking=True)
+    write_checked(timeline, class_precision(timeline, find_home_logs([logs])), canvas)
     for part in read_frames(timeline):
         draw_frames(part, canvas)
     return drawn.text()
@@ -84,10 +84,10 @@ def queue_text(logs: Path) -> str:
     drawn = Drawn()
     canvas = Canvas(drawn, timeline.clock)
     drawn.add_layout(review_layout(timeline, marking=True, close_up=True))
-    draw(timeline, canvas, marking=True)
+    draw(timeline, canvas)
     draw_close_up(read_timeline([logs], start - _MARGIN, end + _MARGIN), NONE, canvas)
     question = Question("Music?", "1 of 10", [Key("a", "yes"), Key("n", "skip")])
-    draw_requested(0, start, end, question, canvas)
+    RequestedSpan().ask(start, end, question, canvas)
     return drawn.text()
 
 
