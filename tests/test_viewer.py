@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from realday import START
+from rerun.chunk import RrdReader
 from shortsounds import DAY, SOUGHT, short_sounds
 from viewers import (
     Window,
@@ -349,6 +350,15 @@ def test_every_short_sound_of_a_day_is_seen_in_the_page(short_sounds, size, tmp_
         with suppress(AssertionError):
             patiently(page.picture, lambda png: is_seen(png, timeline, path))
         check_seen(path.read_bytes(), timeline)
+
+
+def test_the_ruler_of_a_day_is_named_in_words(short_sounds, tmp_path):
+    timeline = read_timeline([short_sounds], *day_span(DAY, UTC))
+    save_timeline(timeline, tmp_path / "day.rrd")
+    chunks = [*RrdReader(tmp_path / "day.rrd").stream()]
+    assert {str(one.entity_path) for one in chunks} >= {"/Hour", "/words/hours"}
+    (name,) = [one.to_record_batch() for one in chunks if str(one.entity_path) == "/words/hours"]
+    assert name.column("TextDocument:text").to_pylist() == [["Hour of the day"]]
 
 
 # What one does with the mouse

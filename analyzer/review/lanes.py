@@ -176,6 +176,11 @@ class Lane(NamedTuple):
     spans: LabelledSpans
     colours: Mapping[str, Colour]
 
+    @property
+    def title(self) -> str:
+        """The name as shown: marks have the colours of classes, also of those without a lane."""
+        return f"{REVIEWED} · class colours" if self.name == REVIEWED else self.name
+
 
 def timeline_lanes(timeline: Timeline, *, marking: bool = False) -> Iterator[Lane]:
     """Make the lanes of a timeline, microphone by microphone, from the top.

@@ -39,8 +39,8 @@ from hearthlog.models.classes import in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 
-LINES, CLIP, WORDS, HOURS = "events", "clip", "words", "hours"
-SPECTRUM = "spectrum"
+LINES, CLIP, WORDS, HOURS = "events", "clip", "words", "Hour"
+SPECTRUM, HOURS_NAME = "spectrum", "words/hours"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # suffix of a microphone's name
 ASKED, ASKED_NAME = "asked", "words/asked_name"
@@ -50,8 +50,7 @@ _ASKED, _ASKED_BELOW = SELECTED_COLOUR, (95, 92, 84)
 _SELECTED_PLACE = 0.65, 0.35  # the lower edge of the row is out of sight
 
 _THICKNESS = 0.5  # of a strip, in lanes, without the width of its lines
-_HOUR = 3600 * NANOSECONDS
-_HOURS_FROM = 4 * _HOUR
+_HOUR, _HOURS_FROM = 3600 * NANOSECONDS, 4 * 3600 * NANOSECONDS
 _DAY: Colour = (70, 80, 92)
 _NIGHT: Colour = (28, 36, 58)
 _Strip = tuple[int, int, str]
@@ -145,7 +144,7 @@ def draw(
     if _has_hours(timeline):
         _draw_hours(timeline, canvas)
     for lane, place in placed_lanes(timeline, marking=marking):
-        canvas.write(place.name, lane.name)
+        canvas.write(place.name, lane.title)
         drawn = DrawnLane(place.entity, place.height)
         drawn.show(lane, canvas)
         if {REVIEWED, SELECTED} & lane.colours.keys():
@@ -174,6 +173,7 @@ def _draw_hours(timeline: Timeline, canvas: Canvas) -> None:
     names = [f"{hour % 24:02}" for hour in hours.tolist()]
     night = {f"{hour:02}" for hour in (*range(EVENING, 24), *range(MORNING))}
     shades = {name: _NIGHT if name in night else _DAY for name in sorted(set(names))}
+    canvas.write(HOURS_NAME, "Hour of the day")
     canvas.configure_states(HOURS, shades)
     times = np.clip(clock.utc(hours * _HOUR), grid.start, grid.end)
     canvas.change_states(HOURS, times, [*names[:-1], None])
@@ -539,7 +539,7 @@ def _by_title(plots: Sequence[Plot]) -> list[list[Plot]]:
 
 def _hours_view() -> rrb.Container:
     view = rrb.StateTimelineView(origin=HOURS, name="Hours", titlebar=False, time_view=_axis())
-    return rrb.Horizontal(_text(NOTHING), view, column_shares=HOUR_COLUMNS)
+    return rrb.Horizontal(_text(HOURS_NAME), view, column_shares=HOUR_COLUMNS)
 
 
 def _spectrum_view(microphone: str) -> rrb.Container:
