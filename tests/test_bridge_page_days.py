@@ -20,6 +20,7 @@ from viewers import browsing, patiently
 
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
 from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity.sureness import Sureness
 from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
@@ -55,11 +56,14 @@ GERMAN = {"Accept-Language": "de-AT,de;q=0.9,en;q=0.5"}
 
 
 def tiled(hours, *sounds):
-    """Segments of some hours of the day, silence between sounds of (hour, seconds, label)."""
+    """Segments of some hours of the day, silence between sounds.
+
+    These are (hour, seconds, label), or with a confidence (hour, seconds, label, confidence).
+    """
     rows, now = [], int(hours[0] * HOUR)
-    for hour, seconds, label in sorted(sounds):
+    for hour, seconds, *label in sorted(sounds):
         begin, end = int(hour * HOUR), int(hour * HOUR) + seconds * NANOSECONDS
-        rows += [(now, begin, "silence"), (begin, end, label)]
+        rows += [(now, begin, "silence"), (begin, end, *label)]
         now = end
     return [*rows, (now, int(hours[1] * HOUR), "silence")]
 
@@ -89,7 +93,7 @@ def segments_of(name, parts):
         "header.stamp": starts,
         "duration": ends - starts,
         "label": np.array([row[2] for row in rows], object),
-        "confidence": np.ones(len(rows), np.float32),
+        "confidence": np.array([(*row, 1.0)[3] for row in rows], np.float32),
     }
     return Columns(f"/{name}/segment", message_types.SEGMENT, {}, ends, ends, ends, fields)
 
@@ -143,6 +147,107 @@ def test_a_sound_that_two_rooms_may_have_heard_is_not_counted_twice(language, st
     and_once = {"en": "and 15:00), once", "de": "und 15:00), einmal"}[language]
     sentence = f"{start} (Bath: 14:00 {and_once} (Kitchen: 14:00), {end}"
     assert picture_of(home_of_rooms(16, rooms, language))["sentence"] == sentence
+
+
+def coughs_at(*hours, sure=True):
+    return [(hour, 3, "coughing", 0.9 if sure else 0.6) for hour in hours]
+
+
+@pytest.mark.parametrize(
+    ("sounds", "english", "german"),
+    [
+        (
+            [*coughs_at(3.62), *coughs_at(0.67, 6.44, sure=False)],
+            "coughing once (03:37), perhaps twice more (00:40 and 06:26)",
+            "einmal Husten (03:37), vielleicht noch zweimal (00:40 und 06:26)",
+        ),
+        (
+            [*coughs_at(3.62, 4), *coughs_at(1, sure=False)],
+            "coughing twice (03:37 and 04:00), perhaps once more (01:00)",
+            "zweimal Husten (03:37 und 04:00), vielleicht noch einmal (01:00)",
+        ),
+        (
+            [*coughs_at(0), *coughs_at(1, 2, 3, 4, sure=False)],
+            "coughing once (00:00), perhaps 4 more times (01:00 to 04:00)",
+            "einmal Husten (00:00), vielleicht noch 4-mal (01:00 bis 04:00)",
+        ),
+        (
+            coughs_at(0.67, 6.44, sure=False),
+            "perhaps coughing twice (00:40 and 06:26)",
+            "vielleicht zweimal Husten (00:40 und 06:26)",
+        ),
+        (
+            coughs_at(3, sure=False),
+            "perhaps coughing once (03:00)",
+            "vielleicht einmal Husten (03:00)",
+        ),
+        (
+            [*coughs_at(3), *coughs_at(4, sure=False), (5, 3, "crying", 0.9)],
+            "coughing once (03:00), perhaps once more (04:00); crying once (05:00)",
+            "einmal Husten (03:00), vielleicht noch einmal (04:00); einmal Weinen (05:00)",
+        ),
+        (
+            [*coughs_at(3), (5, 3, "crying", 0.6)],
+            "coughing once (03:00) and perhaps crying once (05:00)",
+            "einmal Husten (03:00) und vielleicht einmal Weinen (05:00)",
+        ),
+    ],
+)
+def test_the_sentence_tells_what_is_sure_from_what_may_be(sounds, english, german):
+    for language, what in (("en", english), ("de", german)):
+        sentence = picture_of(home_at(9, tiled((-3, 9), *sounds), language=language))["sentence"]
+        start, end = {
+            "en": ("A quiet night: ", ", by the sound of it."),
+            "de": ("Eine ruhige Nacht: ", ", dem Klang nach."),
+        }[language]
+        assert sentence == f"{start}{what}{end}"
+
+
+def test_the_sentence_names_a_room_once_for_what_is_sure_and_what_may_be_there():
+    rooms = {
+        "bath": [tiled((-3, 9), *coughs_at(2), *coughs_at(3, sure=False))],
+        "kitchen": [tiled((-3, 9), *coughs_at(2, sure=False))],
+    }
+    assert picture_of(home_of_rooms(9, rooms))["sentence"] == (
+        "A quiet night: coughing once (Bath: 02:00), perhaps once more (03:00), "
+        "perhaps once (Kitchen: 02:00), by the sound of it."
+    )
+
+
+def test_the_sentence_the_times_and_the_list_call_the_same_sounds_not_sure(tmp_path):
+    sounds = [*coughs_at(2.2), *coughs_at(2.17, 5, 6.22, sure=False)]
+    home = home_at(9, tiled((-3, 9), *sounds))
+    (microphone,) = home.microphones
+    events = microphone.events("coughing", 0)
+    answer = Mark("mic", events[2].start, events[2].end, "coughing")
+    home = home._replace(corrections=EventCorrections(tmp_path, "home").of_day([answer]))
+
+    def shown():
+        picture = picture_of(home)
+        (lane,) = (e for e in picture["rooms"][0]["lanes"] if e["label"] == "coughing")
+        correction = {events[2].id: "You said: Coughing"}
+        entries = ShownBouts(
+            home.moment.now,
+            UTC,
+            home.words,
+            lambda event: correction.get(event.id, ""),
+            True,
+            home.sureness,
+        )
+        times = {
+            clock: about.partition(" · ")[2] for clock, _, about, _ in lane["times"][0]["times"]
+        }
+        return picture["sentence"], times, [entries.describe(b)["sure"] for b in bouts(events)]
+
+    sentence, times, entries = shown()
+    assert "coughing twice (02:12 and 05:00), perhaps twice more (02:10 and 06:13)" in sentence
+    assert times == {"06:13": "not sure", "05:00": "", "02:12": "", "02:10": "not sure"}
+    assert entries == ["not sure", "", "1 of them not sure"]
+    home = home._replace(sureness=Sureness(0.55))  # as the checked minutes of the home have it
+    sentence, times, entries = shown()
+    assert "coughing 4 times (02:10 to 06:13), by" in sentence
+    assert times == {"06:13": "sure", "05:00": "", "02:12": "sure", "02:10": "sure"}
+    assert entries[0] == entries[2] == "sure"
 
 
 def test_a_night_is_quiet_if_it_is_so_in_each_room():

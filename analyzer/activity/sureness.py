@@ -41,6 +41,10 @@ class Sureness(NamedTuple):
             return SURE
         return NOT_SURE if confidence < _DOUBTFUL else ""
 
+    def is_unsure(self, confidence: float) -> bool:
+        """Whether a confidence is shown as not sure."""
+        return self.word(confidence) == NOT_SURE
+
 
 UNMEASURED = Sureness()
 

@@ -20,6 +20,7 @@ _LANGUAGE = re.compile(r"([a-z]{2,3})\.json")
 _DEFAULT = "en"
 _LONGEST_HEADER = 500  # characters of an `Accept-Language`
 _CLASS = "class."
+_TIMES = {0: "never", 1: "once", 2: "twice"}  # keys of counts that have a word
 _WITH_CAUSE = ("error.not saved", "error.not played")
 
 
@@ -116,8 +117,11 @@ class Words:
 
     def times(self, count: int) -> str:
         """Format a count: `never`, `once`, `4 times`."""
-        key = {0: "never", 1: "once", 2: "twice"}.get(count, "times")
-        return self.text(key, count=self.number(count))
+        return self.text(_TIMES.get(count, "times"), count=self.number(count))
+
+    def more_times(self, count: int) -> str:
+        """Format a count, of at least one, in addition to another: `once more`."""
+        return self.text(f"more.{_TIMES.get(count, 'times')}", count=self.number(count))
 
     def class_words(self, label: str) -> str:
         """Return the display name of a class, on one line of limited length."""

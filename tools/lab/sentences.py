@@ -537,18 +537,24 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
         yield _judged(PAGE, text, f"{sound:.1f} min of sound", right=sound <= limit, modest=modest)
     for name in names:
         words = re.escape(in_words(name).lower())
-        match = re.search(rf"{words} ({_NUMBER})(?: times)?(?: \(([^)]*)\))?", text, re.IGNORECASE)
+        match = re.search(
+            rf"(perhaps )?{words} ({_NUMBER})(?: times)?(?: \(([^)]*)\))?"
+            rf"(?:, perhaps ({_NUMBER}) more(?: times)?(?: \(([^)]*)\))?)?",
+            text,
+            re.IGNORECASE,
+        )
         if match is None:
             continue
-        stated = _number(match[1])
+        perhaps, count, times, more, more_times = match.groups(default="")
+        stated = _number(count)
         yield _counted(
             PAGE,
             f"{text} [{in_words(name)}]",
-            (stated, stated),
+            (0 if perhaps else stated, stated + (_number(more) if more else 0)),
             minutes.count(name, None).labelled,
             modest=modest,
         )
-        if clocks := _CLOCK.findall(match[2] or ""):
+        if clocks := _CLOCK.findall(f"{times} {more_times}"):
             yield _at_times(PAGE, f"{text} [{in_words(name)}]", name, clocks, truth, modest=modest)
 
 

@@ -68,8 +68,17 @@ class HomeDay(NamedTuple):
     sureness: Sureness = UNMEASURED
 
     def sure(self, event: SoundEvent) -> str:
-        """Return a word for the confidence of an event; empty if none can be justified."""
+        """Return a word for the confidence of an event; empty if none can be justified.
+
+        What somebody has answered needs none.
+        """
+        if self.corrections.of(event) is not None:
+            return ""
         return self.words.sureness(event.confidence, self.sureness)
+
+    def is_unsure(self, event: SoundEvent) -> bool:
+        """Whether an event is shown as not sure: nobody has answered what it was, either."""
+        return self.sureness.is_unsure(event.confidence) and self.corrections.of(event) is None
 
     def sounds(self, microphone: LiveMicrophone, since: int) -> dict[str, ClassSounds]:
         """Return the events of each shown class since a time, corrected by people."""
@@ -280,29 +289,52 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     words = home.words
     names = [name for name in found if name in IMPORTANT] or [*found]
     parts = [_class_and_times(name, found[name], home) for name in names[:_MOST_CLASSES]]
-    what = words.listed(parts)
+    is_simple = all(len(part) == 1 for part in parts)
+    texts = [", ".join(part) for part in parts]
+    what = words.listed(texts) if is_simple else "; ".join(texts)
     if not parts and when in map(words.text, _PARTLY):
         return f"{when}."
     text = words.text("sentence", when=when, what=what) if parts and when else when or what
     return words.text("by its sound", sentence=text[:1].upper() + text[1:]) + "."
 
 
-def _class_and_times(name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:
-    """Format the counts of a class, by room: rooms may hear the same sound, so none are added."""
+def _class_and_times(
+    name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay
+) -> list[str]:
+    """Format the counts of a class, by room: rooms may hear the same sound, so none are added.
+
+    In each room first the events that are counted on, then those that are not sure.
+    """
     words = home.words
     shown = words.inside(words.class_words(name))
     parts: list[str] = []
     for microphone, events in rooms.items():
-        where = _where(name, microphone, events, home)
-        key = "times and clocks" if parts else "class and times" if where else "class and count"
-        values = {"class": shown, "times": words.times(len(events)), "clocks": where}
-        parts.append(words.text(key, **values))
-    return ", ".join(parts)
+        unsure = [event for event in events if home.is_unsure(event)]
+        sure = [event for event in events if event not in unsure]
+        if sure:
+            where = _where(name, microphone, sure, home)
+            parts.append(_times_of(words.times(len(sure)), where, "" if parts else shown, words))
+        if unsure:
+            count = len(unsure)
+            times = words.more_times(count) if sure else words.times(count)
+            where = _where(name, "" if sure else microphone, unsure, home)
+            text = _times_of(times, where, "" if parts else shown, words)
+            parts.append(words.text("perhaps", what=text))
+    return parts
+
+
+def _times_of(times: str, where: str, name: str, words: Words) -> str:
+    """Format a count, with its class and where it was if these are given."""
+    if not name:
+        return words.text("times and clocks", times=times, clocks=where) if where else times
+    key = "class and times" if where else "class and count"
+    return words.text(key, **{"class": name, "times": times, "clocks": where})
 
 
 def _where(name: str, microphone: str, events: Sequence[SoundEvent], home: HomeDay) -> str:
     """Format in which of several rooms, and for an important class when, a sound was heard."""
-    words, place = home.words, room(microphone) if len(home.microphones) > 1 else ""
+    words = home.words
+    place = room(microphone) if microphone and len(home.microphones) > 1 else ""
     if name not in IMPORTANT:
         return place
     clocks = [*dict.fromkeys(clock(event.start, home.zone) for event in events)]

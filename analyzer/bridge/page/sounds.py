@@ -12,7 +12,7 @@ from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
 from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.sources import source_microphone
-from hearthlog.analyzer.activity.sureness import UNMEASURED, Sureness
+from hearthlog.analyzer.activity.sureness import SURE, UNMEASURED, Sureness
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.bridge.page.day import IMPORTANT
 from hearthlog.analyzer.bridge.page.doubts import Doubts
@@ -176,10 +176,19 @@ class ShownBouts(NamedTuple):
 
     def _sureness(self, bout: Bout) -> str:
         if not bout.doubts:
-            highest = max(each.confidence for each in bout.events)
-            return self.words.sureness(highest, self.sureness)
+            return self._sureness_of(bout.events)
         is_loud = any(doubt.is_loud for doubt in bout.doubts)
         return self.words.text("doubt.why loud" if is_loud else "doubt.why")
+
+    def _sureness_of(self, events: Sequence[SoundEvent]) -> str:
+        """Return how many of some events are not sure; whether the likeliest is if none are."""
+        unsure = sum(
+            self.sureness.is_unsure(e.confidence) and not self.correction(e) for e in events
+        )
+        if 0 < unsure < len(events):
+            return self.words.text("not sure.some", count=self.words.number(unsure))
+        word = self.sureness.word(max(event.confidence for event in events))
+        return self.words.text(word) if word == SURE or unsure else ""
 
     def _beside(self, bout: Bout) -> str:
         """Return how many events of a bout do not count, because of a television beside."""
