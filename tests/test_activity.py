@@ -28,7 +28,7 @@ from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, today
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, one
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, write_marks
 from hearthlog.analyzer.promotion.paired_labels import reference_sounds
 from hearthlog.analyzer.promotion.recent_time import recent_logs, spans_of
@@ -115,11 +115,14 @@ def test_the_page_shows_the_counts_of_the_report(logs, followed):
     moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
     (room,) = picture_of(HomeDay([*followed.microphones.values()], moment, ZONE))["rooms"]
     (own,) = followed.microphones.values()
+    _, day = day_metrics(logs)
     for lane in room["lanes"]:
         name = lane["label"]
         later = [e for e in own.events(name, moment.now) if e.start < day_span(DAY, ZONE)[1]]
-        of_day, of_night, _ = reported(logs)[name]
-        assert ((lane["today"] or 0), lane["night"] or 0) == (of_day, of_night), (name, later)
+        _, of_night, _ = reported(logs)[name]
+        waking = one(*(at_hour(DAY, hour, ZONE) for hour in (MORNING, EVENING)))
+        of_day = day.home.minutes.between(waking).count(name, None).labelled
+        assert [count or 0 for count in lane["counts"]] == [of_night, of_day], (name, later)
 
 
 def test_totals_and_alerts_at_once_count_also_beside_a_television(logs, followed, tmp_path):
@@ -176,7 +179,7 @@ def test_two_microphones_are_counted_apart_by_the_bridge_and_joined_by_the_repor
     moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
     rooms = picture_of(HomeDay([*state.microphones.values()], moment, ZONE))["rooms"]
     shown = {
-        room["room"]: lane["today"]
+        room["room"]: lane["count"]
         for room in rooms
         for lane in room["lanes"]
         if lane["label"] == "coughing"

@@ -569,6 +569,7 @@ def test_a_day_on_which_the_clock_is_changed_has_the_hours_of_the_clock(day, hou
     state.push([segments("mic", (noon, noon + 120 * NANOSECONDS, "speech"))])
     picture = picture_of(HomeDay([*state.microphones.values()], today(noon + 60, zone), zone))
     clock = [hour for _, hour in picture["hours"]]
+    assert clock[:2] == [22, 23]
     assert len(clock) == hours
     assert sorted({*clock}) == sorted({*range(24)} - ({2} if hours == 23 else set()))
     noons = [place for place, hour in picture["hours"] if hour == 12]
@@ -576,21 +577,20 @@ def test_a_day_on_which_the_clock_is_changed_has_the_hours_of_the_clock(day, hou
     assert len(lane["bars"]) == hours * 30
     assert lane["bars"].index("9") / len(lane["bars"]) == pytest.approx(noons[0], abs=1e-4)
     places = {hour: place for place, hour in picture["hours"]}
-    assert picture["nights"] == [(0, places[7]), (places[22], 1)]
+    assert picture["nights"] == [(0, places[7])]
 
 
-def test_an_event_from_before_midnight_reaches_into_the_day_and_counts_for_the_night():
+def test_an_event_from_before_midnight_is_of_the_night_and_counts_once():
     begin = at(UTC, 2026, 5, 5)
     minute = 60 * NANOSECONDS
     state = HomeState()
     state.push([segments("mic", (begin - 60 * minute, begin + 60 * minute, "music"))])
     now = today(begin + 600 * minute, UTC)
     (lane,) = picture_of(HomeDay([*state.microphones.values()], now, UTC))["rooms"][0]["lanes"]
-    assert lane["bars"] == "9" * 30 + "0" * 690
-    assert (lane["today"], lane["night"], lane["told"]) == (
-        0,
-        1,
-        "Music: never today, by the sound of it",
+    assert lane["bars"] == "0" * 30 + "9" * 60 + "0" * 630
+    assert (lane["counts"], lane["told"]) == (
+        [1, None],
+        "Music: once since yesterday evening, by the sound of it, last at 01:00",
     )
 
 
@@ -622,10 +622,11 @@ def test_a_0_is_said_only_where_it_was_listened_for(first, gap, today_known, nig
         for each in picture_of(HomeDay([microphone], now, UTC))["rooms"][0]["lanes"]
     }
     cough = lanes["Coughing"]
-    assert cough["today"] == (0 if today_known else None)
-    assert cough["night"] == (0 if night_known else None)
-    assert ("not known" in cough["told"]) == (not today_known)
-    assert lanes["Music"]["night"] == (1 if -2 <= first < 7 else lanes["Coughing"]["night"])
+    night, day = cough["counts"]
+    assert day == (0 if today_known else None)
+    assert night == (0 if night_known else None)
+    assert ("not known" in cough["told"]) == (not (today_known and night_known))
+    assert lanes["Music"]["counts"][0] == (1 if -2 <= first < 7 else night)
 
 
 def test_what_was_not_heard_is_marked_as_such():
@@ -640,7 +641,7 @@ def test_what_was_not_heard_is_marked_as_such():
     microphone.active.time, microphone.seen = begin + 18 * hour, time.monotonic() - 60
     now = today(begin + 20 * hour, UTC)
     gaps = picture_of(HomeDay([microphone], now, UTC))["rooms"][0]["gaps"]
-    assert gaps == [(0, 0.25), (0.5, 0.5833), (0.75, 0.8333)]
+    assert gaps == [(0, 0.3333), (0.5833, 0.6667), (0.8333, 0.9167)]
 
 
 @pytest.mark.parametrize(
@@ -684,7 +685,7 @@ def test_a_day_of_thousands_of_sounds_is_small():
         HomeDay([*state.microphones.values()], today(begin + 5000 * step, UTC), UTC)
     )
     lanes = picture["rooms"][0]["lanes"]
-    assert {lane["label"]: lane["today"] for lane in lanes} == {
+    assert {lane["label"]: lane["count"] or 0 for lane in lanes} == {
         name: 0 if name in SET_APART else 625 for name in labels
     }, "like a television"
     assert len(json.dumps(picture)) < 40_000
@@ -829,8 +830,9 @@ def test_a_tap_on_a_count_shows_when_and_hides_a_sound_everywhere(phone, lived):
     row = "[...document.querySelectorAll('tbody tr')].find((e) => e.innerText.startsWith('Music'))"
     phone.until(row)
     start = next(e for e in lived.events() if e["label"] == "music")["time"]
-    phone.of(f"{row}.querySelector('button').click()")
+    phone.of(f"{row}.querySelectorAll('button')[1].click()")
     phone.until(f"{row}.nextSibling.innerText.includes({start!r})")
+    phone.shows(".panel", "Music · Since 07:00")
     assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
     phone.of(f"{row}.nextSibling.querySelector('.back').click()")
     phone.shows("#hidden-said", "Music is now hidden everywhere.")
@@ -872,15 +874,16 @@ def test_a_screen_reader_is_told_what_everything_is(phone, lived):
     lanes = [
         name
         for role, name in tree
-        if role == "button" and " today, by the sound of it, last at " in name
+        if role == "button" and " since yesterday evening, by the sound of it, last at " in name
     ]
     cells = [name for role, name in tree if role in {"cell", "gridcell"}]
     # Nothing was recorded before the last night.
-    assert "Coughing, Living room, Last night: not known" in cells
+    assert "Coughing, Living room, Night 22\N{EN DASH}07: not known" in cells
     assert any(
-        name.startswith("Coughing: once today, by the sound of it, last at ") for name in lanes
+        name.startswith("Coughing: once since yesterday evening, by the sound of it, last at ")
+        for name in lanes
     )
-    assert "Crying, Living room, Today: 0" in cells
+    assert "Crying, Living room, Since 07:00: 0" in cells
     buttons = [name for role, name in tree if role == "DisclosureTriangle"]
     assert len({*buttons}) == len(buttons) == len(LIVED) + 1
     assert ("meter", "Loudness, Living room") in tree

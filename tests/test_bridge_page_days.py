@@ -121,8 +121,13 @@ NIGHT = [(2.17, 3, "coughing"), (6.22, 3, "coughing")]
             "Last night: coughing 9 times (01:00 to 01:48), by the sound of it.",
         ),
         (9, (-3, 9), [(1, 1800, "speech")], "Last night: talking once, by the sound of it."),
-        (14, (-3, 14), [(10, 3, "coughing")], "Today: coughing once (10:00), by the sound of it."),
-        (14, (-3, 14), [], "Today: no coughing or crying, by the sound of it."),
+        (
+            14,
+            (-3, 14),
+            [(10, 3, "coughing")],
+            "Since 07:00: coughing once (10:00), by the sound of it.",
+        ),
+        (14, (-3, 14), NIGHT, "Since 07:00: no coughing or crying, by the sound of it."),
         (14, (9, 14), [], "Only part of today was heard."),
     ],
 )
@@ -135,8 +140,8 @@ def test_the_sentence_is_true_and_calls_nothing_quiet_that_was_not_listened_to(
 @pytest.mark.parametrize(
     ("language", "start", "end"),
     [
-        ("en", "Today: coughing twice", "by the sound of it."),
-        ("de", "Heute: zweimal Husten", "dem Klang nach."),
+        ("en", "Since 07:00: coughing twice", "by the sound of it."),
+        ("de", "Seit 07:00: zweimal Husten", "dem Klang nach."),
     ],
 )
 def test_a_sound_that_two_rooms_may_have_heard_is_not_counted_twice(language, start, end):
@@ -262,18 +267,52 @@ def test_rings_and_coughs_beside_a_television_are_not_counted_and_the_lane_says_
     picture = picture_of(home_at(15, tiled((-3, 15), *talking, *rings)))
     lanes = {lane["label"]: lane for lane in picture["rooms"][0]["lanes"]}
     ring = lanes["phone_ring"]
-    assert (ring["today"], len(ring["times"][0]["times"])) == (1, 1)
+    assert (ring["count"], ring["counts"], len(ring["times"][2]["times"])) == (1, [0, 1], 1)
     assert ring["told"].endswith("; twice beside something like a television, not counted")
-    assert picture["sentence"] == "Today: telephone ringing once (09:15), by the sound of it."
-    assert lanes["speech"]["today"] == 60, "talking of a television is talking"
+    assert picture["sentence"] == "Since 07:00: telephone ringing once (09:15), by the sound of it."
+    assert lanes["speech"]["counts"] == [0, 60], "talking of a television is talking"
 
 
 def test_the_counts_of_the_sentence_are_those_below_it():
     picture = picture_of(home_at(9, tiled((-3, 9), *NIGHT)))
     (lane,) = (each for each in picture["rooms"][0]["lanes"] if each["label"] == "coughing")
-    assert (lane["today"], lane["night"]) == (2, 2)
-    assert [time for time, *_ in lane["times"][0]["times"]] == ["06:13", "02:10"]
-    assert lane["times"][0]["times"][0][1].startswith("mic-coughing-")
+    assert (lane["count"], lane["counts"]) == (2, [2, 0])
+    for times in lane["times"][:2]:
+        assert [time for time, *_ in times["times"]] == ["06:13", "02:10"]
+        assert times["times"][0][1].startswith("mic-coughing-")
+    assert lane["times"][2] == {"times": [], "before": 0}
+
+
+EVENINGS = coughs_at(-1.5, 0.67, 6.99, 7, 21.99, 22, 23)
+
+
+@pytest.mark.parametrize(
+    ("hour", "columns", "counts"),
+    [
+        (3, ["Since 22:00"], [2]),
+        (7.5, ["Night 22\N{EN DASH}07", "Since 07:00"], [3, 1]),
+        (21.995, ["Night 22\N{EN DASH}07", "Since 07:00"], [3, 2]),
+        (22.5, ["Night 22\N{EN DASH}07", "Day 07\N{EN DASH}22", "Since 22:00"], [3, 2, 1]),
+        (23.99, ["Night 22\N{EN DASH}07", "Day 07\N{EN DASH}22", "Since 22:00"], [3, 2, 2]),
+    ],
+)
+def test_no_sound_counts_twice_and_each_count_lists_what_it_counts(hour, columns, counts):
+    heard = [each for each in EVENINGS if each[0] < hour]
+    picture = picture_of(home_at(hour, tiled((-3, hour), *heard)))
+    (lane,) = (each for each in picture["rooms"][0]["lanes"] if each["label"] == "coughing")
+    assert picture["columns"] == columns
+    assert (lane["counts"], lane["count"]) == (counts, sum(counts))
+    whole, *each = [[own for _, own, *_ in times["times"]] for times in lane["times"]]
+    assert [len(ids) for ids in each] == counts
+    assert whole == [own for ids in reversed(each) for own in ids]
+    shown = {n / 30 - 2 for n, bar in enumerate(lane["bars"]) if bar != "0"}
+    assert len(shown) == len(heard)
+    assert min(shown) == pytest.approx(-1.5, abs=1 / 30)
+
+
+def test_the_hours_of_the_counts_are_there_in_german():
+    picture = picture_of(home_at(22.5, tiled((-3, 22.5)), language="de"))
+    assert picture["columns"] == ["Nacht 22\N{EN DASH}07", "Tag 07\N{EN DASH}22", "Seit 22:00"]
 
 
 def test_what_people_say_of_a_sound_is_what_the_page_counts(tmp_path):
@@ -294,7 +333,9 @@ def test_what_people_say_of_a_sound_is_what_the_page_counts(tmp_path):
     lanes = {lane["label"]: lane for lane in picture["rooms"][0]["lanes"]}
     assert [time for time, *_ in lanes["coughing"]["times"][0]["times"]] == ["13:24", "11:30"]
     assert [time for time, *_ in lanes["crying"]["times"][0]["times"]] == ["10:30"]
-    assert picture["sentence"].startswith("Today: coughing twice (11:30 and 13:24) and crying once")
+    assert picture["sentence"].startswith(
+        "Since 07:00: coughing twice (11:30 and 13:24) and crying once"
+    )
 
 
 def test_what_is_not_counted_is_drawn_pale_and_its_entry_says_so():
@@ -302,7 +343,9 @@ def test_what_is_not_counted_is_drawn_pale_and_its_entry_says_so():
     coughs = [(hour, 4, "coughing") for hour in (9.26, 13.409, 13.45)]
     home = home_at(15, tiled((-3, 15), *talking, *coughs))
     (lane,) = (e for e in picture_of(home)["rooms"][0]["lanes"] if e["label"] == "coughing")
-    marked = [{n / 30 for n, bar in enumerate(lane[key]) if bar != "0"} for key in ("bars", "pale")]
+    marked = [
+        {n / 30 for n, bar in enumerate(lane[key], -60) if bar != "0"} for key in ("bars", "pale")
+    ]
     assert [{round(hour, 2) for hour in own} for own in marked] == [{9.23}, {13.4, 13.43}]
     events = events_between(home.microphones, MIDNIGHT, MIDNIGHT + 24 * HOUR)
     uncounted = uncounted_ids(home.microphones, events)
@@ -320,9 +363,9 @@ def test_what_is_not_counted_is_drawn_pale_and_its_entry_says_so():
 def test_hours_that_no_log_has_are_hatched_and_no_0_is_said_of_them():
     home = home_at(9, tiled((-3, -2)), tiled((7, 9)))
     (room,) = picture_of(home)["rooms"]
-    assert room["gaps"] == [(0, round(7 / 24, 4))]
-    assert {lane["night"] for lane in room["lanes"]} == {None}
-    assert {lane["today"] for lane in room["lanes"]} == {0}
+    assert room["gaps"] == [(0, round(9 / 24, 4))]
+    assert [lane["counts"] for lane in room["lanes"]] == [[None, 0]] * len(room["lanes"])
+    assert {lane["count"] for lane in room["lanes"]} == {None}
     (microphone,) = home.microphones  # what MQTT publishes
     assert microphone.counts(home.moment)["coughing"] == (0, None)
 
@@ -423,7 +466,7 @@ def test_a_past_day_has_the_picture_the_counts_and_the_sounds_of_its_logs(lived)
     assert (status, day["now"]) == (200, None)
     lanes = {lane["label"]: lane for lane in day["rooms"][0]["lanes"]}
     assert {*lanes} == {*GENERAL} - {"silence"}
-    assert (lanes["coughing"]["today"], lanes["crying"]["today"]) == (1, 0)
+    assert (lanes["coughing"]["count"], lanes["crying"]["counts"][1]) == (1, 0)
     assert [each["label"] for each in day["events"]] == ["speech", "coughing"]
     assert f"mic-coughing-{lived.coughed}" in day["events"][1]["ids"]
     assert day["events"][1]["look"]
@@ -745,7 +788,7 @@ def test_a_lane_is_opened_by_keyboard_and_shows_its_times(phone, lived):
     phone.until(lane("Coughing"))
     phone.of(f"{lane('Coughing')}.focus()")
     phone.press("Enter", "\r")
-    phone.shows(".panel", "Coughing · Today")
+    phone.shows(".panel", "Coughing · since yesterday evening")
     phone.shows(".panel", "Hide coughing everywhere")
     assert phone.of("document.querySelectorAll('.panel li').length") == 1
     assert phone.of(f"{lane('Coughing')}.getAttribute('aria-expanded')") == "true"

@@ -2,6 +2,7 @@
 
 from datetime import UTC, date
 
+import numpy as np
 import pytest
 
 from hearthlog.analyzer.activity.home_data import read_home
@@ -89,5 +90,6 @@ def test_the_page_has_one_lane_of_running_water_and_counts_what_the_report_count
     assert not lanes.keys() & {*WATER}
     account, _ = read_account(find_home_logs([logs]), Period(DAY, 1, UTC))
     (day,) = account.days
-    assert lanes["running_water"]["today"] == day.count("running_water").labelled > 0
+    begun = np.concatenate([day.night_events("running_water"), day.events("running_water")])
+    assert lanes["running_water"]["count"] == len({*begun.tolist()}) > 0
     assert words_of("de").class_words("running_water") == "Fließendes Wasser"

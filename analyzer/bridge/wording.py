@@ -70,19 +70,23 @@ class Words:
                 return self.text(key, text=self.translated(english.removeprefix(begin)))
         return english
 
-    def when(self, time: int, now: int, zone: tzinfo, *, seconds: bool = False) -> str:
+    def when(
+        self, time: int, now: int, zone: tzinfo, *, seconds: bool = False, is_past: bool = False
+    ) -> str:
         """Format a time relative to now: `14:05`, `yesterday 23:10`, `3 May 14:05`.
 
         Parameters
         ----------
         seconds : bool
             Whether to include seconds.
+        is_past : bool
+            Whether `now` is on a past day: then no other day is called yesterday.
         """
         moment, today = local_time(time, zone), local_time(now, zone).date()
         shown = f"{moment:%H:%M:%S}" if seconds else f"{moment:%H:%M}"
         if moment.date() == today:
             return shown
-        if moment.date() == today - timedelta(days=1):
+        if not is_past and moment.date() == today - timedelta(days=1):
             return self.text("yesterday", time=shown)
         short = self.text("date", day=moment.day, month=self._months[moment.month - 1])
         return self.text("date and time", date=short, time=shown)

@@ -79,6 +79,11 @@ def local_time(nanoseconds: int, zone: tzinfo) -> datetime:
     return datetime.fromtimestamp(nanoseconds // NANOSECONDS, UTC).astimezone(zone)
 
 
+def evening_before(day: date, zone: tzinfo) -> int:
+    """Return the start of the night that ends on a day, in nanoseconds of UTC."""
+    return at_hour(day - timedelta(days=1), EVENING, zone)
+
+
 class Today(NamedTuple):
     """The current local day and the last night, in nanoseconds of UTC.
 

@@ -489,7 +489,9 @@ def page_statements(
 ) -> Iterator[Statement]:
     """Yield the statements of the page of the home about a past day, and of its morning."""
     picture = picture_of(home)
-    yield from _page_sentence(picture["sentence"], home, truth, truth.everywhere.span)
+    night, day = (one(part.start, part.end) for part in home.times_of_day())
+    both = one(int(night.starts[0]), int(day.ends[0]))
+    yield from _page_sentence(picture["sentence"], home, truth, both)
     morning = home._replace(
         moment=home.moment._replace(now=at_hour(truth.metrics.day, MORNING, home.zone) + HOUR),
         is_past=False,
@@ -497,15 +499,11 @@ def page_statements(
     yield from _page_sentence(picture_of(morning)["sentence"], home, truth, truth.everywhere.night)
     for lane in (each for each in picture["rooms"][0]["lanes"] if each["label"] != UNKNOWN):
         name, modest = lane["label"], is_modest(lane["told"])
-        for key, span, what in (
-            ("today", truth.metrics.span, "today"),
-            ("night", truth.metrics.night, "last night"),
-        ):
-            if lane[key] is not None:
-                text = f"{lane['words']}, {what}: {lane[key]}"
-                yield _counted(
-                    PAGE, text, (lane[key],) * 2, _of_page(truth, lane, name, span), modest=modest
-                )
+        for count, span, what in zip(lane["counts"], (night, day), picture["columns"], strict=True):
+            if count is not None:
+                text = f"{lane['words']}, {what}: {count}"
+                true = _of_page(truth, lane, name, span)
+                yield _counted(PAGE, text, (count, count), true, modest=modest)
         times = [time for time, *_ in lane["times"][0]["times"]]
         if times and len(times) <= 5:
             text = f"{lane['words']} at {', '.join(times)}"
@@ -560,7 +558,7 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
 
 def _sureness(home: HomeDay, truth: TrueDay, measured: Sureness) -> Iterator[Statement]:
     """Check how many of the sounds that are said to be sure are right."""
-    events = events_between(home.microphones, home.moment.midnight, home.moment.now + 1)
+    events = events_between(home.microphones, home.moment.night, home.moment.now + 1)
     shown = ShownBouts(home.moment.now, home.zone, ENGLISH, lambda _: "", True, measured)
     found: defaultdict[str, list[bool]] = defaultdict(list)
     for bout in bouts(events):

@@ -1,7 +1,7 @@
 """A day on the page: its picture, counts, times, and one sentence about it."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from datetime import tzinfo
+from datetime import date, tzinfo
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity.events import SoundEvent
@@ -11,7 +11,6 @@ from hearthlog.analyzer.bridge.home_state import (
     MOST,
     NO_CORRECTIONS,
     ClassSounds,
-    ListeningThreshold,
     LiveMicrophone,
 )
 from hearthlog.analyzer.bridge.wording import ENGLISH, Words, clock, room
@@ -22,6 +21,7 @@ from hearthlog.analyzer.logs.local_time import (
     Today,
     at_hour,
     day_span,
+    evening_before,
     local_time,
 )
 from hearthlog.analyzer.logs.spans import joined
@@ -37,8 +37,16 @@ _SILENT = 60 * NANOSECONDS  # shortest gap that is drawn
 _DIGITS = 4  # decimals of a position in the day, 0 to 1
 
 
+class TimeOfDay(NamedTuple):
+    """A part of a day, in nanoseconds of UTC; no two of a day have a time in common."""
+
+    name: str  # of the column of its counts
+    start: int
+    end: int
+
+
 class DaySpan(NamedTuple):
-    """A local day from midnight to midnight, in nanoseconds of UTC."""
+    """A span of the local time of a home, in nanoseconds of UTC."""
 
     start: int
     end: int
@@ -76,6 +84,10 @@ class HomeDay(NamedTuple):
             return ""
         return self.words.sureness(event.confidence, self.sureness)
 
+    def when(self, time: int) -> str:
+        """Format a time: `14:05`, on the current day also `yesterday 23:10`."""
+        return self.words.when(time, self.moment.now, self.zone, is_past=self.is_past)
+
     def is_unsure(self, event: SoundEvent) -> bool:
         """Whether an event is shown as not sure: nobody has answered what it was, either."""
         return self.sureness.is_unsure(event.confidence) and self.corrections.of(event) is None
@@ -84,43 +96,76 @@ class HomeDay(NamedTuple):
         """Return the events of each shown class since a time, corrected by people."""
         return microphone.sounds(since, self.corrections, microphone.common_names)
 
+    @property
+    def date(self) -> date:
+        """The local date."""
+        return local_time(self.moment.midnight, self.zone).date()
+
     def span(self) -> DaySpan:
-        """Return the day from midnight to midnight."""
-        date = local_time(self.moment.midnight, self.zone).date()
-        return DaySpan(*day_span(date, self.zone), self.zone)
+        """Return the day with the night before it: from the evening before to the evening.
+
+        The current day has its own evening, too: only from midnight on it belongs to the next.
+        """
+        start, evening = evening_before(self.date, self.zone), self._hour(EVENING)
+        is_late = not self.is_past and self.moment.now >= evening
+        return DaySpan(start, day_span(self.date, self.zone)[1] if is_late else evening, self.zone)
+
+    def times_of_day(self) -> list[TimeOfDay]:
+        """Return the parts of the day that have begun: its night, the day and the evening."""
+        span, now, words = self.span(), self.moment.now, self.words
+        morning, evening = self._hour(MORNING), self._hour(EVENING)
+        first, last = f"{EVENING:02}", f"{MORNING:02}"
+        parts = (
+            TimeOfDay(words.text("hours of night", first=first, last=last), span.start, morning),
+            TimeOfDay(words.text("hours of day", first=last, last=first), morning, evening),
+            TimeOfDay("", evening, span.end),
+        )
+        begun = [part for part in parts if part.start <= min(now, span.end - 1)]
+        if not self.is_past and now < begun[-1].end:
+            since = words.text("since", time=clock(begun[-1].start, self.zone))
+            begun[-1] = begun[-1]._replace(name=since)
+        return begun
+
+    def _hour(self, hour: int) -> int:
+        return at_hour(self.date, hour, self.zone)
 
 
 def picture_of(home: HomeDay) -> Any:
     """Return the picture of a day for JSON."""
     day = home.span()
-    date = local_time(day.start, home.zone).date()
     hours = range(day.start, day.end, _HOUR)
-    nights = [
-        (day.start, at_hour(date, MORNING, home.zone)),
-        (at_hour(date, EVENING, home.zone), day.end),
-    ]
+    morning, evening = (at_hour(home.date, hour, home.zone) for hour in (MORNING, EVENING))
+    nights = [(day.start, morning), *([(evening, day.end)] if evening < day.end else [])]
     now = home.moment.now
     return {
-        "date": date.isoformat(),
-        "title": home.words.long_date(date),
+        "date": home.date.isoformat(),
+        "title": home.words.long_date(home.date),
         "sentence": day_sentence(home),
         "now": None if home.is_past else day.place(now - now % BIN),
         "hours": [(day.place(hour), local_time(hour, home.zone).hour) for hour in hours],
         "nights": [(day.place(start), day.place(end)) for start, end in nights],
+        "columns": [part.name for part in home.times_of_day()],
         "rooms": [_room(microphone, day, home) for microphone in home.microphones],
     }
 
 
 def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
-    known = microphone.known_of(home.moment)
+    times_of_day = home.times_of_day()
+    known = [_is_known(microphone, part, day, home.moment.now) for part in times_of_day]
     return {
         "room": room(microphone.name),
         "gaps": [(day.place(a), day.place(b)) for a, b in _gaps(microphone, day, home)],
         "lanes": [
-            _lane(label, sounds, day, home, known)
+            _lane(label, sounds, home, [*zip(times_of_day, known, strict=True)])
             for label, sounds in home.sounds(microphone, 0).items()
         ],
     }
+
+
+def _is_known(microphone: LiveMicrophone, part: TimeOfDay, day: DaySpan, now: int) -> bool:
+    """Whether a part of the day was listened to enough for a count of 0."""
+    share = microphone.listened_share(part.start, min(part.end, now))
+    return share >= MOST if part.start == day.start else share > 0
 
 
 def _gaps(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> list[tuple[int, int]]:
@@ -132,19 +177,22 @@ def _gaps(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> list[tuple
 
 
 def _lane(
-    label: str, sounds: ClassSounds, day: DaySpan, home: HomeDay, known: ListeningThreshold
+    label: str, sounds: ClassSounds, home: HomeDay, parts: Sequence[tuple[TimeOfDay, bool]]
 ) -> Any:
-    today, words = home.moment, home.words
+    day, words = home.span(), home.words
     events = [e for e in sounds.events if day.start - 24 * _HOUR <= e.start < day.end]
     counted = [e for e in sounds.counted if e.start < day.end]
-    of_night = [e for e in counted if today.night <= e.start < today.morning]
-    of_day = [e for e in counted if e.start >= today.midnight]
+    of_parts = [[e for e in counted if part.start <= e.start < part.end] for part, _ in parts]
+    counts = [
+        len(own) if own or is_known else None
+        for own, (_, is_known) in zip(of_parts, parts, strict=True)
+    ]
+    of_day = [event for own in of_parts for event in own]
+    count = len(of_day) if of_day or None not in counts else None
     uncounted = sorted({*events} - {*counted})
-    beside = sum(e.start >= today.midnight for e in uncounted)
-    count: int | None = len(of_day) if of_day or known.day else None
-    night: int | None = len(of_night) if of_night or known.night else None
+    beside = sum(e.start >= day.start for e in uncounted)
     last = (events if home.is_past and events else [None, *sounds.events])[-1]
-    at = "" if last is None else words.when(last.end, today.now, day.zone)
+    at = "" if last is None else home.when(last.end)
     name = words.class_words(label)
     often = words.text("count.not known") if count is None else words.times(count)
     key = "lane of a day" if home.is_past else "lane and last" if count else "lane"
@@ -159,10 +207,10 @@ def _lane(
         "bars": bars((event for event in counted if event.end > day.start), day),
         "pale": bars((event for event in uncounted if event.end > day.start), day),
         "told": description,
-        "today": count,
-        "night": night,
+        "count": count,
+        "counts": counts,
         "last": at,
-        "times": [_times(each, name, sounds.given, home) for each in (of_day, of_night)],
+        "times": [_times(each, name, sounds.given, home) for each in (of_day, *of_parts)],
     }
 
 
@@ -241,13 +289,14 @@ def day_sentence(home: HomeDay) -> str:
 
 
 def _sentence_of_day(home: HomeDay) -> str:
-    moment, words = home.moment, home.words
-    found = _events_of(home, moment.midnight, home.span().end)
-    shares = [m.listened_share(moment.midnight, moment.now) for m in home.microphones]
+    moment, words, span = home.moment, home.words, home.span()
+    start = span.start if home.is_past else at_hour(home.date, MORNING, home.zone)
+    found = _events_of(home, start, span.end)
+    shares = [m.listened_share(start, moment.now) for m in home.microphones]
     if min(shares, default=0) < MOST:
         when = words.text("day.past partly" if home.is_past else "day.partly")
         return _sentence(when, found, home)
-    when = "" if home.is_past else words.text("day.today")
+    when = "" if home.is_past else words.text("since", time=clock(start, home.zone))
     if any(name in IMPORTANT for name in found):
         return _sentence(when, found, home)
     known = {name for each in home.microphones for name in each.classes} & IMPORTANT

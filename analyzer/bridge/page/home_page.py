@@ -36,7 +36,7 @@ from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import Words, clock, preferred_language, room, words_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.local_time import evening_before, local_time
 from hearthlog.analyzer.logs.never_tell import read_list, write_list
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.recorder.host import writes_to_journal
@@ -87,7 +87,7 @@ class HomePage:
         self._started = time.time_ns()
         self._made = -_EVERY_SECONDS
         self._state = HomeState()  # the latest
-        self._events: dict[str, SoundEvent] = {}  # of today and the last night, by id
+        self._events: dict[str, SoundEvent] = {}  # of today and the night before, by id
         self._bouts: dict[str, Bout] = {}  # by id
         self._doubtful: list[SoundEvent] = []
         self.is_settled = False  # whether the views show all that was read from the logs
@@ -168,7 +168,7 @@ class HomePage:
         if self._measured != day:
             self._measured = day
             threading.Thread(target=self._measure, args=(news.today.now,), daemon=True).start()
-        first = min(news.today.midnight, news.today.night)
+        first = evening_before(day, news.zone)
         microphones, doubts = news.state.microphones.values(), self._doubts.found
         key = _events_key(news), len(doubts)
         if key != self._events_key:
@@ -314,13 +314,14 @@ class HomePage:
         microphones = [*day.state.microphones.values()]
         given = self._state.corrections.of_day(day.marks)
         home = HomeDay(microphones, moment, zone, words, True, given, self._sureness)
-        events = events_between(microphones, moment.midnight, moment.now + 1)
+        events = events_between(microphones, moment.night, moment.now + 1)
         every = self._past_bouts(day, events)
         shown = self._shown(words, moment.now, given, is_alone=len(microphones) == 1)
         shown = shown._replace(
             common_names=day.state.common_names,
             uncounted=uncounted_ids(microphones, events),
             hidden=self._state.never_tell,
+            is_past=True,
         )
         return picture_of(home) | {"events": [shown.describe(b) for b in every[:_MOST_OF_DAY]]}
 

@@ -16,7 +16,15 @@ from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.logs.confused_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, find_home_logs
-from hearthlog.analyzer.logs.local_time import EVENING, MORNING, Today, at_hour, day_span
+from hearthlog.analyzer.logs.local_time import (
+    EVENING,
+    MORNING,
+    Today,
+    at_hour,
+    evening_before,
+    local_time,
+    midnight,
+)
 from hearthlog.analyzer.logs.selection import array_names, select
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY
 from hearthlog.analyzer.marks.marks import Mark, read_marks
@@ -58,8 +66,8 @@ class PastDays:
         self._lock = Lock()  # one reader at a time
 
     def dates(self) -> list[date]:
-        """Return the days that have logs, the newest first."""
-        return [*reversed(self._logs().days(self._zone))]
+        """Return the days that have logs, the newest first; an evening is of the next day."""
+        return sorted(self._days_of(self._logs()), reverse=True)
 
     def read(self, day: date, never_tell: frozenset[str]) -> PastDay:
         """Read a day, unless it was read in the last five minutes.
@@ -70,7 +78,7 @@ class PastDays:
             made, found = self._days.get(day, (0.0, None))
             if found is None or time.monotonic() - made > _FRESH_SECONDS:
                 logs = self._logs()
-                if day not in logs.days(self._zone):
+                if day not in self._days_of(logs):
                     raise BridgeError(_NO_LOGS)
                 found = _read(logs, self._node, day, self._zone)
                 self._days[day] = time.monotonic(), found
@@ -88,6 +96,17 @@ class PastDays:
                     return day, day.events[identifier]
         return None
 
+    def _days_of(self, logs: HomeLogs) -> set[date]:
+        """Return the days that have logs: those of the clock, and the next of a past evening."""
+        now = local_time(time.time_ns(), self._zone).date()
+        days = {*logs.days(self._zone)}
+        return days | {
+            after
+            for day in days
+            if (after := day + timedelta(days=1)) <= now
+            and len(logs.between(at_hour(day, EVENING, self._zone), midnight(after, self._zone)))
+        }
+
     def _logs(self) -> HomeLogs:
         try:
             return find_home_logs([self._folder])
@@ -96,9 +115,8 @@ class PastDays:
 
 
 def _read(logs: HomeLogs, node: str, day: date, zone: tzinfo) -> PastDay:
-    start, end = day_span(day, zone)
-    before = day - timedelta(days=1)
-    night = at_hour(before, EVENING, zone), at_hour(day, MORNING, zone)
+    start, end = midnight(day, zone), at_hour(day, EVENING, zone)
+    night = evening_before(day, zone), at_hour(day, MORNING, zone)
     late = end + SEGMENT_DELAY  # a segment is written at its end
     entries = [each for each in logs.between(night[0], late) if each.node == node]
     state, marks = HomeState(), list[Mark]()

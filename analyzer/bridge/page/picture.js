@@ -1,5 +1,5 @@
 // A day as one picture, its counts, and the times behind a lane or a count.
-import { draw, inside, make, place, say, send, set, swatch, write } from "./elements.js";
+import { draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
 import { showEntries } from "./sounds.js";
 
 const LANE = 36, NAME = 15, GAP = 3, HOURS = 20; // pixels
@@ -29,7 +29,7 @@ export function spans(list, width, height) {
 
 function timesOf(it, index) {
   const { times, before } = it.times[index];
-  return { it, times, before, value: index ? it.night : it.today, night: index === 1 };
+  return { it, times, before, value: [it.count, ...it.counts][index], when: [dayName(), ...shown.columns][index] };
 }
 
 // Shows when a sound was heard, below the picture or the count that was chosen; a second tap closes.
@@ -58,8 +58,8 @@ function close() {
 function showTimes() {
   const data = open.data();
   if (!data) { close(); return; }
-  const { it, times, before, value, night } = data;
-  write(open.heading, say("times of", { what: it.words, when: night ? nightName() : dayName() }));
+  const { it, times, before, value, when } = data;
+  write(open.heading, say("times of", { what: it.words, when }));
   showEntries(open.list, open.items, times.map(([time, id, about, said]) =>
     ({ id, ids: [id], label: it.label, words: it.words, time, about, said, isSingle: true })));
   let text = before ? say("before", { count: before }) : "";
@@ -69,8 +69,7 @@ function showTimes() {
 }
 
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
-const dayName = () => place("date").textContent;
-const nightName = () => say(shown?.now === null ? "night before" : "last night");
+const dayName = () => shown.now === null ? shown.title : say("since evening");
 
 async function hideClass(label) {
   const answer = await send("show", { show: "no", label });
@@ -92,32 +91,31 @@ function beginLane(room, number) {
   return lane;
 }
 
-function beginRow(room, label) {
+function beginRow(room, label, columns) {
   const find = () => room.lanes.find((each) => each.label === label);
-  const counts = [0, 1].map((index) => {
+  const counts = columns.map((_, index) => {
     const button = make("button", { type: "button", class: "count", "aria-expanded": "false" });
     button.addEventListener("click", () => choose({ button,
-      where: (panel) => row.element.after(make("tr", { class: "times" }, make("td", { colspan: 4 }, panel))),
-      data: () => { const it = find(); return it && timesOf(it, index); } }));
+      where: (panel) => row.element.after(make("tr", { class: "times" }, make("td", { colspan: columns.length + 2 }, panel))),
+      data: () => { const it = find(); return it && timesOf(it, index + 1); } }));
     return button;
   });
   const name = make("th", { scope: "row" });
-  const cells = [make("td", {}, counts[0]), make("td", {}, counts[1]), make("td")];
-  const row = { label, name, counts, cells, element: make("tr", {}, name, ...cells) };
+  const cells = counts.map((button) => make("td", {}, button)), last = make("td");
+  const row = { label, name, counts, cells, last, element: make("tr", {}, name, ...cells, last) };
   return row;
 }
 
-function showRow(row, it, where) {
+function showRow(row, it, where, columns) {
   if (!row.name.firstChild) row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour), make("span", {}, it.words)));
-  [it.today, it.night].forEach((value, index) => {
+  it.counts.forEach((value, index) => {
     row.cells[index].className = value ? "" : "none";
     write(row.counts[index], value === null ? say("not known") : String(value));
-    const when = index ? nightName() : dayName();
-    const name = [it.words, where, when].filter(Boolean).join(", ");
+    const name = [it.words, where, columns[index]].filter(Boolean).join(", ");
     set(row.counts[index], "aria-label", `${name}: ${row.counts[index].textContent}`);
   });
-  row.cells[2].className = it.last ? "" : "none";
-  write(row.cells[2], it.last || say("not lately"));
+  row.last.className = it.last ? "" : "none";
+  write(row.last, it.last || say("not lately"));
 }
 
 function beginRoom(name, isAlone) {
@@ -131,10 +129,10 @@ function beginRoom(name, isAlone) {
   room.ground = draw("rect", { class: "ground", rx: 6 });
   room.svg = draw("svg", { class: "picture", role: "group" }, room.ground, room.nights, room.unheard,
     room.future, room.group, room.moment, room.hours);
-  room.heads = ["sound", "today", "last night", "last"].map(() => make("th", { scope: "col" }));
+  room.heads = make("tr");
   room.body = make("tbody");
   room.caption = make("caption", { class: "hidden" });
-  room.table = make("table", {}, room.caption, make("thead", {}, make("tr", {}, ...room.heads)), room.body);
+  room.table = make("table", {}, room.caption, make("thead", {}, room.heads), room.body);
   room.note = make("p", { class: "note" });
   room.elements = [...(isAlone ? [] : [make("h3", {}, name)]), room.svg, room.note, room.table];
   return room;
@@ -174,7 +172,7 @@ function showRoom(room, { gaps, lanes }, day) {
       set(path, "fill", `rgb(${it.colour.join(" ")})`);
     }
     write(lane.name, it.words);
-    write(lane.figure, it.today ? `${it.today}×` : "");
+    write(lane.figure, it.count ? `${it.count}×` : "");
     for (const [text, x] of [[lane.name, 6], [lane.figure, width - 6]]) { set(text, "x", x); set(text, "y", top + 12.5); }
   });
   const every = width < 520 ? 4 : 2;
@@ -187,18 +185,16 @@ function showRoom(room, { gaps, lanes }, day) {
 }
 
 function showTable(room, day) {
-  const heads = [say("sound"), say("today"), say("last night"), say("last")];
-  if (day.now === null) [heads[1], heads[2]] = [say("day"), say("night before")];
-  room.heads.forEach((head, index) => write(head, heads[index]));
+  keep(room.heads, [say("sound"), ...day.columns, say("last")], () => make("th", { scope: "col" }), write);
   write(room.caption, room.where ? say("often in", { room: room.where }) : say("often"));
   room.table.hidden = !room.lanes.length;
-  const key = JSON.stringify(room.lanes.map(({ label, words }) => [label, words]));
+  const key = JSON.stringify([day.columns.length, room.lanes.map(({ label, words }) => [label, words])]);
   if (room.key !== key) { // else what somebody reads there stays
     room.key = key;
-    room.rows = room.lanes.map(({ label }) => beginRow(room, label));
+    room.rows = room.lanes.map(({ label }) => beginRow(room, label, day.columns));
     room.body.replaceChildren(...room.rows.map(({ element }) => element));
   }
-  room.rows.forEach((row, index) => showRow(row, room.lanes[index], room.where));
+  room.rows.forEach((row, index) => showRow(row, room.lanes[index], room.where, day.columns));
 }
 
 let rooms = [], roomsOf = "", shown = null;

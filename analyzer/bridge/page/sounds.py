@@ -136,12 +136,13 @@ class ShownBouts(NamedTuple):
     common_names: Mapping[str, str] = MappingProxyType({})
     uncounted: Collection[str] = ()
     hidden: Collection[str] = ()
+    is_past: bool = False
 
     def describe(self, bout: Bout) -> Any:
         """Return a bout for JSON."""
         words, first, last = self.words, bout.first, bout.last
         count = len(bout.events)
-        time = words.when(first.start, self.now, self.zone)
+        time = words.when(first.start, self.now, self.zone, is_past=self.is_past)
         end = clock(last.end, self.zone)
         if count > 1 and end != clock(first.start, self.zone):
             time = words.text("range", first=time, last=end)
