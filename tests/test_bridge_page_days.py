@@ -25,6 +25,7 @@ from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
+from hearthlog.analyzer.bridge.page.doubts import need_look
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import (
     ShownBouts,
@@ -720,6 +721,31 @@ def test_the_page_works_behind_the_ingress_of_home_assistant(phone, lived):
 
 
 SCREAM = 4.0, "music", 0.33, {"coughing": 0.05, "yelling": 0.12}, 48.0
+
+
+def test_what_may_be_a_cough_next_to_one_is_no_second_entry_that_needs_a_look():
+    def sound(seconds, label, microphone="mic"):
+        start = MIDNIGHT + round(seconds * NANOSECONDS)
+        return SoundEvent(microphone, label, start, start + NANOSECONDS, 0.4, 1.0)
+
+    def doubt(event, level=10.0, **shares):
+        return DoubtfulSound(event.label, event.start, event.end, level, shares)
+
+    cough = sound(100, "coughing")
+    before, after = sound(88.9, "objects_activity"), sound(95, "objects_activity")
+    elsewhere = sound(101, "objects_activity", "bath")
+    every = [before, after, cough, elsewhere]
+
+    def looked_at(level=10.0, hidden=(), **shares):
+        shares = {"coughing": 0.33, "crying": 0.0, "yelling": 0.0} | shares
+        doubts = {e.id: doubt(e, level, **shares) for e in (before, after, elsewhere)}
+        unsure = [before, after, elsewhere]
+        return [unsure.index(e) for e in unsure if e.id in need_look(doubts, unsure, every, hidden)]
+
+    assert looked_at() == [0, 2], "ten seconds and more away, or in another room"
+    assert looked_at(yelling=0.2) == [0, 1, 2], "it may be something else"
+    assert looked_at(level=40.0) == [0, 1, 2], "it is loud"
+    assert looked_at(hidden=("coughing",)) == []
 
 
 def test_a_loud_sound_that_the_model_is_unsure_of_needs_a_look_on_its_day_and_later(tmp_path):

@@ -8,14 +8,18 @@ from threading import Thread
 import numpy as np
 
 from hearthlog.analyzer.activity.doubtful_sounds import (
+    WORRYING,
     DoubtfulSound,
     is_doubtful,
+    perhaps,
     read_doubtful_sounds,
 )
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.logs.home_logs import HomeLog, find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE
+from hearthlog.models.classes import class_name
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic
@@ -60,6 +64,37 @@ def read_doubts(
         sounds = read_doubtful_sounds(spans, topics, labelling)
         found |= {ids[sound.label, sound.start]: sound for sound in sounds}
     return found
+
+
+def need_look(
+    doubts: Doubts,
+    events: Iterable[SoundEvent],
+    every: Iterable[SoundEvent],
+    hidden: Collection[str] = (),
+) -> Doubts:
+    """Return the doubts on some events that need a look of their own.
+
+    A sound that is not loud needs none if all it may be sounded just before or after it: were it
+    of that class, both would be one event.
+    """
+    worrying = [event for event in every if class_name(event.label) in WORRYING]
+
+    def is_part(event: SoundEvent, doubt: DoubtfulSound) -> bool:
+        near = {
+            class_name(each.label)
+            for each in worrying
+            if each.microphone == event.microphone
+            and each.start <= event.end + EVENT_PAUSE
+            and event.start <= each.end + EVENT_PAUSE
+        }
+        return not doubt.is_loud and near.issuperset(perhaps([doubt], hidden))
+
+    own = ((event, doubts[event.id]) for event in events if event.id in doubts)
+    return {
+        event.id: doubt
+        for event, doubt in own
+        if doubt.needs_look(hidden) and not is_part(event, doubt)
+    }
 
 
 class CurrentDoubts:

@@ -18,7 +18,7 @@ from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
-from hearthlog.analyzer.bridge.page.doubts import CurrentDoubts, Doubts, doubtful
+from hearthlog.analyzer.bridge.page.doubts import CurrentDoubts, doubtful, need_look
 from hearthlog.analyzer.bridge.page.past_days import PastDay, PastDays
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
@@ -176,7 +176,7 @@ class HomePage:
             every = events_between(microphones, first, news.today.now + _DAY)
             self._events = {event.id: event for event in every}
             self._doubtful = doubtful(microphones, every)
-            folded = bouts(every, _need_look(doubts, self._doubtful, news.state.never_tell))
+            folded = bouts(every, need_look(doubts, self._doubtful, every, news.state.never_tell))
             self._bouts = {bout.first.id: bout for bout in folded}
             self._uncounted = uncounted_ids(microphones, every)
         self._doubts.update(self._doubtful, news.today.now)
@@ -327,7 +327,8 @@ class HomePage:
 
     def _past_bouts(self, day: PastDay, events: Sequence[SoundEvent]) -> list[Bout]:
         microphones, hidden = day.state.microphones.values(), self._state.never_tell
-        return bouts(events, _need_look(day.doubts, doubtful(microphones, events), hidden))
+        unsure = doubtful(microphones, events)
+        return bouts(events, need_look(day.doubts, unsure, events, hidden))
 
     def _mark(self, identifier: str, text: str, words: Words, *, is_single: bool) -> str:
         bout = None if is_single else self._bouts.get(identifier)
@@ -372,12 +373,6 @@ class HomePage:
         with suppress(HearthlogError, OSError):  # not measured
             logs = find_home_logs([self._home.folder])
             self._sureness = read_sureness(logs, now - BASELINE_DAYS * _DAY, now)
-
-
-def _need_look(doubts: Doubts, events: Sequence[SoundEvent], hidden: frozenset[str]) -> Doubts:
-    """Return the doubts on some events that need a look."""
-    own = {event.id: doubts[event.id] for event in events if event.id in doubts}
-    return {name: doubt for name, doubt in own.items() if doubt.needs_look(hidden)}
 
 
 def _classes_key(news: News) -> Any:
