@@ -5,7 +5,7 @@ import json
 import re
 import time
 import wave
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
 from http.client import HTTPConnection
 from types import SimpleNamespace
 from urllib.parse import quote
@@ -33,7 +33,7 @@ from hearthlog.analyzer.bridge.page.sounds import (
     events_between,
     uncounted_ids,
 )
-from hearthlog.analyzer.bridge.settings import PageSettings
+from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import languages, preferred_language, words_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -471,6 +471,25 @@ def test_a_past_day_has_the_picture_the_counts_and_the_sounds_of_its_logs(lived)
     assert [each["label"] for each in day["events"]] == ["speech", "coughing"]
     assert f"mic-coughing-{lived.coughed}" in day["events"][1]["ids"]
     assert day["events"][1]["look"]
+
+
+def test_the_evening_of_a_past_day_is_of_the_night_of_the_next_and_of_no_other(tmp_path):
+    monday, tuesday = date(2026, 3, 2), date(2026, 3, 3)
+    labels = [(at(clock), 2, "coughing", 0.9) for clock in ("03:00", "21:59:50", "22:00", "23:10")]
+    write_day(tmp_path, monday, labels, node="home")
+    past = PastDays(RecorderAddress(tmp_path, "home", UTC))
+    assert past.dates() == [tuesday, monday]
+    found = {}
+    for day in (monday, tuesday):
+        own = past.read(day, frozenset())
+        home = HomeDay([*own.state.microphones.values()], own.moment, UTC, is_past=True)
+        (cough,) = (e for e in picture_of(home)["rooms"][0]["lanes"] if e["label"] == "coughing")
+        found[day] = cough["counts"], [time for time, *_ in cough["times"][0]["times"]]
+    assert found == {
+        monday: ([1, 1], ["21:59", "03:00"]),
+        tuesday: ([2, None], ["23:10", "22:00"]),
+    }
+    assert home.when(own.moment.night) == "2 March 22:00", "which is not yesterday"
 
 
 @pytest.mark.parametrize("text", ["2001-01-01", "", "../../etc/passwd", "9999-12-31", "%00", "x"])
