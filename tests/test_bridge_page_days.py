@@ -189,8 +189,8 @@ def coughs_at(*hours, sure=True):
         ),
         (
             [*coughs_at(3), *coughs_at(4, sure=False), (5, 3, "crying", 0.9)],
-            "coughing once (03:00), perhaps once more (04:00); crying once (05:00)",
-            "einmal Husten (03:00), vielleicht noch einmal (04:00); einmal Weinen (05:00)",
+            "coughing 1 to 2 times (03:00 and 04:00) and crying once (05:00)",
+            "1- bis 2-mal Husten (03:00 und 04:00) und einmal Weinen (05:00)",
         ),
         (
             [*coughs_at(3), (5, 3, "crying", 0.6)],

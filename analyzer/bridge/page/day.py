@@ -337,7 +337,8 @@ def _is_quiet(found: Mapping[str, Sequence[SoundEvent]], length: int) -> bool:
 def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     words = home.words
     names = [name for name in found if name in IMPORTANT] or [*found]
-    parts = [_class_and_times(name, found[name], home) for name in names[:_MOST_CLASSES]]
+    names = names[:_MOST_CLASSES]
+    parts = [_class_and_times(name, found[name], home, brief=len(names) > 1) for name in names]
     is_simple = all(len(part) == 1 for part in parts)
     texts = [", ".join(part) for part in parts]
     what = words.listed(texts) if is_simple else "; ".join(texts)
@@ -348,11 +349,12 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
 
 
 def _class_and_times(
-    name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay
+    name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay, *, brief: bool
 ) -> list[str]:
     """Format the counts of a class, by room: rooms may hear the same sound, so none are added.
 
-    In each room first the events that are counted on, then those that are not sure.
+    In each room first the events that are counted on, then those that are not sure; in brief, both
+    as one range.
     """
     words = home.words
     shown = words.inside(words.class_words(name))
@@ -360,6 +362,12 @@ def _class_and_times(
     for microphone, events in rooms.items():
         unsure = [event for event in events if home.is_unsure(event)]
         sure = [event for event in events if event not in unsure]
+        if brief and sure and unsure:
+            between = words.number(len(sure)), words.number(len(events))
+            times = words.text("times.between", first=between[0], last=between[1])
+            where = _where(name, microphone, events, home)
+            parts.append(_times_of(times, where, "" if parts else shown, words))
+            continue
         if sure:
             where = _where(name, microphone, sure, home)
             parts.append(_times_of(words.times(len(sure)), where, "" if parts else shown, words))
