@@ -131,8 +131,9 @@ class HomePage:
         say(f"the page of the home: {full}")
         if not bind.is_loopback:
             say(
-                f"the page listens on {settings.bind}: it crosses the network unencrypted, and "
-                "others on the network can read it and its token"
+                f"the page listens on {settings.bind}: it crosses a network unencrypted, where "
+                "others can read it and its token, unless a container or a firewall keeps the port "
+                "to this machine"
             )
 
     def words(self, accepted: str) -> Words:
