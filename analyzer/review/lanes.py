@@ -261,7 +261,7 @@ def reviewed_lane(
 def selected_lane(microphone: str, span: tuple[int, int] | None = None) -> Lane:
     """Make the lane of the selected span (ns of UTC), if there is one."""
     edges = np.array([] if span is None else [span], np.int64).reshape(-1, 2)
-    spans = LabelledSpans(*edges.T, np.full(len(edges), SELECTED, object))
+    spans = LabelledSpans(edges[:, 0], edges[:, 1], np.full(len(edges), SELECTED, object))
     return Lane(microphone, "", SELECTED, spans, {SELECTED: SELECTED_COLOUR})
 
 
