@@ -133,20 +133,22 @@ def test_close_ups_are_right_and_the_span_is_marked_also_when_the_queue_jumps_ba
     assert view.state().errors == []
 
 
-def test_a_drag_in_a_queue_is_seen_on_what_is_asked_until_it_is_the_same_span(view, logs, timeline):
+def test_a_drag_in_a_queue_is_seen_on_the_requested_span_until_both_are_the_same(
+    view, logs, timeline
+):
     start = timeline.grid.start + 60 * SECOND
-    asked, dragged = (start, start + 6 * SECOND), (start + 2 * SECOND, start + 12 * SECOND)
-    ask(view, logs, *asked)
-    for span in (dragged, asked, dragged):
+    first, dragged = (start, start + 6 * SECOND), (start + 2 * SECOND, start + 12 * SECOND)
+    ask(view, logs, *first)
+    for span in (dragged, first, dragged):
         view.show(*span, MARGIN)
 
         def is_right(png, span=span):
             view.refresh()  # as a session does several times a second
             picture = pixels(png)
             scale = (picture.shape[1] - _LEFT) / (span[1] - span[0] + 2 * MARGIN)
-            only_asked = _LEFT + round((asked[0] - span[0] + MARGIN + SECOND) * scale)
-            grey = np.ptp(picture[:, only_asked], axis=1) < 20
-            grey &= np.abs(picture[:, only_asked].mean(axis=1) - 90) < 12
+            only_first = _LEFT + round((first[0] - span[0] + MARGIN + SECOND) * scale)
+            grey = np.ptp(picture[:, only_first], axis=1) < 20
+            grey &= np.abs(picture[:, only_first].mean(axis=1) - 90) < 12
             is_behind = grey.sum() >= 20
             return is_asked(picture, *span, beyond=6) and is_behind == (span == dragged)
 
@@ -165,7 +167,7 @@ _NAMES = ["talking", "music", "telephone ringing", "coughing", "household sounds
 
 
 def test_the_question_is_large_and_all_is_shown_on_a_small_screen(timeline):
-    """Lanes beside their names, the probabilities, the question, and two lines of keys."""
+    """Lanes with their names, the probabilities, the question, and two lines of keys."""
     keys = [Key(str(number), name) for number, name in enumerate(_NAMES * 2)]
     question = Question("Is all of this minute labelled right?", "1 of 10", keys)
     start = timeline.grid.start + 60 * SECOND

@@ -46,7 +46,7 @@ CLOSE_UP = "/close_up"  # suffix of a microphone's name
 ASKED, ASKED_NAME = "asked", "words/asked_name"
 QUESTION, ANSWERS = "words/question", "words/asked"
 _ASKED_STROKES = 600  # maximum strokes of a band
-_ASKED, _ASKED_BELOW = SELECTED_COLOUR, (95, 92, 84)
+_ASKED, _COVERED = SELECTED_COLOUR, (95, 92, 84)
 _SELECTED_PLACE = 0.65, 0.35  # the lower edge of the row is out of sight
 
 _THICKNESS = 0.5  # of a strip, in lanes, without the width of its lines
@@ -231,7 +231,7 @@ class RequestedSpan(DrawnLane):
         if (*starts.tolist(), *ends.tolist()) == self._span:
             spans = no_spans()
         super().show(lane._replace(spans=spans), canvas)
-        self._colour(_ASKED_BELOW if len(spans) else _ASKED, canvas)
+        self._colour(_COVERED if len(spans) else _ASKED, canvas)
         canvas.write(ASKED_NAME, "Light: selected" if len(spans) else "Asked about")
 
     @property
