@@ -263,12 +263,12 @@ def test_the_viewer_hardly_grows_with_the_spans_that_it_showed(view, logs, timel
     ours = psutil.Process().children(recursive=True)
     (viewer,) = [each for each in ours if each.name() == "rerun"]
     memory = []
-    for number in range(12):
+    for number in range(20):  # the memory of a viewer goes up and down by tens of megabytes
         start = timeline.grid.start + (30 + 37 * number % 120) * SECOND
         ask(view, logs, start, start + 3 * SECOND)
         patiently(view.picture)
         memory.append(viewer.memory_info().rss)
-    assert memory[-1] - memory[3] < 8 * 8_000_000
+    assert memory[-1] - memory[3] < 16 * 8_000_000
 
 
 def test_the_spectrogram_of_a_span_shows_its_sound_where_it_was_kept(view, logs, timeline):
