@@ -39,20 +39,18 @@ from hearthlog.models.classes import in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 
-LINES, CLIP, WORDS, HOURS = "events", "clip", "words", "Hour"
-SPECTRUM, HOURS_NAME = "spectrum", "words/hours"
+LINES, CLIP, WORDS, SPECTRUM = "events", "clip", "words", "spectrum"
+HOURS, HOURS_NAME = "Hour", "words/hours"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # suffix of a microphone's name
 ASKED, ASKED_NAME = "asked", "words/asked_name"
 QUESTION, ANSWERS = "words/question", "words/asked"
-_ASKED_STROKES = 600  # maximum strokes of a band
-_ASKED, _COVERED = SELECTED_COLOUR, (95, 92, 84)
+_ASKED, _COVERED, _ASKED_STROKES = SELECTED_COLOUR, (95, 92, 84), 600  # strokes of a band
 _SELECTED_PLACE = 0.65, 0.35  # the lower edge of the row is out of sight
 
 _THICKNESS = 0.5  # of a strip, in lanes, without the width of its lines
 _HOUR, _HOURS_FROM = 3600 * NANOSECONDS, 4 * 3600 * NANOSECONDS
-_DAY: Colour = (70, 80, 92)
-_NIGHT: Colour = (28, 36, 58)
+_DAY, _NIGHT = (70, 80, 92), (28, 36, 58)
 _Strip = tuple[int, int, str]
 
 
@@ -333,7 +331,8 @@ APPLICATION = "hearthlog"
 # The viewer keeps the shared range of linked time axes under this name.
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
-_LANE, _AROUND_LANES, _LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 27, 50, 90, 140, 28
+_LANE, _CLOSE_LANE, _AROUND_LANES = 29, 27, 50
+_LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 90, 140, 28
 _QUESTION_HEIGHT = 62  # of a heading, with the space that the viewer leaves above it
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
@@ -462,7 +461,8 @@ def review_layout(
         own = [(lane.labelling, place) for lane, place in places if lane.microphone == name]
         count = len({place.height for _, place in own})
         views = _lane_views(microphone, own, count, _note(timeline))
-        rows: list[Row] = [(_LANE * count + _AROUND_LANES, rrb.Tabs(*views, lines_view()))]
+        height = (_CLOSE_LANE if close_up else _LANE) * count + _AROUND_LANES
+        rows: list[Row] = [(height, rrb.Tabs(*views, lines_view()))]
         more = _plot_views(microphone, plots[name], timeline, close_up=close_up)
         level = [_all(same) for same in _by_title(plots[name]) if same[0].kind is LEVEL]
         if close_up:
