@@ -49,8 +49,8 @@ def test_a_week_is_labelled_reviewed_and_learned_from(tmp_path):
 
 def test_a_labelling_is_scored_by_time_and_by_events_that_are_none():
     truth = labelling((0, 6, "silence"), (6, 10, "cough"), (10, 20, "dog"))
-    said = labelling((0, 2, "coughing"), (2, 8, "silence"), (8, 20, "coughing"))
-    one = scored(truth, said)
+    labelled = labelling((0, 2, "coughing"), (2, 8, "silence"), (8, 20, "coughing"))
+    one = scored(truth, labelled)
     assert one.f1(["coughing", "silence", "music"]) == {"coughing": 4 / 18, "silence": 8 / 12}
     assert one.macro_f1(["silence"]) == pytest.approx(2 / 3)
     assert one.false_events == {"coughing": 24 * 3600 / 20}
@@ -61,8 +61,10 @@ def test_the_picture_of_a_quarter_has_level_words_that_cover_no_curve():
     weeks = []
     for number in range(1, 14):
         noise = number * 7 % 11 + 1
-        said = [labelling((0, 60 - n, "silence"), (60 - n, 200, "yelling")) for n in (noise, 40)]
-        scores = [scored(truth, each) for each in said]
+        labelled = [
+            labelling((0, 60 - n, "silence"), (60 - n, 200, "yelling")) for n in (noise, 40)
+        ]
+        scores = [scored(truth, each) for each in labelled]
         weeks.append(Week(number, "home", *scores, 9.0, 5, 20, 4, True, number not in {9, 12}))
     figure = quarter_figure(weeks)
     figure.draw_without_rendering()

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 JUDGED_BY = "keep recording: the check needs ten minutes that it was not trained on"
 _SHOWN = 10  # list items
-_MOST_TOLD = 100  # recent texts kept
+_MOST_SHOWN = 100  # recent texts kept
 
 
 def print_lines(lines: Iterable[str]) -> None:
@@ -115,7 +115,7 @@ class ReportOnce:
     """Writes repeated messages once per text."""
 
     def __init__(self) -> None:
-        self._shown: deque[str] = deque(maxlen=_MOST_TOLD)
+        self._shown: deque[str] = deque(maxlen=_MOST_SHOWN)
 
     def __call__(self, what: object) -> None:
         """Write a message unless written recently."""
