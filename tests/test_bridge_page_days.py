@@ -189,8 +189,8 @@ def coughs_at(*hours, sure=True):
         ),
         (
             [*coughs_at(3), *coughs_at(4, sure=False), (5, 3, "crying", 0.9)],
-            "coughing 1 to 2 times (03:00 and 04:00) and crying once (05:00)",
-            "1- bis 2-mal Husten (03:00 und 04:00) und einmal Weinen (05:00)",
+            "coughing twice (03:00 and 04:00, 1 of them not sure) and crying once (05:00)",
+            "zweimal Husten (03:00 und 04:00, davon 1 unsicher) und einmal Weinen (05:00)",
         ),
         (
             [*coughs_at(3), (5, 3, "crying", 0.6)],

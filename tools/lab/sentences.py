@@ -536,19 +536,19 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
     for name in names:
         words = re.escape(in_words(name).lower())
         match = re.search(
-            rf"(perhaps )?{words} ({_NUMBER})(?: to ({_NUMBER}))?(?: times)?(?: \(([^)]*)\))?"
+            rf"(perhaps )?{words} ({_NUMBER})(?: times)?(?: \(([^)]*)\))?"
             rf"(?:, perhaps ({_NUMBER}) more(?: times)?(?: \(([^)]*)\))?)?",
             text,
             re.IGNORECASE,
         )
         if match is None:
             continue
-        perhaps, count, most, times, more, more_times = match.groups(default="")
-        stated = _number(most or count)
+        perhaps, count, times, more, more_times = match.groups(default="")
+        total = _number(count) + (_number(more) if more else 0)  # labelled, sure or not
         yield _counted(
             PAGE,
             f"{text} [{in_words(name)}]",
-            (0 if perhaps else _number(count), stated + (_number(more) if more else 0)),
+            (0 if perhaps else total, total),
             minutes.count(name, None).labelled,
             modest=modest,
         )

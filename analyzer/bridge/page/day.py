@@ -353,8 +353,8 @@ def _class_and_times(
 ) -> list[str]:
     """Format the counts of a class, by room: rooms may hear the same sound, so none are added.
 
-    In each room first the events that are counted on, then those that are not sure; in brief, both
-    as one range.
+    In each room first the events that are counted on, then those that are not sure; in brief, how
+    many of all are not sure.
     """
     words = home.words
     shown = words.inside(words.class_words(name))
@@ -363,9 +363,10 @@ def _class_and_times(
         unsure = [event for event in events if home.is_unsure(event)]
         sure = [event for event in events if event not in unsure]
         if brief and sure and unsure:
-            between = words.number(len(sure)), words.number(len(events))
-            times = words.text("times.between", first=between[0], last=between[1])
             where = _where(name, microphone, events, home)
+            some = words.text("not sure.some", count=words.number(len(unsure)))
+            where = f"{where}, {some}" if where else some
+            times = words.times(len(events))
             parts.append(_times_of(times, where, "" if parts else shown, words))
             continue
         if sure:
