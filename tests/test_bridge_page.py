@@ -999,9 +999,7 @@ def test_a_page_that_is_not_allowed_shows_it_in_no_frame(phone, served, dashboar
         f"{{src: {served.url!r}}}))"
     )
     patiently(phone.framed, bool)
-    patiently(
-        served.open_pages, lambda number: number == 0
-    )  # that of the fixture ends soon
+    patiently(served.open_pages, lambda number: number == 0)  # that of the fixture ends soon
 
 
 def test_the_page_works_below_a_path_of_a_proxy_and_leaves_its_cookie_there(phone, named):
