@@ -192,15 +192,22 @@ class _Choice:
         """
         return self._mixed(samples, self._in_mix if self._instead is None else self._instead)
 
-    def _mixed(self, samples: _Samples, channels: list[int]) -> _Samples:
+    def _mixed(self, samples: _Samples, channels: list[int], axis: int = -1) -> _Samples:
         if len(channels) == 1:
-            return np.ascontiguousarray(samples[..., channels[0]])
+            return np.ascontiguousarray(samples.take(channels[0], axis))
         if channels == self._usual:
-            return samples.mean(axis=-1)
+            return samples.mean(axis)
+        chosen = samples.take(channels, axis)
         if self._is_mean():  # one of them has NaN
-            return samples[..., channels].mean(axis=-1)
+            return chosen.mean(axis)
         # Uncorrelated channels add up to the noise level of one channel.
-        return samples[..., channels].sum(axis=-1) / samples.dtype.type(math.sqrt(len(channels)))
+        return chosen.sum(axis) / samples.dtype.type(math.sqrt(len(channels)))
+
+    def _power(self, rows: Float64, powers: Float64, channels: list[int]) -> float:
+        """Return the power of a mix of channels, which have these powers."""
+        if len(channels) == 1:
+            return float(powers[channels[0]])
+        return float(self._mixed(rows, channels, axis=0).var(axis=-1).mean())
 
     def look_at_piece(self, piece: Float32) -> None:
         """Switch channels if the selected ones hold no sound and another does.
@@ -209,10 +216,12 @@ class _Choice:
         ----------
         piece : np.ndarray [shape=(n, c)], float32
         """
-        rows = piece[:: max(len(piece) // _SAMPLES, 1)].astype(np.float64)
-        is_lost = np.asarray(np.isnan(piece).any(axis=0))
-        finite = _without_holes(rows) if is_lost.any() else rows
-        powers = finite.var(axis=0)
+        finite = _rows_of(piece, max(len(piece) // _SAMPLES, 1))
+        is_lost = np.zeros(self._count, bool)
+        if np.isnan(piece.sum()):  # much faster than a look at each sample
+            is_lost = np.asarray(np.isnan(piece).any(axis=0))
+            finite = _without_holes(finite)
+        powers = finite.var(axis=-1)
         self._piece += 1
         self._powers = np.concatenate([self._powers[-_PIECES + 1 :], powers[np.newaxis]])
         rises = powers > _STANDS_OUT * np.quantile(self._powers, 0.1, axis=0)
@@ -221,9 +230,9 @@ class _Choice:
         candidates = is_sound & self._usable & ~is_lost
         best = int(np.where(candidates, powers, -1.0).argmax())
         if candidates[best]:
-            usual = self._mixed(finite, self._usual).var()
+            usual = self._power(finite, powers, self._usual)
             self._usual_covers &= bool(usual * _COVERS > powers[best])
-            if self._hides(best, powers[best], self._mixed(finite, self._in_mix).var()):
+            if self._hides(best, powers[best], self._power(finite, powers, self._in_mix)):
                 self._go_to(best, hides=False)
         self._instead = self._without(is_lost, powers) if is_lost[self._in_mix].any() else None
 
@@ -235,21 +244,20 @@ class _Choice:
         block : np.ndarray [shape=(n, c)], float32
         """
         step = max(len(block) // (_PIECES * _SAMPLES), 1)
-        rows = block[::step].astype(np.float64)
-        count = len(rows) // _PIECES * _PIECES
+        rows = _rows_of(block, step)
+        count = rows.shape[1] // _PIECES * _PIECES
         if not count:
             return
-        pieces = rows[:count].reshape(_PIECES, -1, self._count)
-        if np.isnan(pieces).any():
-            lost = np.isnan(pieces).any(axis=1).mean(axis=0) > _LOST_SHARE
-            pieces = np.stack([_without_holes(piece) for piece in pieces])
-        else:
-            lost = np.zeros(self._count, bool)
-        powers = pieces.var(axis=1)  # an offset is no sound
-        total = powers.mean(axis=0)
+        pieces = rows[:, :count].reshape(self._count, _PIECES, -1)
+        lost = np.zeros(self._count, bool)
+        if np.isnan(pieces.sum()):
+            lost = np.isnan(pieces).any(axis=-1).mean(axis=-1) > _LOST_SHARE
+            pieces = _without_holes(pieces)
+        powers = pieces.var(axis=-1)  # an offset is no sound
+        total = powers.mean(axis=-1)
         levels = 10.0 * np.log10(powers + _TINY)
-        steady = levels.std(axis=0) < _STEADY_DB
-        floors = np.quantile(powers, 0.1, axis=0)
+        steady = levels.std(axis=-1) < _STEADY_DB
+        floors = np.quantile(powers, 0.1, axis=-1)
         sounding = ~steady & (total > _AUDIBLE)
         # Steady noise in one channel, above the floor of a channel with sound, hides that sound.
         quietest = floors[sounding].min() if sounding.any() else np.inf
@@ -261,13 +269,13 @@ class _Choice:
         if not total[best] > _AUDIBLE:
             return
         self._usable = usable
-        usual = self._mixed(pieces, self._usual).var(axis=1).mean()
+        usual = self._power(pieces, total, self._usual)
         is_usual_there = sounding.sum() > 1 or (self._usual == [best] and sounding[best])
         covers = covers and usable[self._usual].all() and usual * _COVERS > total[best]
         if self._in_mix != self._usual and covers and is_usual_there:
             self._on_samples(self._usual, "")
             return
-        power = self._mixed(pieces, self._in_mix).var(axis=1).mean()
+        power = self._power(pieces, total, self._in_mix)
         # The steady noise of an unplugged socket is louder than a quiet room.
         hides = not usable[self._in_mix].all()
         if (self._is_mean() or sounding[best] or power < _DEAD) and (
@@ -339,20 +347,26 @@ def _names(channels: Iterable[int]) -> str:
     return f"channels {', '.join(more)} and {last}" if more else f"channel {last}"
 
 
+def _rows_of(samples: Float32, step: int) -> Float64:
+    """Return every `step`-th sample, with a row per channel: numpy sums rows much faster."""
+    return np.ascontiguousarray(samples[::step].T, np.float64)
+
+
 def _level_spread(rows: Float64) -> Float64:
     """Return the standard deviation of the level within a piece, in dB per channel."""
-    count = len(rows) // _PIECES * _PIECES
+    count = rows.shape[1] // _PIECES * _PIECES
     if not count:
-        return np.zeros(rows.shape[1])
-    powers = rows[:count].reshape(_PIECES, -1, rows.shape[1]).var(axis=1)
-    return (10.0 * np.log10(powers + _TINY)).std(axis=0)
+        return np.zeros(len(rows))
+    powers = rows[:, :count].reshape(len(rows), _PIECES, -1).var(axis=-1)
+    return (10.0 * np.log10(powers + _TINY)).std(axis=-1)
 
 
 def _without_holes(rows: Float64) -> Float64:
-    """Replace NaN by the mean of the other samples of the channel."""
+    """Replace NaN by the mean of the other samples of the row."""
     is_hole = np.isnan(rows)
-    count = np.maximum((~is_hole).sum(axis=0), 1)
-    return np.where(is_hole, np.where(is_hole, 0.0, rows).sum(axis=0) / count, rows)
+    count = np.maximum((~is_hole).sum(axis=-1, keepdims=True), 1)
+    mean = np.where(is_hole, 0.0, rows).sum(axis=-1, keepdims=True) / count
+    return np.where(is_hole, mean, rows)
 
 
 def finite_or_nan(block: Float32) -> Float32:

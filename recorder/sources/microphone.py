@@ -320,8 +320,9 @@ class MicrophoneSource:
             return
         filtered = self._infrasound(event.samples)
         self._level.add(filtered)
-        has_offset = (filtered != event.samples).any(axis=1)
-        is_dead = ~event.samples.any(axis=1) | (is_flat & has_offset)
+        is_dead = ~event.samples.any(axis=1)
+        if is_flat and filtered is not event.samples:  # it has an offset
+            is_dead |= (filtered != event.samples).any(axis=1)
         sounding = np.flatnonzero(~is_dead)
         zeros = len(event.samples) - 1 - sounding[-1] if len(sounding) else len(event.samples)
         self._silent_frames = int(zeros) if len(sounding) else self._silent_frames + int(zeros)
