@@ -121,6 +121,11 @@ class StreamLabeller:
         if isinstance(event, Gap):
             self.close()
             return None
+        last = self._label_from - FRAME_NANOSECONDS
+        unlabelled = int(np.searchsorted(event.stamps, last, side="right"))
+        if 0 < unlabelled < len(event.stamps):
+            self.push(event.part(slice(unlabelled)))
+            return self.push(event.part(slice(unlabelled, None)))
         if self._next is not None and not self.is_followed_by((event.first, int(event.stamps[0]))):
             self.close()
         self._from_start |= event.first == 0
@@ -276,8 +281,8 @@ def warm_up(
             return labeller
         if labeller.floor_converged:
             labels_back *= 4
-        else:
-            floor_back *= 4
+        else:  # of sound without a quiet moment; to read it again costs more than to read far
+            floor_back *= 8
     return StreamLabeller(classifier, microphone=info.microphone, embedding=info.embedding)
 
 

@@ -12,6 +12,7 @@ os.environ.update(
     )
 )
 os.environ.update(kernel_environment())
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # an installed hearthlog has its bytecode
 
 import tempfile
 from pathlib import Path

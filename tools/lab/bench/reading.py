@@ -91,6 +91,7 @@ def _rows_of_ours(name: str, best: Mapping[str, Seconds]) -> list[Row]:
         Row(f"{name}: to arrays / decompressed", read.cpu / bare.cpu, ""),
         Row(checked, floor.cpu, "s", elapsed=floor.elapsed, note="what any reader must do"),
         Row(f"{name}: to arrays / all that", read.cpu / floor.cpu, "", target=_SHARE),
+        Row(f"{name}: the same by the clock", read.elapsed / floor.elapsed, "", note="two threads"),
     ]
 
 
