@@ -2,6 +2,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
+# As installed: otherwise each of a thousand processes of the tests compiles its modules again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: install demo test test-fast test-lab test-wheel test-lowest test-3.13 test-ros check docs pictures bench \
 	bench-history bench-check starter dist deb addon clean
 

@@ -24,7 +24,7 @@ def bursts(seconds, seed, every=1.0):
     return rng.normal(0, 0.1, len(time)) * ((time >= 1) & (time % every < 0.4))
 
 
-def heard(places, azimuth, seconds=6, seed=1, hiss=1e-3):
+def array_frames(places, azimuth, seconds=6, seed=1, hiss=1e-3):
     """Frames of an array that hears bursts from one direction, and its own hiss."""
     samples = plane_wave(places, azimuth, bursts(seconds, seed))
     samples += np.random.default_rng(seed + 1).normal(0, hiss, samples.shape)

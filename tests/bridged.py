@@ -75,8 +75,8 @@ def turned_on(folder: Path) -> dict[str, np.ndarray]:
         times = labels.log_times / NANOSECONDS
         for label in np.unique(labels["label"]):
             own = np.convolve(labels["label"] == label, np.ones(20, int))[: len(times)] >= 8
-            heard = times[own]
-            turns[label] = heard[np.diff(heard, prepend=-np.inf) > 10]
+            recorded = times[own]
+            turns[label] = recorded[np.diff(recorded, prepend=-np.inf) > 10]
     return turns
 
 

@@ -29,13 +29,13 @@ class Broker:
 
     def __init__(self, folder: Path, settings: str = _SETTINGS):
         self.port = _free_port()
-        self.said = folder / "mosquitto.log"
+        self.log_file = folder / "mosquitto.log"
         self._configuration = folder / "mosquitto.conf"
         self._configuration.write_text(f"{_AS_WE}listener {self.port} 127.0.0.1\n{settings}")
         self.start()
 
     def start(self):
-        with self.said.open("ab") as log:
+        with self.log_file.open("ab") as log:
             self._process = subprocess.Popen(
                 [*DIES_WITH_PARENT, _mosquitto(), "-c", str(self._configuration)],
                 stdout=log,
@@ -49,7 +49,7 @@ class Broker:
                 time.sleep(0.02)
             else:
                 return
-        pytest.fail(f"Mosquitto did not start: {self.said.read_text()}")
+        pytest.fail(f"Mosquitto did not start: {self.log_file.read_text()}")
 
     def hang(self):
         self._process.send_signal(signal.SIGSTOP)
@@ -177,11 +177,11 @@ def broker(tmp_path):
     broker.kill()
 
 
-def start_bridge(config: Path, said: Path, *options: str) -> subprocess.Popen:
+def start_bridge(config: Path, output: Path, *options: str) -> subprocess.Popen:
     """Start `hearthlog bridge`; what it says goes to a file."""
     from conftest import HEARTHLOG  # noqa: PLC0415  which imports this module
 
-    with said.open("ab") as log:
+    with output.open("ab") as log:
         return subprocess.Popen(
             [*DIES_WITH_PARENT, *HEARTHLOG, "bridge", "--config", str(config), *options],
             stdout=log,

@@ -17,7 +17,7 @@ class FileServer:
     def __init__(self, origin):
         self.data = b""
         self.moods = ["well"]
-        self.asked = []  # the ranges
+        self.requested = []  # the ranges
         self.url = f"{origin}/network.tflite"
         self.over = Event()
 
@@ -31,7 +31,7 @@ def file_server(certificate=None):
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            server.asked.append(self.headers["Range"])
+            server.requested.append(self.headers["Range"])
             _answer(self, server, server.mood())
 
         def log_message(self, *_):
@@ -67,16 +67,16 @@ def _answer(request, server, mood):
 
 def _answer_with_data(request, server, mood):
     data, start = server.data, 0
-    asked = re.fullmatch(r"bytes=(\d+)-", request.headers["Range"] or "")
-    if asked and mood != "no ranges":
-        start = int(asked[1])
+    requested = re.fullmatch(r"bytes=(\d+)-", request.headers["Range"] or "")
+    if requested and mood != "no ranges":
+        start = int(requested[1])
         if start >= len(data):
             request.send_error(416)
             return
     request.send_response(206 if start else 200)
     if start:
-        said = 0 if mood == "another range" else start
-        request.send_header("Content-Range", f"bytes {said}-{len(data) - 1}/{len(data)}")
+        output = 0 if mood == "another range" else start
+        request.send_header("Content-Range", f"bytes {output}-{len(data) - 1}/{len(data)}")
     if mood != "no length":
         request.send_header("Content-Length", str(len(data) - start))
     request.end_headers()

@@ -132,11 +132,11 @@ class HomeAssistant:
 
     def start(self):
         """Start it, and wait until it answers."""
-        with (self.folder / "said").open("a") as said:
+        with (self.folder / "said").open("a") as output:
             self._process = subprocess.Popen(
                 [*DIES_WITH_PARENT, self._hass, "-c", self.folder, "--skip-pip"],
-                stdout=said,
-                stderr=said,
+                stdout=output,
+                stderr=output,
             )
         wait_for(self._answers, 120)
         if not self._refresh:
@@ -215,11 +215,11 @@ class HomeAssistant:
                 return each["state"]
         return None
 
-    def ask(self, **command):
+    def query(self, **command):
         """Give a command of the WebSocket API, and return its result."""
-        return asyncio.run(self._ask(command))
+        return asyncio.run(self._query(command))
 
-    async def _ask(self, command):
+    async def _query(self, command):
         async with (
             aiohttp.ClientSession() as session,
             session.ws_connect(f"{self.url}/api/websocket", max_msg_size=0) as socket_,
@@ -317,14 +317,16 @@ class Household:
         arguments = "--device", microphone.device, "--model", "general"
         self.recorder = self._start("record", *arguments, env=microphone.env)
 
-    def tell(self):
+    def start_bridge(self):
         """Start the bridge."""
         self.bridge = self._start("bridge")
 
     def _start(self, verb, *arguments, **options):
         command = [*DIES_WITH_PARENT, *HEARTHLOG, verb, *arguments, "--config", self.configuration]
-        with (self.folder / f"said-{verb}").open("a") as said:
-            return subprocess.Popen(list(map(str, command)), stdout=said, stderr=said, **options)
+        with (self.folder / f"said-{verb}").open("a") as output:
+            return subprocess.Popen(
+                list(map(str, command)), stdout=output, stderr=output, **options
+            )
 
     def close(self):
         """End both, if they run."""

@@ -86,7 +86,7 @@ def write_day(  # noqa: PLR0913
                 for name, rows in rooms.items()
             },
             [gap for gap in gaps if hour * HOUR < gap[0] + gap[1] <= (hour + step) * HOUR],
-            [said for said in health if hour * HOUR <= said[0] < (hour + step) * HOUR],
+            [output for output in health if hour * HOUR <= output[0] < (hour + step) * HOUR],
             [each for each in doubts if hour * HOUR <= each[0] < (hour + step) * HOUR],
             {"version": "0", "node": node} | ({"timezone": timezone} if timezone else {}),
         )
@@ -237,8 +237,10 @@ def _write_hour(  # noqa: PLR0913, PLR0917
             hardware_id=microphone,
             values=[],
         )
-        said = message(message_types.DIAGNOSTICS, header=header(stamp, microphone), status=[status])
-        written.append((stamp, DIAGNOSTICS, encode(said)))
+        output = message(
+            message_types.DIAGNOSTICS, header=header(stamp, microphone), status=[status]
+        )
+        written.append((stamp, DIAGNOSTICS, encode(output)))
     for time, topic, data in sorted(written):
         writer.write(topic, time, data)
     return writer.finish()

@@ -38,7 +38,7 @@ class Ending(NamedTuple):
 
     found: dict[str, str]
     expected: dict[str, str]
-    said: str
+    output: str
 
     @property
     def wrong(self) -> list[str]:
@@ -57,7 +57,7 @@ def kill_at_random(  # noqa: PLR0913, PLR0917
     folder: Path, sounds: list[Path], model: str, seconds: float, kills: int, chance: random.Random
 ) -> Ending:
     """Let all three run, kill each so many times, and wait until what is left is told."""
-    broker, said = Broker(folder), folder / "said"
+    broker, output = Broker(folder), folder / "said"
     config = folder / "home.toml"
     config.write_text(
         f'output = "{folder}/logs"\ntimezone = "{ZONE}"\n'
@@ -65,8 +65,8 @@ def kill_at_random(  # noqa: PLR0913, PLR0917
         f'[bridge.prometheus]\ntext_file = "{folder}/home.prom"\nreadable_by = "owner"\n'
     )
     start = {
-        "recorder": lambda: start_recorder(config, sounds, model, said),
-        "bridge": lambda: start_bridge(config, said),
+        "recorder": lambda: start_recorder(config, sounds, model, output),
+        "bridge": lambda: start_bridge(config, output),
     }
     running = {what: begin() for what, begin in start.items()}
     names = [what for what in ("broker", *running) for _ in range(kills)]
@@ -86,19 +86,19 @@ def kill_at_random(  # noqa: PLR0913, PLR0917
     time.sleep(max(began + seconds - time.monotonic(), 0))
     logs, zone = folder / "logs", ZoneInfo(ZONE)
 
-    def is_heard() -> bool:
+    def is_recorded() -> bool:
         with suppress(LogError):  # on a busy machine there may be no log yet
             return any(each.endswith("/last_heard") for each in expected_values(logs, zone, _ROOT))
         return False
 
-    _wait(is_heard)
+    _wait(is_recorded)
     running["recorder"].terminate()
     running["recorder"].wait()
     expected = expected_values(logs, zone, _ROOT) | expected_totals(logs)
 
     def ending() -> Ending:
         found = settled_values(broker.port, f"{_ROOT}/#") | _totals(folder / "home.prom")
-        return Ending(found, expected, said.read_text())
+        return Ending(found, expected, output.read_text())
 
     _wait(lambda: not ending().wrong)
     last = ending()
@@ -127,11 +127,11 @@ def _wait(is_so: Callable[[], bool]) -> None:
         time.sleep(0.2)
 
 
-def start_recorder(config: Path, sounds: list[Path], model: str, said: Path) -> subprocess.Popen:
+def start_recorder(config: Path, sounds: list[Path], model: str, output: Path) -> subprocess.Popen:
     """Record files at the pace of real time, as if they were heard from now on."""
     now = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%f}Z"
     options = ["--realtime", "--start", now, "--model", model, "--config", str(config)]
-    with said.open("ab") as log:
+    with output.open("ab") as log:
         return subprocess.Popen(
             [*DIES_WITH_PARENT, *HEARTHLOG, "record", *map(str, sounds), *options],
             stdout=log,
@@ -145,7 +145,7 @@ def main(sound: str, model: str, minutes: str, kills: str, seed: str = "0") -> N
         chance, seconds = random.Random(int(seed)), 60 * float(minutes)
         sounds = 10 * [Path(sound)]
         ending = kill_at_random(Path(folder), sounds, model, seconds, int(kills), chance)
-    sys.stdout.write(f"{ending.said}{len(ending.expected)} values, wrong: {ending.wrong}\n")
+    sys.stdout.write(f"{ending.output}{len(ending.expected)} values, wrong: {ending.wrong}\n")
     for topic in ending.wrong:
         sys.stdout.write(f"{topic}: {ending.found.get(topic)}, not {ending.expected.get(topic)}\n")
 

@@ -34,7 +34,7 @@ class Run(NamedTuple):
 
     status: int
     kills: int
-    said: str  # on standard error
+    output: str  # on standard error
 
 
 def relabel_under_fire(fleet: Path, model: Path, folder: Path, due: Callable[[], bool]) -> Run:
@@ -52,10 +52,10 @@ def relabel_under_fire(fleet: Path, model: Path, folder: Path, due: Callable[[],
         done, kills = threading.Event(), []
         killer = threading.Thread(target=_kill, args=(nannies.pid, due, done, kills))
         killer.start()
-        _, said = process.communicate()
+        _, output = process.communicate()
         done.set()
         killer.join()
-    return Run(process.returncode, len(kills), said)
+    return Run(process.returncode, len(kills), output)
 
 
 def _kill(nannies: int, due: Callable[[], bool], done: threading.Event, kills: list[int]) -> None:
@@ -129,7 +129,7 @@ def _main(logs: str, model: str, homes: str, days: str, seconds: str) -> None:
         began = time.monotonic()
         run = relabel_under_fire(fleet, Path(model), folder, every(float(seconds)))
         elapsed = time.monotonic() - began
-        print(f"{run.said}status {run.status}, {run.kills} kills, {elapsed:.0f} s")  # noqa: T201
+        print(f"{run.output}status {run.status}, {run.kills} kills, {elapsed:.0f} s")  # noqa: T201
         alone = layers(home)
         equal = sum(layers(one) == alone for one in fleet.iterdir())
         print(  # noqa: T201

@@ -53,18 +53,18 @@ class LiveHome:
     ):
         self.folder, self.classes = folder, list(classes)
         self.start = time.time_ns() - minutes_ago * MINUTE
-        beside = {scenario_labelling(name): own for name, own in (scenarios or {}).items()}
+        neighbour = {scenario_labelling(name): own for name, own in (scenarios or {}).items()}
         topics = {
             topic.name: topic
             for microphone in microphones
-            for topic in topics_of(microphone, FEATURE_NAMES, self.classes, beside)
+            for topic in topics_of(microphone, FEATURE_NAMES, self.classes, neighbour)
         }
         path = log_path(folder, metadata.get("node", "home"), self.start)
         self._writer = LogWriter(
             path, list(topics.values()), {"version": "0", "node": "home"} | metadata
         )
 
-    def heard(self, label, minutes_ago, seconds=4.0, confidence=0.93, microphone="mic"):
+    def write_segment(self, label, minutes_ago, seconds=4.0, confidence=0.93, microphone="mic"):
         """Write a segment that began so many minutes ago; return when that was."""
         start = time.time_ns() - round(minutes_ago * 60 * 1000) * 1_000_000
         length = round(seconds * 1000) * 1_000_000
@@ -86,7 +86,7 @@ class LiveHome:
         *doubt
             Seconds, label, confidence, other probabilities, dB above the quiet around.
         """
-        start = self.heard(doubt[1], minutes_ago, doubt[0], doubt[2], microphone)
+        start = self.write_segment(doubt[1], minutes_ago, doubt[0], doubt[2], microphone)
         self._writer.write_columns(frames_of(microphone, self.classes, start, *doubt))
         self._writer.flush()
         return start
@@ -118,7 +118,7 @@ class LiveHome:
         }
         self._write(f"/{microphone}/gap", start + minutes * MINUTE, fields)
 
-    def says(self, subject, level, text, **values):
+    def write_status(self, subject, level, text, **values):
         """Write what the recorder says of something."""
         now = time.time_ns()
         pair = "diagnostic_msgs/msg/KeyValue"
@@ -130,8 +130,8 @@ class LiveHome:
             hardware_id=subject.partition(" ")[0],
             values=[message(pair, key=key, value=value) for key, value in values.items()],
         )
-        said = message(message_types.DIAGNOSTICS, header=header(now, ""), status=[status])
-        self._writer.write(DIAGNOSTICS, now, encode(said))
+        output = message(message_types.DIAGNOSTICS, header=header(now, ""), status=[status])
+        self._writer.write(DIAGNOSTICS, now, encode(output))
         self._writer.flush()
 
     def close(self):
@@ -143,10 +143,10 @@ class LiveHome:
 
 
 @contextmanager
-def following(place, outputs, said):
+def following(place, outputs, output):
     """A bridge in a thread, which knows the events of the last day."""
     stop = Event()
-    bridge = Bridge(place, time.time_ns() - 24 * 60 * MINUTE, dict(outputs), said.append)
+    bridge = Bridge(place, time.time_ns() - 24 * 60 * MINUTE, dict(outputs), output.append)
     thread = Thread(target=bridge.run, args=[stop], daemon=True)
     thread.start()
     try:

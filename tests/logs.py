@@ -32,8 +32,8 @@ def features(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
-def labelled_frames(heard: np.ndarray, timing: LabelTiming) -> np.ndarray:
+def labelled_frames(recorded: np.ndarray, timing: LabelTiming) -> np.ndarray:
     """Numbers of the frames that get a label where these frames were heard."""
-    runs = np.split(heard, np.flatnonzero(np.diff(heard) != 1) + 1)
+    runs = np.split(recorded, np.flatnonzero(np.diff(recorded) != 1) + 1)
     ends = [np.arange(timing.first_window_end(int(run[0])), int(run[-1]) + 1) for run in runs]
     return np.concatenate(ends) - timing.delay

@@ -72,7 +72,7 @@ class LabMicrophone:
         (self._folder / f"{self.device}.pcm").write_text(f"pcm.{self.device} {{ {fields} }}\n")
         self._write_configuration()
 
-    def beside(self, device: str) -> "LabMicrophone":
+    def add_device(self, device: str) -> "LabMicrophone":
         """Add a second microphone, on the same clock, to what the same processes see."""
         return LabMicrophone(self._plugin, self._folder, device)
 
@@ -273,10 +273,10 @@ def _wait_for_server(daemon: subprocess.Popen, env: dict[str, str]):
     deadline = time.monotonic() + _SECONDS_TO_START
     while time.monotonic() < deadline and daemon.poll() is None:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            asked = subprocess.run(
+            requested = subprocess.run(
                 ["pactl", "info"], env=env, capture_output=True, timeout=2, check=False
             )
-            if asked.returncode == 0:
+            if requested.returncode == 0:
                 return
         time.sleep(0.05)
     pytest.fail("PulseAudio did not start: " + Path(env["HOME"], "log").read_text())

@@ -496,17 +496,17 @@ def main():
             mutation = kinds[number % len(kinds)]
             changed = mutation(rng, data)
             counts[mutation.__name__] += 1
-            if said := victim.read(changed, path.name):
+            if output := victim.read(changed, path.name):
                 wrong[mutation.__name__] += 1
                 kept = options.folder / f"{name}-{number}-{mutation.__name__}"
                 kept.write_bytes(changed)
-                tell(f"{kept.name}: {said.strip().splitlines()[-1]}")
+                print_line(f"{kept.name}: {output.strip().splitlines()[-1]}")
         victim.close()
-        tell(f"{name}: {number + 1} files")
-    tell(f"{counts.total()} files, {wrong.total()} wrong: {dict(wrong)}")
+        print_line(f"{name}: {number + 1} files")
+    print_line(f"{counts.total()} files, {wrong.total()} wrong: {dict(wrong)}")
 
 
-def tell(line):
+def print_line(line):
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 

@@ -34,14 +34,14 @@ _NO_SOUND = ["--topics", "/hall/[!a]*", "--topics", "/[dr]*"]
 
 
 def by_info(run: Run) -> Any:
-    said = json.loads(run("info", "logs", "--json").stdout)
+    output = json.loads(run("info", "logs", "--json").stdout)
     sizes = {"size_bytes", "compression_ratio", "chunks", "schema_versions"}
     topics = {
         name: (about["type"], about["messages"], round(about["rate_hz"], 9))
-        for name, about in said.pop("topics").items()
+        for name, about in output.pop("topics").items()
     }
-    said["metadata"] = [each for each in said["metadata"] if each != CONTENTS_METADATA]
-    return {key: value for key, value in said.items() if key not in sizes} | {"topics": topics}
+    output["metadata"] = [each for each in output["metadata"] if each != CONTENTS_METADATA]
+    return {key: value for key, value in output.items() if key not in sizes} | {"topics": topics}
 
 
 def by_cat(run: Run) -> Any:
@@ -115,22 +115,22 @@ def by_bags(run: Run) -> Any:
 def by_doctor(run: Run) -> Any:
     found = []
     for folder in ("logs", "left"):
-        said = json.loads(run("doctor", folder, "--json").stdout)
-        assert not said["more"]
+        output = json.loads(run("doctor", folder, "--json").stdout)
+        assert not output["more"]
         found += [
-            (each["path"], each["level"], each["rule"], each["what"]) for each in said["findings"]
+            (each["path"], each["level"], each["rule"], each["what"]) for each in output["findings"]
         ]
     return sorted(each for each in found if each[2] != "newer")
 
 
 def by_replay(run: Run) -> Any:
     made = run("replay", "logs", "--model", "models/smoothed.safetensors", "--json")
-    said = json.loads(made.stdout)
-    assert said["compared"]["bit_for_bit"]
-    del said["took_seconds"]
+    output = json.loads(made.stdout)
+    assert output["compared"]["bit_for_bit"]
+    del output["took_seconds"]
     run("replay", "logs", "--model", "models/smoothed.safetensors", "-o", "again")
     again = read_columns(find_logs(Path("again")))
-    return said, {topic: plain(columns.fields) for topic, columns in again.items()}
+    return output, {topic: plain(columns.fields) for topic, columns in again.items()}
 
 
 def by_relabel(run: Run) -> Any:
@@ -210,12 +210,12 @@ def by_splicing(run: Run) -> Any:
 
 
 def by_catalog(run: Run) -> Any:
-    said = json.loads(run("catalog", "logs", "--json", "--export", "rows.parquet").stdout)
+    output = json.loads(run("catalog", "logs", "--json", "--export", "rows.parquet").stdout)
     rows = pq.read_table("rows.parquet").to_pylist()
     for written in ("rows.parquet", "logs/catalog.sqlite"):
         Path(written).unlink()
     of_files = {"size", "mtime", "input_sha256"}
-    return said["labels"], [
+    return output["labels"], [
         {key: value for key, value in row.items() if key not in of_files} for row in rows
     ]
 

@@ -31,12 +31,12 @@ class Ending(NamedTuple):
 
     status: int | None  # None: it had to be killed, too
     seconds: float  # from the loss of the scheduler on
-    said: str  # on standard error, besides what is announced
+    output: str  # on standard error, besides what is announced
 
     @property
     def good(self) -> bool:
         """Whether it was done before, or ended within 30 s with one line."""
-        one_line = self.said.startswith("hearthlog: ") and self.said.count("\n") == 1
+        one_line = self.output.startswith("hearthlog: ") and self.output.count("\n") == 1
         return self.seconds < 30 and (self.status == 0 or (self.status == 1 and one_line))
 
 
@@ -65,12 +65,12 @@ def run_and_kill(
             scheduler.kill()
             killed = time.monotonic()
             try:
-                _, said = process.communicate(timeout=120)
+                _, output = process.communicate(timeout=120)
                 status = process.returncode
             except subprocess.TimeoutExpired:
                 process.kill()
-                status, said = None, process.communicate()[1]
-            return Ending(status, time.monotonic() - killed, said.replace(_ANNOUNCED, "", 1))
+                status, output = None, process.communicate()[1]
+            return Ending(status, time.monotonic() - killed, output.replace(_ANNOUNCED, "", 1))
 
 
 def _connected(process: int, address: str) -> bool:
@@ -120,7 +120,7 @@ def _main(logs: str, model: str, times: str = "100") -> None:
         for seconds, ending in pool.map(once, range(int(times))):
             endings.append(ending)
             print(f"{seconds:6.2f} s {'' if ending.good else 'BAD '}{ending}", flush=True)  # noqa: T201
-        print(Counter((one.status, one.said[:60]) for one in endings))  # noqa: T201
+        print(Counter((one.status, one.output[:60]) for one in endings))  # noqa: T201
         print(  # noqa: T201
             f"{sum(one.good for one in endings)} of {times} good; "
             f"{max(one.seconds for one in endings):.1f} s at most after the loss"

@@ -62,17 +62,17 @@ class Served:
         self.log = LiveHome(folder / "logs", **options)
         hidden = frozenset(never_tell)
         self.home = RecorderAddress(folder / "logs", "home", midday_zone(), hidden)
-        self.state, self.said, self.port = folder / "state", [], free_port()
+        self.state, self.output, self.port = folder / "state", [], free_port()
         self._start()
 
     def _start(self):
         settings = PageSettings(port=self.port, **self.settings)
-        page = self._page = HomePage(settings, self.home, self.state, self.said.append)
+        page = self._page = HomePage(settings, self.home, self.state, self.output.append)
         self.url = (self.state / "page-address").read_text().strip()
         self.token = self.url.partition("=")[2]
         now = today(time.time_ns(), self.home.zone)
         self._stop = threading.Event()
-        bridge = Bridge(self.home, min(now.midnight, now.night), {"page": page}, self.said.append)
+        bridge = Bridge(self.home, min(now.midnight, now.night), {"page": page}, self.output.append)
         self._thread = threading.Thread(target=bridge.run, args=(self._stop,))
         self._thread.start()
 
@@ -100,10 +100,10 @@ class Served:
         return socket.create_connection(("127.0.0.1", self.port), timeout=30)
 
     def cookie(self):
-        _, fields, _ = self.ask("GET", f"/?token={self.token}", cookie=None)
+        _, fields, _ = self.request("GET", f"/?token={self.token}", cookie=None)
         return fields["Set-Cookie"].partition(";")[0]
 
-    def ask(self, method, path, body=None, cookie="own", **fields):
+    def request(self, method, path, body=None, cookie="own", **fields):
         """Send a request; return status, fields and body of the answer."""
         named = {name.replace("_", "-"): value for name, value in fields.items()}
         if cookie is not None:
@@ -121,7 +121,7 @@ class Served:
 
     def post(self, path, content):
         own = {"Origin": f"http://127.0.0.1:{self.port}", **JSON}
-        status, _, answer = self.ask("POST", path, json.dumps(content), **own)
+        status, _, answer = self.request("POST", path, json.dumps(content), **own)
         return status, answer
 
     def marks(self):

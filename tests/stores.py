@@ -29,10 +29,10 @@ def throttled_account() -> dict[str, str]:
     from werkzeug.serving import make_server  # noqa: PLC0415
 
     moto = DomainDispatcherApplication(create_backend_app)
-    asked = itertools.count()
+    requested = itertools.count()
 
     def application(environ, start_response):
-        if next(asked) % 4:
+        if next(requested) % 4:
             return moto(environ, start_response)
         start_response("503 Slow Down", [("Content-Type", "application/xml")])
         return [b"<Error><Code>SlowDown</Code><Message>Reduce your request rate.</Message></Error>"]
@@ -43,7 +43,7 @@ def throttled_account() -> dict[str, str]:
     yield account(f"http://127.0.0.1:{server.server_port}")
     server.shutdown()
     thread.join()
-    assert next(asked) > 4
+    assert next(requested) > 4
 
 
 def account(endpoint: str) -> dict[str, str]:

@@ -41,7 +41,7 @@ class LiveServer:
         self.data, self.secret = data, secret
         self.burst, self.speed, self.condition = 0.0, 1.0, ""
         self.epoch = time.monotonic()
-        self.asked: list[str] = []  # what was asked for
+        self.requested: list[str] = []  # what was asked for
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
         self._server.daemon_threads = True
         self.port = self._server.server_port
@@ -61,7 +61,7 @@ class LiveServer:
                 pass
 
             def do_GET(self):
-                server.asked.append(self.path)
+                server.requested.append(self.path)
                 with suppress(OSError):
                     server._answer(self)
 

@@ -170,11 +170,11 @@ def test_counts_are_those_of_a_truth_that_is_counted_second_by_second(tmp_path):
     known[untold] = labelled[untold]
 
     for name in names:
-        said, true = (_runs(labels, name, 10) for labels in (labelled, known))
-        found, right = _begun(minutes, said, true, untold)
-        there, told = _begun(minutes, true, said, untold)
-        assert checked(tmp_path).check(name)[:4] == (found, right, there, there - told)
-        assert min(right, found - right, there - told) > 0, "something to count"
+        output, true = (_runs(labels, name, 10) for labels in (labelled, known))
+        found, right = _begun(minutes, output, true, untold)
+        there, reported = _begun(minutes, true, output, untold)
+        assert checked(tmp_path).check(name)[:4] == (found, right, there, there - reported)
+        assert min(right, found - right, there - reported) > 0, "something to count"
     assert len(checked(tmp_path)) == len(drawn)
     sounds = [s for i, log in enumerate(logs) for s in reference(log, logs[i + 1 :])]
     parts = [part for m in minutes.values() for part in np.split(m, [HOUR - int(m[0]) % HOUR])]
@@ -237,11 +237,11 @@ def test_fewer_than_five_minutes_promise_nothing():
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=FEWEST, max_size=40))
 def test_a_range_is_in_order_the_same_each_time_and_grows_with_what_is_counted(minutes):
-    said, true = np.array(minutes).T
-    loud = said > 0
-    rates = checked_rates(said, true, loud, 0.3)
-    again = checked_rates(said, true, loud, 0.3)
-    strata = strata_of(np.tile(said, 3), np.tile(loud, 3))
+    output, true = np.array(minutes).T
+    loud = output > 0
+    rates = checked_rates(output, true, loud, 0.3)
+    again = checked_rates(output, true, loud, 0.3)
+    strata = strata_of(np.tile(output, 3), np.tile(loud, 3))
     low, high = rates.range_of(strata)
     assert 0 <= low <= high
     assert again.range_of(strata) == (low, high)
@@ -252,21 +252,21 @@ def test_a_range_is_in_order_the_same_each_time_and_grows_with_what_is_counted(m
 
 def test_a_range_of_a_labelling_that_is_half_right_lies_around_the_half():
     rng = np.random.default_rng(1)
-    said = rng.poisson(0.4, 400)
-    true = rng.binomial(said, 0.5)
-    rates = checked_rates(said, true, said > 0, 0.5)
-    low, high = rates.range_of(strata_of(said, said > 0))
+    output = rng.poisson(0.4, 400)
+    true = rng.binomial(output, 0.5)
+    rates = checked_rates(output, true, output > 0, 0.5)
+    low, high = rates.range_of(strata_of(output, output > 0))
     assert low < true.sum() < high
-    assert high - low < said.sum() / 2
+    assert high - low < output.sum() / 2
 
 
 def test_a_class_that_is_never_labelled_may_have_been_missed_and_one_always_wrong_be_nothing():
-    said, none = np.tile([0, 1], 15), np.zeros(30, np.int64)
-    strata = strata_of(np.tile(said, 40), np.tile(said, 40) > 0)
-    assert checked_rates(said, none, said > 0, 0.1).range_of(strata)[0] == 0
-    assert checked_rates(none, none, said > 0, 0.1).range_of(strata)[1] > 0
-    few = checked_rates(said[:5], none[:5], said[:5] > 0, 0.1)
-    assert few.range_of(strata_of(np.tile(said, 9999), np.tile(said, 9999) > 0))[0] == 0
+    output, none = np.tile([0, 1], 15), np.zeros(30, np.int64)
+    strata = strata_of(np.tile(output, 40), np.tile(output, 40) > 0)
+    assert checked_rates(output, none, output > 0, 0.1).range_of(strata)[0] == 0
+    assert checked_rates(none, none, output > 0, 0.1).range_of(strata)[1] > 0
+    few = checked_rates(output[:5], none[:5], output[:5] > 0, 0.1)
+    assert few.range_of(strata_of(np.tile(output, 9999), np.tile(output, 9999) > 0))[0] == 0
 
 
 def test_segments_ten_seconds_apart_are_one_event():
@@ -282,8 +282,8 @@ def test_nine_ranges_of_ten_hold_where_minutes_are_drawn_from_other_days(chance)
     for _ in range(60):
         loud = rng.random(1440) < 0.2
         true = np.where(loud, rng.poisson(0.2, 1440), rng.poisson(0.001, 1440))
-        said = rng.binomial(true, chance) + np.where(loud, rng.poisson(0.1, 1440), 0)
-        loud |= said > 0
+        output = rng.binomial(true, chance) + np.where(loud, rng.poisson(0.1, 1440), 0)
+        loud |= output > 0
         other, day = slice(0, 720), slice(720, 1440)
         rows = np.concatenate(
             [
@@ -291,8 +291,8 @@ def test_nine_ranges_of_ten_hold_where_minutes_are_drawn_from_other_days(chance)
                 rng.choice(np.flatnonzero(~loud[other]), 3, replace=False),
             ]
         )
-        rates = checked_rates(said[rows], true[rows], loud[rows], 0.5)
-        low, high = rates.range_of(strata_of(said[day], loud[day]))
+        rates = checked_rates(output[rows], true[rows], loud[rows], 0.5)
+        low, high = rates.range_of(strata_of(output[day], loud[day]))
         held.append(low <= true[day].sum() <= high)
     assert np.mean(held) >= 0.85
 
@@ -516,8 +516,8 @@ def test_what_is_missed_in_a_quiet_minute_stands_for_more_than_in_one_with_sound
     assert Accuracy(find_home_logs([tmp_path])).weight == accuracy.weight, "nothing drawn that day"
     assert checked.miss_rate(1)[1] < 0.5
     assert checked.miss_rate(accuracy.weight)[1] > 0.9
-    whole = ClassCheck(40, 30, 50, 20, 2)
-    assert whole.miss_rate(10)[0] > whole.miss_rate(1)[0]
+    full = ClassCheck(40, 30, 50, 20, 2)
+    assert full.miss_rate(10)[0] > full.miss_rate(1)[0]
 
 
 def confidences(*groups):

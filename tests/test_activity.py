@@ -77,7 +77,7 @@ def reported(logs):
     for name in SOUNDS:
         night = day.home.minutes.counted(name, day.home.events_in(name, day.night))
         counts[name] = day.count(name).labelled, len(night), day.beside_television(name)
-    assert sum(beside for *_, beside in counts.values()) > 100
+    assert sum(neighbour for *_, neighbour in counts.values()) > 100
     return counts
 
 
@@ -130,15 +130,15 @@ def test_totals_and_alerts_at_once_count_also_beside_a_television(logs, followed
     totals = Totals(BridgeState(tmp_path, "home", pytest.fail), start, pytest.fail)
     counted = {total.label: total.events for total in totals.count(followed, end)}
     hour = 3600 * NANOSECONDS
-    heard = read_activity(find_home_logs([logs]), "home", start - hour, end, pytest.fail)
-    for name, (alone, _, beside) in reported(logs).items():
-        of_day = alone + beside
+    recorded = read_activity(find_home_logs([logs]), "home", start - hour, end, pytest.fail)
+    for name, (alone, _, neighbour) in reported(logs).items():
+        of_day = alone + neighbour
         assert counted.get(name, 0) == of_day, name
         if of_day:
             hours = (end - start) // hour
             for count, rings in ((of_day - 1, True), (of_day, False)):
                 one = rule("more_than", count=count, window=f"{hours}h", **{"class": name})
-                rang, _ = notifications(one, heard, end - NANOSECONDS, end, ZONE)
+                rang, _ = notifications(one, recorded, end - NANOSECONDS, end, ZONE)
                 assert bool(rang) == rings, (name, count)
 
 
@@ -258,9 +258,9 @@ def test_the_catalogue_a_comparison_and_an_evaluation_count_the_events_of_the_re
         return {name: own for name, own in home.events.items() if name != SILENCE and len(own)}
 
     starts = counted()
-    for name, (alone, _, beside) in reported(logs).items():
+    for name, (alone, _, neighbour) in reported(logs).items():
         own = starts.get(name, np.empty(0, np.int64))
-        assert ((own >= start) & (own < end)).sum() == alone + beside, name
+        assert ((own >= start) & (own < end)).sum() == alone + neighbour, name
     events = {name: len(own) for name, own in starts.items()}
     listed = json.loads(hearthlog("catalog", logs, "--json").stdout)["labels"]
     (logs / "catalog.sqlite").unlink()
@@ -399,7 +399,7 @@ def test_a_sound_that_a_person_marked_counts_beside_a_television_too(logs, capfd
         after = json.loads(run(capfd, *words).stdout)["counts"]["crying"]
         assert after["counted"] == before["counted"] + 1
         _, day = day_metrics(logs)
-        beside = day.beside_television("crying")
-        assert after == {"counted": day.count("crying").labelled, "television": beside}
+        neighbour = day.beside_television("crying")
+        assert after == {"counted": day.count("crying").labelled, "television": neighbour}
     finally:
         layer.unlink()

@@ -256,8 +256,8 @@ def test_what_is_near_to_the_vectors_of_a_home_is_drawn_to_its_class_and_nothing
 
 def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorded):
     log = find_logs(recorded)[0]
-    heard = read_columns([log], ["/mic/features"])["/mic/features"]
-    stamps = heard["header.stamp"]
+    labelled = read_columns([log], ["/mic/features"])["/mic/features"]
+    stamps = labelled["header.stamp"]
     marks = [
         Mark("mic", int(stamps[100]), int(stamps[160]), "speech"),
         Mark("mic", int(stamps[300]), int(stamps[306]), "coughing"),
@@ -268,10 +268,12 @@ def test_marks_in_a_log_become_segments_of_the_features_that_were_logged(recorde
     finally:
         layer.unlink()
     assert [item.label for item in found] == ["speech", "coughing"]
-    np.testing.assert_array_equal(found[0].features, heard["values"][100:160])
-    np.testing.assert_array_equal(found[1].features, heard["values"][293:313])  # a whole second
+    np.testing.assert_array_equal(found[0].features, labelled["values"][100:160])
+    np.testing.assert_array_equal(found[1].features, labelled["values"][293:313])  # a whole second
     assert found[0].group == found[1].group
-    floors = FloorTracker()(DEFAULT.band_powers(heard["values"]), int(heard["frame"][0])).powers
+    floors = FloorTracker()(
+        DEFAULT.band_powers(labelled["values"]), int(labelled["frame"][0])
+    ).powers
     behind = len(floors) - len(stamps)  # from the end of the mark on, as the recorder tracked it
     np.testing.assert_array_equal(found[0].floor, floors[behind + 100 : behind + 160])
     np.testing.assert_array_equal(found[1].floor, floors[behind + 293 : behind + 313])
@@ -310,9 +312,9 @@ def test_the_floor_at_a_mark_is_that_of_a_recorder_that_did_not_begin_with_its_l
     settings = Settings(output=tmp_path, max_bag_duration=60)
     record(settings, FileSource([day], 1_772_348_400 * 10**9), Event())
     logs = find_logs(tmp_path)
-    whole = read_columns(logs, ["/mic/features"])["/mic/features"]
-    stamps = whole["header.stamp"]
-    floors = FloorTracker()(DEFAULT.band_powers(whole["values"]), 0).powers
+    full = read_columns(logs, ["/mic/features"])["/mic/features"]
+    stamps = full["header.stamp"]
+    floors = FloorTracker()(DEFAULT.band_powers(full["values"]), 0).powers
     second = int(np.searchsorted(stamps, 1_772_348_460 * 10**9))
     begin, end = int(stamps[second + 10]), int(stamps[second + 50])
     layer = write_marks(logs[1], [Mark("mic", begin, end, "silence")])
@@ -358,8 +360,8 @@ def test_transitions_that_an_earlier_version_learned_from_a_home_are_forgotten(w
 
 def test_a_second_across_a_gap_is_not_learned_from(recorded):
     for log in find_logs(recorded):
-        heard = read_columns([log], ["/mic/features"])["/mic/features"]
-        stamps, frames = heard["header.stamp"], heard["frame"].astype(np.int64)
+        labelled = read_columns([log], ["/mic/features"])["/mic/features"]
+        stamps, frames = labelled["header.stamp"], labelled["frame"].astype(np.int64)
         if len(gaps := np.flatnonzero(np.diff(frames) != 1)):
             break
     gap = gaps[0]

@@ -69,12 +69,12 @@ def test_what_was_not_told_to_all_is_there_after_the_next_start(tmp_path):
 
 
 def test_a_full_outbox_drops_the_oldest_and_says_what_to_do(tmp_path):
-    said = []
-    outbox = Outbox(state_in(tmp_path), ["a"], said.append, most=3)
+    printed = []
+    outbox = Outbox(state_in(tmp_path), ["a"], printed.append, most=3)
     outbox.put(ring(number) for number in range(1, 6))
     assert [each.time // SECOND for each in outbox.waiting_for("a", 1)] == [3, 4, 5]
     assert len(state_in(tmp_path).names("outbox")) == 3
-    assert said == [
+    assert printed == [
         (
             "3 alerts are waiting, and the oldest are dropped; see above which "
             "target fails; repair it, or remove it from urls_file"
@@ -84,33 +84,33 @@ def test_a_full_outbox_drops_the_oldest_and_says_what_to_do(tmp_path):
 
 @pytest.mark.parametrize("content", ["", "{}", "[1]", '{"rule": 1}', "\0" * 9, "[" * 100_000])
 def test_a_file_that_is_no_ring_is_named_and_left_alone(content, tmp_path):
-    said, state = [], state_in(tmp_path)
+    printed, state = [], state_in(tmp_path)
     state.write("outbox/1-x", content)
-    outbox = Outbox(state, ["a"], said.append)
+    outbox = Outbox(state, ["a"], printed.append)
     assert len(outbox) == 0
-    assert said == [f"{state.path}, outbox/1-x: cannot be read; this alert is not delivered"]
+    assert printed == [f"{state.path}, outbox/1-x: cannot be read; this alert is not delivered"]
 
 
 def test_a_folder_that_takes_nothing_is_said_and_the_ring_told_all_the_same(tmp_path):
-    said = []
+    printed = []
     state = state_in(tmp_path)
-    outbox = Outbox(state, ["a"], said.append)
+    outbox = Outbox(state, ["a"], printed.append)
     with closing(sqlite3.connect(state.path)) as other:
         other.execute("DROP TABLE entries")
     outbox.put([ring(1)])
     assert outbox.waiting_for("a", 1) == [ring(1)]
-    assert len(said) == 1
-    assert "until it can, alerts are only kept in memory" in said[0]
+    assert len(printed) == 1
+    assert "until it can, alerts are only kept in memory" in printed[0]
 
 
 def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
-    port, said = free_port(), []
-    targets = find_targets(addresses(tmp_path, f"json://127.0.0.1:{port}"), said.append).targets
-    outbox = Outbox(state_in(tmp_path), [each.name for each in targets], said.append)
+    port, printed = free_port(), []
+    targets = find_targets(addresses(tmp_path, f"json://127.0.0.1:{port}"), printed.append).targets
+    outbox = Outbox(state_in(tmp_path), [each.name for each in targets], printed.append)
     outbox.put([ring(1), ring(2)])
-    delivery = Delivery(outbox, targets, "home", UTC, said.append, first_pause=0.01)
+    delivery = Delivery(outbox, targets, "home", UTC, printed.append, first_pause=0.01)
     try:
-        wait_for(lambda: len(said) > 1)
+        wait_for(lambda: len(printed) > 1)
         with server(port) as (_, texts):
             wait_for(lambda: not len(outbox))
             assert [text[-7:] for text in [t.removesuffix(" (delivered late)") for t in texts]] == [
@@ -119,27 +119,27 @@ def test_a_target_that_is_away_is_told_when_it_is_back(tmp_path):
             ]
     finally:
         delivery.close()
-    assert len(set(said)) == 1
-    assert said[0].startswith(
+    assert len(set(printed)) == 1
+    assert printed[0].startswith(
         "line 2, json://127.0.0.1: an alert could not be delivered (no connection)"
     )
     assert state_in(tmp_path).names("outbox") == []
 
 
 def test_a_target_that_never_answers_holds_up_neither_the_others_nor_the_end(tmp_path):
-    said = []
+    printed = []
     with socket.socket() as mute, server() as (port, texts):
         mute.bind(("127.0.0.1", 0))
         mute.listen()
         dead = f"json://127.0.0.1:{mute.getsockname()[1]}?cto=1&rto=1"
         targets = find_targets(
-            addresses(tmp_path, dead, f"json://127.0.0.1:{port}"), said.append
+            addresses(tmp_path, dead, f"json://127.0.0.1:{port}"), printed.append
         ).targets
-        outbox = Outbox(state_in(tmp_path), [each.name for each in targets], said.append)
+        outbox = Outbox(state_in(tmp_path), [each.name for each in targets], printed.append)
         outbox.put([ring(1)])
-        delivery = Delivery(outbox, targets, "home", UTC, said.append, first_pause=60.0)
+        delivery = Delivery(outbox, targets, "home", UTC, printed.append, first_pause=60.0)
         wait_for(lambda: texts)
-        wait_for(lambda: said)
+        wait_for(lambda: printed)
         delivery.close()
     assert len(texts) == 1
     assert outbox.waiting_for(targets[0].name, 1) == [ring(1)]
@@ -211,11 +211,11 @@ def test_one_wrong_line_keeps_nobody_else_from_being_told_and_is_told_late_when_
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
-    home, said, broker = RecorderAddress(tmp_path / "logs", "home", UTC), [], []
+    home, printed, broker = RecorderAddress(tmp_path / "logs", "home", UTC), [], []
     now = time.time_ns()
     rung = [Notification("it", now + n, f"ring {n}", is_known=True, due=now) for n in (1, 2)]
 
-    def tell(_name, text, _time):
+    def send(_name, text, _time):
         broker.append(text)
         return True
 
@@ -224,7 +224,7 @@ def test_one_wrong_line_keeps_nobody_else_from_being_told_and_is_told_late_when_
         file = addresses(tmp_path, right, typo)
         settings = DeliverySettings(urls_file=file)
         for ring_now in rung:  # before and after a start of the bridge
-            own = AlertsOutput([], settings, home, state_in(tmp_path), said.append, tell)
+            own = AlertsOutput([], settings, home, state_in(tmp_path), printed.append, send)
             own._outbox.put([ring_now])
             wait_for(partial(_is_told, own, broker))
             wait_for(lambda: len(good) == 1)
@@ -245,7 +245,7 @@ def test_one_wrong_line_keeps_nobody_else_from_being_told_and_is_told_late_when_
         own.close()
     assert [text.partition(": ")[2] for text in mended] == ["ring 1", "ring 2"]
     assert good == []
-    assert {line.partition(";")[0] for line in said} == {
+    assert {line.partition(";")[0] for line in printed} == {
         f"alerts: {file}, line 3: no address that Apprise knows",
         f"alerts: {file}, line 2: no address that Apprise knows",
         f"alerts: {file}: every line of it can be read now",
@@ -256,11 +256,11 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
-    home, said, now = RecorderAddress(tmp_path / "logs", "home", UTC), [], time.time_ns()
+    home, printed, now = RecorderAddress(tmp_path / "logs", "home", UTC), [], time.time_ns()
     with server() as (port, good), server() as (other, mended):
         right, typo = f"json://127.0.0.1:{port}", f"jsno://127.0.0.1:{other}"
         settings = DeliverySettings(urls_file=addresses(tmp_path, right, typo))
-        own = AlertsOutput([], settings, home, state_in(tmp_path), said.append)
+        own = AlertsOutput([], settings, home, state_in(tmp_path), printed.append)
         own._outbox.put([Notification("it", now, "first", is_known=True, due=now)])
         wait_for(lambda: len(good) == 1)
         before = own._lines
@@ -268,7 +268,7 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
         wait_for(lambda: own._lines != before)
         own.close()
         addresses(tmp_path, f"{right}/?verify=yes", typo, "# and while it does not")
-        own = AlertsOutput([], settings, home, state_in(tmp_path), said.append)
+        own = AlertsOutput([], settings, home, state_in(tmp_path), printed.append)
         own._outbox.put([Notification("it", now + 1, "second", is_known=True, due=now)])
         wait_for(lambda: len(good) == 2)
         addresses(tmp_path, f"{right}/?rto=9", typo.replace("jsno", "json"))  # both at once
@@ -282,17 +282,17 @@ def test_who_is_on_a_line_that_is_edited_is_told_nothing_twice_while_another_lin
 
 def test_addresses_are_read_again_when_the_package_that_was_missing_is_there(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "_LOOK_AT_FILE_SECONDS", 0.0)
-    home, said, now = RecorderAddress(tmp_path / "logs", "home", UTC), [], time.time_ns()
+    home, printed, now = RecorderAddress(tmp_path / "logs", "home", UTC), [], time.time_ns()
     with server() as (port, texts):
         settings = DeliverySettings(urls_file=addresses(tmp_path, f"json://127.0.0.1:{port}"))
         with monkeypatch.context() as missing:
             missing.setitem(sys.modules, "apprise", None)
-            own = AlertsOutput([], settings, home, state_in(tmp_path), said.append)
+            own = AlertsOutput([], settings, home, state_in(tmp_path), printed.append)
             own._outbox.put([Notification("it", now, "first", is_known=True, due=now)])
-            assert said[0].startswith("alerts: apprise is not installed; try: ")
+            assert printed[0].startswith("alerts: apprise is not installed; try: ")
         wait_for(lambda: len(texts) == 1)
         own.close()
-    assert said[-1].endswith("every line of it can be read now")
+    assert printed[-1].endswith("every line of it can be read now")
 
 
 def _is_told(own, broker):
@@ -317,7 +317,7 @@ def test_what_waits_for_a_wrong_line_alone_is_dropped_after_a_day(tmp_path):
 
 @pytest.mark.parametrize("content", [None, "", "# nothing\n"])
 def test_without_an_address_the_broker_is_told_all_the_same(tmp_path, content):
-    file, said, told = tmp_path / "urls", [], []
+    file, printed, reported = tmp_path / "urls", [], []
     if content is not None:
         file.write_text(content)
         file.chmod(0o600)
@@ -330,14 +330,14 @@ def test_without_an_address_the_broker_is_told_all_the_same(tmp_path, content):
         settings,
         home,
         state_in(tmp_path),
-        said.append,
-        lambda *given: told.append(given) or True,
+        printed.append,
+        lambda *given: reported.append(given) or True,
     )
     own._outbox.put([ring(1)])
     own.update(SimpleNamespace(state=HomeState(), columns=()))
     own.close()
-    assert len(told) == 1
-    assert said[0].startswith(f"alerts: {file}: no ")
+    assert len(reported) == 1
+    assert printed[0].startswith(f"alerts: {file}: no ")
 
 
 def test_a_file_without_an_address_and_one_that_is_not_there_are_refused(tmp_path):
@@ -348,11 +348,11 @@ def test_a_file_without_an_address_and_one_that_is_not_there_are_refused(tmp_pat
 
 
 def test_a_file_of_secrets_that_everybody_may_read_is_said(tmp_path):
-    said = []
+    printed = []
     file = addresses(tmp_path, "json://127.0.0.1")
     file.chmod(0o644)
-    (target,) = find_targets(file, said.append).targets
-    assert said == [
+    (target,) = find_targets(file, printed.append).targets
+    assert printed == [
         f"{file}: holds secrets, and everybody on this machine may read it: chmod 600 {file}"
     ]
     assert target.place == "line 2, json://127.0.0.1"
@@ -392,39 +392,39 @@ def test_a_target_is_named_by_its_line_and_at_most_its_scheme_and_host(address, 
 
 
 def test_no_part_of_an_address_is_said_when_it_cannot_be_reached_or_refuses(tmp_path, capfd):
-    said = []
+    printed = []
     with server(status=403) as (port, _):
         places = [f"127.0.0.1:{each}/hush-topic" for each in (port, free_port())]
         kinds = ("ntfy", "json", "xml", "form", "gotify", "mmost")
         lines = [f"{kind}://hush:hush@{place}" for kind in kinds for place in places]
-        targets = find_targets(addresses(tmp_path, *lines), said.append).targets
-        outbox = Outbox(state_in(tmp_path), [each.name for each in targets], said.append)
+        targets = find_targets(addresses(tmp_path, *lines), printed.append).targets
+        outbox = Outbox(state_in(tmp_path), [each.name for each in targets], printed.append)
         outbox.put([ring(1)])
-        delivery = Delivery(outbox, targets, "home", UTC, said.append)
-        wait_for(lambda: len(set(said)) == len(lines))
+        delivery = Delivery(outbox, targets, "home", UTC, printed.append)
+        wait_for(lambda: len(set(printed)) == len(lines))
         delivery.close()
-    refused = {int(line.split(",")[0].split()[1]) for line in said if "(error 403)" in line}
-    away = {int(line.split(",")[0].split()[1]) for line in said if "(no connection)" in line}
+    refused = {int(line.split(",")[0].split()[1]) for line in printed if "(error 403)" in line}
+    away = {int(line.split(",")[0].split()[1]) for line in printed if "(no connection)" in line}
     assert (refused, away) == (set(range(2, 14, 2)), set(range(3, 14, 2)))
     assert capfd.readouterr() == ("", "")
-    assert "hush" not in "".join(said)
+    assert "hush" not in "".join(printed)
 
 
 def test_the_password_of_an_address_is_in_no_line_and_no_file(tmp_path):
-    said = []
+    printed = []
     file = addresses(tmp_path, f"json://user:hush@127.0.0.1:{free_port()}")
-    targets = find_targets(file, said.append).targets
-    outbox = Outbox(state_in(tmp_path), ["x", *(each.name for each in targets)], said.append)
+    targets = find_targets(file, printed.append).targets
+    outbox = Outbox(state_in(tmp_path), ["x", *(each.name for each in targets)], printed.append)
     outbox.put([ring(1)])
-    delivery = Delivery(outbox, targets, "home", UTC, said.append)
-    wait_for(lambda: said)
+    delivery = Delivery(outbox, targets, "home", UTC, printed.append)
+    wait_for(lambda: printed)
     delivery.close()
     outbox.record_delivery(targets[0].name, ring(1))
     (kept,) = state_in(tmp_path).names("outbox")
     files = [path.read_bytes() for path in tmp_path.glob("state*")]
     assert any(kept.encode() in content for content in files)
     assert not any(b"hush" in content for content in files)
-    assert "hush" not in "".join(said)
+    assert "hush" not in "".join(printed)
 
 
 DELIVERING = """
@@ -461,8 +461,8 @@ def test_a_bridge_that_is_killed_again_and_again_tells_of_every_ring(tmp_path):
             process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
             assert process.stdout.readline() == "kept\n"
             if start < kills:
-                told = len(texts)
-                wait_for(lambda told=told: len(texts) >= told + 5)
+                reported = len(texts)
+                wait_for(lambda reported=reported: len(texts) >= reported + 5)
                 process.send_signal(signal.SIGKILL)
             process.communicate(timeout=WAIT)
             assert process.returncode == (-signal.SIGKILL if start < kills else 0)

@@ -57,51 +57,53 @@ def home(*segments, covered=(), classes=None, written=()):
     return gathered.activity()
 
 
-def rung(one, heard, hours=24):
+def rung(one, recorded, hours=24):
     """Seconds after noon at which a rule rings."""
-    found, _ = notifications(one, heard, NOON, NOON + hours * HOUR * SECOND, UTC)
+    found, _ = notifications(one, recorded, NOON, NOON + hours * HOUR * SECOND, UTC)
     return [(ring.time - NOON) / SECOND for ring in found]
 
 
 def test_a_rule_of_more_than_rings_with_the_event_that_is_one_too_many():
-    heard = home(*((minute * 60, 2, "coughing") for minute in (0, 10, 20, 30, 40)))
+    recorded = home(*((minute * 60, 2, "coughing") for minute in (0, 10, 20, 30, 40)))
     one = rule("more_than", count=2, window="30m", **{"class": "coughing"})
-    assert rung(one, heard) == [20 * 60]
-    assert rung(rule("more_than", count=3, window="30m", **{"class": "coughing"}), heard) == []
+    assert rung(one, recorded) == [20 * 60]
+    assert rung(rule("more_than", count=3, window="30m", **{"class": "coughing"}), recorded) == []
 
 
 def test_segments_with_short_pauses_between_them_are_one_event_of_all_microphones():
-    heard = home((0, 2, "coughing", 1.0, "a"), (9, 2, "coughing", 1.0, "b"), (21, 1, "coughing"))
-    assert rung(rule("more_than", count=0, window="1h", **{"class": "coughing"}), heard) == [0]
-    assert rung(rule("more_than", count=1, window="1h", **{"class": "coughing"}), heard) == []
+    recorded = home((0, 2, "coughing", 1.0, "a"), (9, 2, "coughing", 1.0, "b"), (21, 1, "coughing"))
+    assert rung(rule("more_than", count=0, window="1h", **{"class": "coughing"}), recorded) == [0]
+    assert rung(rule("more_than", count=1, window="1h", **{"class": "coughing"}), recorded) == []
 
 
 def test_an_event_counts_when_it_has_lasted_long_enough_and_is_sure_enough():
-    heard = home((0, 2, "crying"), (100, 3, "crying"), (107, 3, "crying"), (500, 9, "crying", 0.5))
+    recorded = home(
+        (0, 2, "crying"), (100, 3, "crying"), (107, 3, "crying"), (500, 9, "crying", 0.5)
+    )
     base = {"count": 0, "window": "1h", "class": "crying", "least_seconds": 5}
-    assert rung(rule("more_than", **base), heard) == [109]
-    assert rung(rule("more_than", **base | {"least_seconds": 7}), heard) == [507]
-    assert rung(rule("more_than", **base | {"least_seconds": 7, "confidence": 0.6}), heard) == []
+    assert rung(rule("more_than", **base), recorded) == [109]
+    assert rung(rule("more_than", **base | {"least_seconds": 7}), recorded) == [507]
+    assert rung(rule("more_than", **base | {"least_seconds": 7, "confidence": 0.6}), recorded) == []
 
 
 def test_a_rule_of_one_microphone_does_not_mind_the_others():
-    heard = home((0, 2, "crying", 1.0, "hall"), (60, 2, "crying", 1.0, "bath"))
+    recorded = home((0, 2, "crying", 1.0, "hall"), (60, 2, "crying", 1.0, "bath"))
     keys = {"count": 0, "window": "1h", "class": "crying"}
-    assert rung(rule("more_than", microphone="bath", **keys), heard) == [60]
+    assert rung(rule("more_than", microphone="bath", **keys), recorded) == [60]
 
 
 def test_a_rule_of_minutes_rings_in_the_second_in_which_there_are_more():
-    heard = home((0, 600, "speech"), (1200, 600, "speech"), (4000, 1000, "speech"))
+    recorded = home((0, 600, "speech"), (1200, 600, "speech"), (4000, 1000, "speech"))
     one = rule("more_than", minutes=15, window="1h", cooldown="1m", **{"class": "speech"})
-    expected = _first_seconds(heard.of("speech"), 3600, 900)
-    assert rung(one, heard) == expected
+    expected = _first_seconds(recorded.of("speech"), 3600, 900)
+    assert rung(one, recorded) == expected
 
 
 def test_minutes_of_events_that_must_be_long_count_from_when_they_are():
-    heard = home((0, 50, "speech"), (100, 100, "speech"), (300, 100, "speech"))
+    recorded = home((0, 50, "speech"), (100, 100, "speech"), (300, 100, "speech"))
     one = rule("more_than", minutes=2, window="1h", least_seconds=60, **{"class": "speech"})
     # The first never counts; the second does with all of its 60 seconds, then second by second.
-    assert rung(one, heard) == [360]
+    assert rung(one, recorded) == [360]
 
 
 def _first_seconds(sounds, window, most):
@@ -116,21 +118,21 @@ def _first_seconds(sounds, window, most):
 
 
 def test_a_rule_of_any_sound_takes_all_classes_but_silence():
-    heard = home((0, 100, "silence"), (100, 40, "music"), (140, 40, "speech"))
-    assert rung(rule("longer_than", longer_than="1m"), heard) == [160]
+    recorded = home((0, 100, "silence"), (100, 40, "music"), (140, 40, "speech"))
+    assert rung(rule("longer_than", longer_than="1m"), recorded) == [160]
 
 
 def test_a_sound_that_lasts_too_long_rings_while_it_does_and_once():
-    heard = home((0, 70, "tap_water"), (75, 100, "tap_water"), (1000, 3, "tap_water"))
+    recorded = home((0, 70, "tap_water"), (75, 100, "tap_water"), (1000, 3, "tap_water"))
     one = rule("longer_than", longer_than="1m", cooldown="1m", **{"class": "tap_water"})
-    assert rung(one, heard) == [60]
+    assert rung(one, recorded) == [60]
     # The limit lies in a pause: it goes on when it is heard again.
     one = rule("longer_than", longer_than="72s", **{"class": "tap_water"})
-    assert rung(one, heard) == [75]
+    assert rung(one, recorded) == [75]
     # Twelve seconds are two sounds, unless the rule says otherwise.
-    heard = home((0, 40, "tap_water"), (52, 40, "tap_water"))
-    assert rung(rule("longer_than", longer_than="1m"), heard) == []
-    assert rung(rule("longer_than", longer_than="1m", pause="15s"), heard) == [60]
+    recorded = home((0, 40, "tap_water"), (52, 40, "tap_water"))
+    assert rung(rule("longer_than", longer_than="1m"), recorded) == []
+    assert rung(rule("longer_than", longer_than="1m", pause="15s"), recorded) == [60]
 
 
 def test_what_begins_in_the_cooldown_rings_at_its_end_if_it_still_is_so():
@@ -142,18 +144,18 @@ def test_what_begins_in_the_cooldown_rings_at_its_end_if_it_still_is_so():
 
 
 def test_no_word_from_the_recorder_rings_once_until_it_writes_again():
-    heard = home(written=[(-3600, 3600), (300, 600), (5000, 90_000)])
-    assert rung(rule("recorder_silent", silent_for="10m"), heard) == [900 + 600]
+    recorded = home(written=[(-3600, 3600), (300, 600), (5000, 90_000)])
+    assert rung(rule("recorder_silent", silent_for="10m"), recorded) == [900 + 600]
     assert rung(rule("recorder_silent", silent_for="10m"), home(), hours=2) == [0]
-    assert rung(rule("recorder_silent", silent_for="4m"), heard) == [240, 240 + 3600]
+    assert rung(rule("recorder_silent", silent_for="4m"), recorded) == [240, 240 + 3600]
 
 
 @pytest.mark.parametrize(("share", "known"), [(0.8, True), (0.7, False)])
 def test_none_by_a_time_is_not_known_where_too_little_was_heard(share, known):
     begin = NOON + 18 * HOUR * SECOND  # 06:00
-    heard = home(covered=[(begin, begin + round(4 * share * HOUR) * SECOND)])
+    recorded = home(covered=[(begin, begin + round(4 * share * HOUR) * SECOND)])
     one = rule("none_by", since="06:00", by="10:00", **{"class": "flushing_water"})
-    found, _ = notifications(one, heard, NOON, NOON + DAY, UTC)
+    found, _ = notifications(one, recorded, NOON, NOON + DAY, UTC)
     assert [ring.is_known for ring in found] == [known]
     assert found[0].time == NOON + 22 * HOUR * SECOND
     assert found[0].text == (
@@ -178,24 +180,24 @@ def test_a_class_of_a_scenario_is_heard_by_its_microphone_and_is_no_further_soun
     spoken = [(0, 30, "speech", 1.0, "hall"), (0, 30, "anna", 1.0, "hall-speakers")]
     nobody = (60, 30, "unknown", 1.0, "hall-speakers")
     silence = [(18 * HOUR, 4 * HOUR, "silence", 1.0, name) for name in know]
-    heard = home(*spoken, nobody, *silence, classes=know)
+    recorded = home(*spoken, nobody, *silence, classes=know)
     count = {"count": 0, "window": "1h", "microphone": "hall"}
-    assert rung(rule("more_than", **count, **{"class": "anna"}), heard) == [0]
-    assert rung(rule("more_than", **count, **{"class": "unknown"}), heard) == []
-    assert rung(rule("more_than", **count), heard) == rung(
+    assert rung(rule("more_than", **count, **{"class": "anna"}), recorded) == [0]
+    assert rung(rule("more_than", **count, **{"class": "unknown"}), recorded) == []
+    assert rung(rule("more_than", **count), recorded) == rung(
         rule("more_than", **count), home(*spoken[:1])
     )
-    assert len(heard.of("").starts) == 1
-    assert unknown_class(rule("more_than", **count, **{"class": "anna"}), heard.classes) == ""
+    assert len(recorded.of("").starts) == 1
+    assert unknown_class(rule("more_than", **count, **{"class": "anna"}), recorded.classes) == ""
     for name in ("ben", "unknown"):
         of_name = rule("more_than", **count, **{"class": name})
-        assert name in unknown_class(of_name, heard.classes)
+        assert name in unknown_class(of_name, recorded.classes)
     absent = rule("none_by", since="06:00", by="10:00", microphone="hall", **{"class": "anna"})
-    assert [ring.is_known for ring in notifications(absent, heard, NOON, NOON + DAY, UTC)[0]] == [
-        True
-    ]
-    assert set(home_sound(heard).listened) == {"silence", "speech"}
-    assert set(home_sound(heard).labels.labels) == {"silence", "speech"}
+    assert [
+        ring.is_known for ring in notifications(absent, recorded, NOON, NOON + DAY, UTC)[0]
+    ] == [True]
+    assert set(home_sound(recorded).listened) == {"silence", "speech"}
+    assert set(home_sound(recorded).labels.labels) == {"silence", "speech"}
 
 
 @pytest.mark.parametrize(
@@ -230,11 +232,13 @@ def test_quiet_hours_end_by_the_clock_of_the_home(day):
 
 
 def test_a_ring_in_quiet_hours_waits_for_their_end_unless_it_is_urgent():
-    heard = home((12 * HOUR, 5, "crying"))
+    recorded = home((12 * HOUR, 5, "crying"))
     keys = {"count": 0, "window": "1h", "class": "crying", "quiet_hours": ["22:00-06:30"]}
-    (ring,), _ = notifications(rule("more_than", **keys), heard, NOON, NOON + DAY, UTC)
+    (ring,), _ = notifications(rule("more_than", **keys), recorded, NOON, NOON + DAY, UTC)
     assert ring.due - ring.time == 6.5 * HOUR * SECOND
-    (ring,), _ = notifications(rule("more_than", urgent=True, **keys), heard, NOON, NOON + DAY, UTC)
+    (ring,), _ = notifications(
+        rule("more_than", urgent=True, **keys), recorded, NOON, NOON + DAY, UTC
+    )
     assert ring.due == ring.time
 
 
@@ -366,8 +370,10 @@ def test_rules_over_thirty_days_ring_exactly_when_the_truth_says(first, tmp_path
     begin = wall_times(first, 0, VIENNA)[0]
     end = wall_times(first + timedelta(days=30), 0, VIENNA)[0]
     lost = []
-    heard = read_activity(find_home_logs([tmp_path]), "home", begin - 3 * DAY, end, lost.append)
-    found = {name: notifications(one, heard, begin, end, VIENNA)[0] for name, one in RULES.items()}
+    recorded = read_activity(find_home_logs([tmp_path]), "home", begin - 3 * DAY, end, lost.append)
+    found = {
+        name: notifications(one, recorded, begin, end, VIENNA)[0] for name, one in RULES.items()
+    }
 
     def shown(own, *, known=True):
         times = [each.time for each in own if each.is_known == known]
@@ -387,8 +393,8 @@ def test_rules_over_thirty_days_ring_exactly_when_the_truth_says(first, tmp_path
 def test_a_time_of_day_in_the_hour_of_the_change_rings_once_on_that_day(first):
     day = wall_times(first, 0, VIENNA)[0]
     one = rule("none_by", since="23:00", by="02:30", **{"class": "crying"})
-    heard = home(covered=[(day - DAY, day + 2 * DAY)])
-    found, _ = notifications(one, heard, day, day + DAY, VIENNA)
+    recorded = home(covered=[(day - DAY, day + 2 * DAY)])
+    found, _ = notifications(one, recorded, day, day + DAY, VIENNA)
     assert [ring.time for ring in found] == [wall_times(first, 150, VIENNA)[1]]
 
 
@@ -399,21 +405,21 @@ def test_a_time_of_day_in_the_hour_of_the_change_rings_once_on_that_day(first):
 def lives(draw):
     """Six hours with sounds, pauses of all lengths, and a recorder that falls silent."""
     seconds = st.integers(1, 20) | st.integers(1, 900)
-    heard, now = [], 0
-    while now < 6 * HOUR and len(heard) < 80:
+    recorded, now = [], 0
+    while now < 6 * HOUR and len(recorded) < 80:
         now += draw(seconds)
         length = draw(st.integers(1, 400))
-        heard.append((now, length, draw(st.sampled_from(["coughing", "music"]))))
+        recorded.append((now, length, draw(st.sampled_from(["coughing", "music"]))))
         now += length if draw(st.booleans()) else length // 2
     writes, at_second = [], -600
     while at_second < 7 * HOUR:
         length = draw(st.integers(10, 4000))
         writes.append((at_second, length))
         at_second += length + draw(st.integers(30, 1500))
-    edges = [second for start, length, _ in heard for second in (start, start + length)]
+    edges = [second for start, length, _ in recorded for second in (start, start + length)]
     near = st.builds(int.__add__, st.sampled_from(edges), st.integers(-2, 15))
     cuts = draw(st.sets(near | st.integers(1, 7 * HOUR), max_size=60))
-    return heard, writes, sorted(cut for cut in cuts if 0 < cut < 7 * HOUR)
+    return recorded, writes, sorted(cut for cut in cuts if 0 < cut < 7 * HOUR)
 
 
 DIVIDED = [
@@ -431,14 +437,14 @@ DIVIDED = [
 @settings(max_examples=60, deadline=None)
 @given(lives())
 def test_any_division_of_the_time_gives_the_same_rings(life):
-    heard, writes, cuts = life
-    whole = home(*heard, written=writes)
+    recorded, writes, cuts = life
+    full = home(*recorded, written=writes)
     edges = [NOON + second * SECOND for second in (0, *cuts, 7 * HOUR)]
     for one in DIVIDED:
-        at_once = notifications(one, whole, edges[0], edges[-1], UTC)
+        at_once = notifications(one, full, edges[0], edges[-1], UTC)
         found, state = [], RuleState()
         for start, end in itertools.pairwise(edges):
-            known = whole.between(start - history(one), end, LONGEST_PAUSE)
+            known = full.between(start - history(one), end, LONGEST_PAUSE)
             more, state = notifications(one, known, start, end, UTC, state)
             found += more
         assert (found, state) == at_once
@@ -457,12 +463,12 @@ def test_a_rule_of_any_sound_says_when_the_first_of_them_began_however_it_is_eva
 
 
 def test_a_sound_that_pauses_where_one_evaluation_ends_rings_once():
-    heard = home((0, 100, "music"), (105, 100, "music"))
+    recorded = home((0, 100, "music"), (105, 100, "music"))
     one = rule("longer_than", longer_than="1m", cooldown="1m")
     edges = [NOON + second * SECOND for second in (0, 102, 300)]
-    first, state = notifications(one, heard.between(0, edges[1], 0), edges[0], edges[1], UTC)
+    first, state = notifications(one, recorded.between(0, edges[1], 0), edges[0], edges[1], UTC)
     assert len(first) == 1
-    assert notifications(one, heard, edges[1], edges[2], UTC, state)[0] == []
+    assert notifications(one, recorded, edges[1], edges[2], UTC, state)[0] == []
 
 
 @pytest.mark.parametrize(
@@ -482,7 +488,7 @@ def test_what_is_no_duration_is_refused(text):
 
 
 @pytest.mark.parametrize(
-    ("keys", "says"),
+    ("keys", "states"),
     [
         ({"rule": "more_than", "window": "2h"}, "set either count or minutes"),
         (
@@ -505,8 +511,8 @@ def test_what_is_no_duration_is_refused(text):
         ({"rule": "recorder_silent", "quiet_hours": ["22-6"]}, "write it as 22:00-06:30"),
     ],
 )
-def test_a_rule_that_makes_no_sense_is_refused(keys, says):
-    with pytest.raises(ValidationError, match=says):
+def test_a_rule_that_makes_no_sense_is_refused(keys, states):
+    with pytest.raises(ValidationError, match=states):
         TypeAdapter(AlertRules).validate_python([{"name": "it", **keys}])
 
 

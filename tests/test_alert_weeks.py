@@ -50,28 +50,28 @@ def test_a_silence_that_goes_on_when_it_is_judged_was_heard(part, tmp_path):
     zone = timezone(timedelta(minutes=8 * 60 + 10 - clock.hour * 60 - clock.minute))
     silent_since = now - (10 if part == "night" else 20) * HOUR - 10 * MINUTE
     quiet = rule("unlike_usual", "quiet", part=part, which="less")
-    state, told, said = BridgeState(tmp_path / "state", "home", pytest.fail), [], []
+    state, reported, output = BridgeState(tmp_path / "state", "home", pytest.fail), [], []
     until = now - 20 * MINUTE
     progress = {"quiet": RuleState(since=until, until=until)}
     RuleProgressStore(state, pytest.fail).save([quiet], progress)
     home = LiveHome(tmp_path / "logs")
     write_nights(home.folder, home.classes, silent_since)
 
-    def tell(*ring):
-        told.append(ring)
+    def send(*ring):
+        reported.append(ring)
         return True
 
     try:
         place = RecorderAddress(home.folder, "home", zone)
-        own = AlertsOutput([quiet], DeliverySettings(), place, state, said.append, tell)
+        own = AlertsOutput([quiet], DeliverySettings(), place, state, output.append, send)
         end = time.monotonic() + 120
-        with following(place, {"alerts": own}, said):
-            while not told and time.monotonic() < end:
+        with following(place, {"alerts": own}, output):
+            while not reported and time.monotonic() < end:
                 home.hears("silence")
                 time.sleep(0.2)
     finally:
         home.close()
-    assert said == []
-    ((name, text, _),) = told
+    assert output == []
+    ((name, text, _),) = reported
     assert name == "quiet"
     assert ": 0 times, usually 5" in text

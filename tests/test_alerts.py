@@ -101,8 +101,10 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
         found += new
         live.forget_before(watch.needed_from(now))
         edge, now = now, now + int(rng.integers(1, 40)) * SECOND
-    heard = read_activity(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
-    expected = [notifications(one, heard, begin + MINUTE, until, UTC)[0] for one in rules]
+    recorded = read_activity(
+        find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail
+    )
+    expected = [notifications(one, recorded, begin + MINUTE, until, UTC)[0] for one in rules]
     assert sorted(found) == sorted(ring for own in expected for ring in own)
     assert [len(own) > 0 for own in expected] == [True] * 6
     assert [ring.is_known for own in expected[2:4] for ring in own] == [True, False]
@@ -182,7 +184,9 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
     events = [(HOUR + 60.0 * n, 2.0, "coughing", 0.9) for n in range(3)]
     write_day(tmp_path / "logs", DAY, events, classes=CLASSES)
     begin = midnight(DAY)
-    heard = read_activity(find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail)
+    recorded = read_activity(
+        find_home_logs([tmp_path / "logs"]), "home", begin, 1 << 62, pytest.fail
+    )
     for down_hours, expected in ((20, 1), (30, 0)):
         folder = tmp_path / str(down_hours)
         state = BridgeState(folder, "home", pytest.fail)
@@ -196,12 +200,12 @@ def test_what_rang_while_the_bridge_was_down_is_told_once_unless_a_day_ago(
         now = begin + down_hours * HOUR * SECOND
         for _ in range(2):  # the second bridge is killed before it has remembered, the third not
             before = state.read("rules")
-            assert len(start(now).evaluate(lambda: heard, pytest.fail, now, now)) == expected
+            assert len(start(now).evaluate(lambda: recorded, pytest.fail, now, now)) == expected
             state.write("rules", before)
         assert len(outbox) == expected
-        start(now).evaluate(lambda: heard, pytest.fail, now, now)
+        start(now).evaluate(lambda: recorded, pytest.fail, now, now)
         start(now).save(now)
-        assert start(now).evaluate(lambda: heard, pytest.fail, now + SECOND, now + SECOND) == []
+        assert start(now).evaluate(lambda: recorded, pytest.fail, now + SECOND, now + SECOND) == []
 
 
 def test_a_new_rule_does_not_ring_for_the_silence_before_it(tmp_path):
@@ -227,48 +231,48 @@ def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):
     one = rule("unlike_usual", of="minutes", **{"class": "speech"})
     now = midnight(DAY.replace(day=10)) + 12 * HOUR * SECOND
     watch, _, _ = watching(tmp_path, [one], now)
-    asked = []
+    requested = []
 
     def weeks(start, end):
-        asked.append(end)
+        requested.append(end)
         return read_activity(find_home_logs([tmp_path / "logs"]), "home", start, end, pytest.fail)
 
     found = []
     for _ in range(30):
         now += HOUR * SECOND
         found += watch.evaluate(pytest.fail, weeks, now, now)
-    assert len(asked) == 1
+    assert len(requested) == 1
     assert [ring.text for ring in found] == ["Talking on 2026-03-10: 50 min, usually 5 min"]
 
 
 def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):
-    said = []
+    output = []
     state = BridgeState(tmp_path, "home", pytest.fail)
-    memory = RuleProgressStore(state, said.append)
+    memory = RuleProgressStore(state, output.append)
     progress = {"coughs": RuleState(5, has_rung=True, until=7)}
     memory.save([COUGHS], progress)
     assert memory.load([COUGHS]) == progress
     changed = COUGHS.model_copy(update={"count": 3})
     assert memory.load([changed])["coughs"].until == 0
-    assert said == []
+    assert output == []
     state.write("rules", '{"x": 3}')
     assert memory.load([COUGHS])["coughs"].until == 0
-    assert said == [f"{state.path}, rules: cannot be read; all rules start over"]
+    assert output == [f"{state.path}, rules: cannot be read; all rules start over"]
 
 
 def test_a_clock_that_ran_ahead_does_not_silence_a_rule(tmp_path):
-    said = []
-    memory = RuleProgressStore(BridgeState(tmp_path, "home", pytest.fail), said.append)
+    output = []
+    memory = RuleProgressStore(BridgeState(tmp_path, "home", pytest.fail), output.append)
     memory.save([COUGHS], {"coughs": RuleState(until=9 * HOUR * SECOND)})
-    watch, _, _ = watching(tmp_path, [COUGHS], HOUR * SECOND, said.append)
+    watch, _, _ = watching(tmp_path, [COUGHS], HOUR * SECOND, output.append)
     assert watch.needed_from(HOUR * SECOND) < HOUR * SECOND
-    assert said == ["alerts: the clock was set back; the rules start over"]
+    assert output == ["alerts: the clock was set back; the rules start over"]
 
 
 def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_to_come(tmp_path):
-    said, now = [], midnight(DAY) + 4 * HOUR * SECOND
+    output, now = [], midnight(DAY) + 4 * HOUR * SECOND
     silent = rule("recorder_silent", "silent", silent_for="10m", cooldown="1m")
-    watch, outbox, memory = watching(tmp_path, [silent, QUIET, COUGHS], now, said.append)
+    watch, outbox, memory = watching(tmp_path, [silent, QUIET, COUGHS], now, output.append)
     nothing = SegmentCollector().activity()
 
     def evaluate(until):
@@ -281,7 +285,7 @@ def test_one_look_with_the_clock_ahead_does_not_silence_rules_nor_ring_in_time_t
     assert len(outbox) == 0
     assert memory.load([COUGHS])["coughs"].until == now + 2 * SECOND  # also after a kill
     assert [ring.rule for ring in evaluate(now + 11 * MINUTE)] == ["silent"]
-    assert said == ["alerts: the clock was set back; the rules start over"]
+    assert output == ["alerts: the clock was set back; the rules start over"]
 
 
 class Recorder(Thread):
@@ -346,43 +350,43 @@ class Recorder(Thread):
 
 
 @contextmanager
-def bridge(root, rules, told, said):
+def bridge(root, rules, reported, output):
     """A bridge that tells of rings of some rules."""
     home = RecorderAddress(root / "logs", "home", ZoneInfo("Europe/Vienna"))
 
-    def tell(*ring):
+    def send(*ring):
         is_taken = next(connected)
-        told.extend([ring] * is_taken)
+        reported.extend([ring] * is_taken)
         return is_taken
 
-    state = BridgeState(root / "state", "home", said.append)
+    state = BridgeState(root / "state", "home", output.append)
     connected = chain([False, False], repeat(True))  # the broker comes after the first ring
-    own = AlertsOutput(rules, DeliverySettings(), home, state, said.append, tell)
-    with following(home, {"alerts": own}, said):
+    own = AlertsOutput(rules, DeliverySettings(), home, state, output.append, send)
+    with following(home, {"alerts": own}, output):
         yield
     state.close()
 
 
 def test_a_bridge_tells_of_a_sound_that_goes_on_and_after_a_restart_not_again(tmp_path):
-    told, said = [], []
+    reported, output = [], []
     recorder = Recorder(tmp_path / "logs")
     try:
-        with bridge(tmp_path, [COUGHS, WATER], told, said):
-            wait_for(lambda: len(told) == 2)
-        assert {name for name, _, _ in told} == {"coughs", "water"}
-        texts = {name: text for name, text, _ in told}
+        with bridge(tmp_path, [COUGHS, WATER], reported, output):
+            wait_for(lambda: len(reported) == 2)
+        assert {name for name, _, _ in reported} == {"coughs", "water"}
+        texts = {name: text for name, text, _ in reported}
         assert "Coughing: 3 times in the last 1 h, more than 2" in texts["coughs"]
         assert "Water tap for longer than 10 min, since " in texts["water"]
         assert BridgeState(tmp_path / "state", "home", pytest.fail).names("outbox") == []
         other = rule("recorder_silent", "other")
         late = COUGHS.model_copy(update={"name": "late"})
-        with bridge(tmp_path, [COUGHS, WATER, other, late], told, said):
-            wait_for(lambda: len(told) > 2)
-        assert [name for name, _, _ in told[2:]] == ["late"]
+        with bridge(tmp_path, [COUGHS, WATER, other, late], reported, output):
+            wait_for(lambda: len(reported) > 2)
+        assert [name for name, _, _ in reported[2:]] == ["late"]
     finally:
         recorder.stop.set()
         recorder.join()
-    assert said == []
+    assert output == []
 
 
 def new_columns(logs, seen):
@@ -411,15 +415,15 @@ def news_of_water(time, columns=()):
 @pytest.mark.parametrize("starts_ahead", [True, False])
 def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path, monkeypatch):
     """Also what was written, and labelled, in that time does not stop them."""
-    told, said, ahead = [], [], [0]
+    reported, output, ahead = [], [], [0]
     right = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: right() + ahead[0])
     recorder = Recorder(tmp_path / "logs")
     home = RecorderAddress(tmp_path / "logs", "home", UTC)
     newest, seen = recorder.water, set()
 
-    def tell(name, _text, rung):
-        told.append((name, rung))
+    def send(name, _text, rung):
+        reported.append((name, rung))
         return True
 
     def hears(condition):
@@ -435,11 +439,11 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
             DeliverySettings(),
             home,
             BridgeState(tmp_path / "state", "home", pytest.fail),
-            said.append,
-            tell,
+            output.append,
+            send,
         )
         if not starts_ahead:
-            wait_for(lambda: hears(lambda: len(told) == 2))
+            wait_for(lambda: hears(lambda: len(reported) == 2))
             ahead[0] = AHEAD
             newest = right()
         wait_for(lambda: hears(lambda: own._watch.needed_from(0) > right() + AHEAD // 2))
@@ -447,15 +451,15 @@ def test_alerts_ring_after_the_clock_was_ahead_for_a_look(starts_ahead, tmp_path
         wait_for(lambda: hears(lambda: own._activity._segment("mic").start > right() + AHEAD // 2))
         ahead[0], newest = 0, recorder.water
         own.update(news_of_water(right() + AHEAD))  # known then, and looked at now
-        told.clear()
-        wait_for(lambda: hears(lambda: len(told) == 2))
+        reported.clear()
+        wait_for(lambda: hears(lambda: len(reported) == 2))
         own.close()
     finally:
         recorder.stop.set()
         recorder.join()
-    assert {name for name, _ in told} == {"coughs", "water"}
-    assert all(rung <= right() for _, rung in told)
-    assert len([line for line in said if "start over" in line]) == 1
+    assert {name for name, _ in reported} == {"coughs", "water"}
+    assert all(rung <= right() for _, rung in reported)
+    assert len([line for line in output if "start over" in line]) == 1
 
 
 def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each(
@@ -463,7 +467,7 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
 ):
     calls = []
 
-    def tell(*ring):
+    def send(*ring):
         calls.append(ring)
         return calls.count(ring) == 3
 
@@ -474,7 +478,7 @@ def test_a_broker_is_told_the_same_of_one_ring_after_the_other_until_it_has_each
         home,
         BridgeState(tmp_path, "home", pytest.fail),
         pytest.fail,
-        tell,
+        send,
     )
     now, right = time.time_ns(), time.time_ns
     own._outbox.put(
@@ -600,17 +604,17 @@ def test_a_replay_says_that_nothing_of_the_microphone_of_a_rule_was_recorded(
 
 def test_a_bridge_says_that_no_model_knows_the_class_of_a_rule(tmp_path, monkeypatch):
     monkeypatch.setattr("hearthlog.analyzer.bridge.alerts.output._WAIT_SECONDS", 0.1)
-    said, recorder = [], WrittenHome(tmp_path / "logs")
+    output, recorder = [], WrittenHome(tmp_path / "logs")
     wrong = rule("more_than", "wrong", count=1, window="1h", **{"class": "couhging"})
     try:
-        with bridge(tmp_path, [COUGHS, wrong], [], said):
+        with bridge(tmp_path, [COUGHS, wrong], [], output):
             until = time.monotonic() + 120
-            while not said and time.monotonic() < until:
+            while not output and time.monotonic() < until:
                 recorder.hears("silence")
                 time.sleep(0.1)
     finally:
         recorder.close()
-    (line,) = {*said}
+    (line,) = {*output}
     assert line.startswith("alerts: wrong: no model here has the class 'couhging'; there")
 
 
@@ -639,7 +643,7 @@ def test_a_replay_with_a_damaged_log_uses_the_others_and_ends_with_status_3(
 
 
 @pytest.mark.parametrize(
-    ("content", "options", "status", "says"),
+    ("content", "options", "status", "states"),
     [
         ("", [], 2, "has no rule; docs/alerts.md shows how"),
         (f'node = "flat"\n{CONFIG}', [], 1, "no logs of the recorder 'flat' (node in the"),
@@ -649,11 +653,11 @@ def test_a_replay_with_a_damaged_log_uses_the_others_and_ends_with_status_3(
     ],
 )
 def test_a_replay_of_what_makes_no_sense_is_one_line(  # noqa: PLR0913, PLR0917
-    content, options, status, says, two_days, hearthlog, tmp_path
+    content, options, status, states, two_days, hearthlog, tmp_path
 ):
     (tmp_path / "home.toml").write_text(content)
     options = ["--config", tmp_path / "home.toml", *options]
     done = hearthlog("alerts", "replay", two_days / "logs", *options)
     assert (done.returncode, done.stdout) == (status, "")
-    assert says in done.stderr
+    assert states in done.stderr
     assert done.stderr.count("\n") == 1

@@ -149,33 +149,35 @@ def test_a_label_file_that_does_not_say_who_labelled_is_yours(log, hearthlog, tm
 def test_what_a_file_cannot_say_of_a_mark_is_not_lost_and_what_it_changes_is_taken(
     log, zero, hearthlog, tmp_path
 ):
-    said = {"reviewer": "Ann", "made": 5 * SECOND, "corrects": "live"}
-    write_marks(log, [mark(zero, 1.0000004, 2)._replace(**said), mark(zero, 3, 4)._replace(**said)])
+    printed = {"reviewer": "Ann", "made": 5 * SECOND, "corrects": "live"}
+    write_marks(
+        log, [mark(zero, 1.0000004, 2)._replace(**printed), mark(zero, 3, 4)._replace(**printed)]
+    )
     labels = tmp_path / "labels.txt"
     labels.write_text("1.000000\t2.000000\tcoughing\n3.0\t4.0\tspeech\n")
     result = hearthlog("annotate", "import", log, labels, "--reviewer", "Bob")
     assert result.stdout.splitlines()[1:] == ["speech  1 mark, 1.00 s"]
     assert result.stderr.startswith("hearthlog: 1 mark existed already\n")
     same, changed = read_marks(log)
-    assert same == mark(zero, 1.0000004, 2)._replace(**said)
+    assert same == mark(zero, 1.0000004, 2)._replace(**printed)
     assert (changed.label, changed.reviewer) == ("speech", "Bob")
 
 
 def test_a_label_that_crosses_into_the_next_log_is_split_there(logs, hearthlog, tmp_path):
-    heard = find_coverage(logs)["mic"]
-    border = (heard.starts[1] - heard.starts[0]) / SECOND
+    labelled = find_coverage(logs)["mic"]
+    border = (labelled.starts[1] - labelled.starts[0]) / SECOND
     labels = tmp_path / "labels.csv"
     labels.write_text(f"start,end,label\n{border - 2:.3f},{border + 3:.3f},speech\n")
     assert hearthlog("annotate", "import", logs, labels).stdout.endswith("2 marks, 5.00 s\n")
-    (before,), (after,) = (read_marks(path) for path in heard.logs[:2])
-    assert before.end == after.start == heard.starts[1]
+    (before,), (after,) = (read_marks(path) for path in labelled.logs[:2])
+    assert before.end == after.start == labelled.starts[1]
     assert after.end - before.start == pytest.approx(5 * SECOND, abs=ROUNDING)
 
 
 def test_a_layer_is_a_log_that_says_what_made_it_and_doctor_is_content(logs, log, zero, hearthlog):
     before = hearthlog("doctor", logs).stdout.splitlines()[:-1]
-    said = mark(zero, 1, 2)._replace(reviewer="Ann", made=5 * SECOND, corrects="live")
-    layer = write_marks(log, [said, mark(zero, 0.5, 1, "speech")])
+    printed = mark(zero, 1, 2)._replace(reviewer="Ann", made=5 * SECOND, corrects="live")
+    layer = write_marks(log, [printed, mark(zero, 0.5, 1, "speech")])
     assert layer == review_path(log)
     reader = LogReader(layer)
     by_topic = {}
@@ -187,8 +189,8 @@ def test_a_layer_is_a_log_that_says_what_made_it_and_doctor_is_content(logs, log
         assert [message.label for _, message in messages] == ["speech", "coughing"]
         assert {message.header.frame_id for _, message in messages} == {"mic"}
     assert {message.confidence for _, message in by_topic["/mic/review/segment"]} == {1}
-    said = [(m.reviewer, m.made.sec, m.corrects) for _, m in by_topic["/mic/review/mark"]]
-    assert said == [("", 0, ""), ("Ann", 5, "live")]
+    printed = [(m.reviewer, m.made.sec, m.corrects) for _, m in by_topic["/mic/review/mark"]]
+    assert printed == [("", 0, ""), ("Ann", 5, "live")]
     about = reader.metadata["hearthlog"]
     assert (about["node"], about["log"]) == ("home", log.name)
     assert about["version"]
@@ -242,14 +244,14 @@ def test_marks_say_who_made_them_when_and_what_they_correct(log, zero):
 
 
 def test_marks_are_deleted_where_that_is_said_and_cut_around_it(log, zero):
-    said = {"reviewer": "Ann", "made": SECOND, "corrects": "live"}
-    old = [mark(zero, 1, 4)._replace(**said), mark(zero, 5, 6), mark(zero, 7, 8)]
+    printed = {"reviewer": "Ann", "made": SECOND, "corrects": "live"}
+    old = [mark(zero, 1, 4)._replace(**printed), mark(zero, 5, 6), mark(zero, 7, 8)]
     write_marks(log, old)
     gaps = [MarkedSpan(*mark(zero, *times)[:3]) for times in ((2, 3), (5, 7))]
     write_marks(log, [mark(zero, 5.5, 5.6, "speech")], gaps)
     assert read_marks(log) == [
-        mark(zero, 1, 2)._replace(**said),
-        mark(zero, 3, 4)._replace(**said),
+        mark(zero, 1, 2)._replace(**printed),
+        mark(zero, 3, 4)._replace(**printed),
         mark(zero, 5.5, 5.6, "speech"),
         mark(zero, 7, 8),
     ]
@@ -257,8 +259,8 @@ def test_marks_are_deleted_where_that_is_said_and_cut_around_it(log, zero):
     assert not layer.exists()
 
 
-def looked_at(zero, start, end, **said):
-    return ReviewedSpan("mic", zero + start * SECOND, zero + end * SECOND, **said)
+def looked_at(zero, start, end, **printed):
+    return ReviewedSpan("mic", zero + start * SECOND, zero + end * SECOND, **printed)
 
 
 def test_a_layer_keeps_what_was_looked_at_beside_the_marks(log, zero):
@@ -388,19 +390,19 @@ def test_logs_of_a_clock_that_drifts_have_one_border(hearthlog, tmp_path, begins
     labels = tmp_path / "labels.txt"
     labels.write_text("1.0\t5.0\tspeech\n5.0\t5.5\tcoughing\n")
     assert hearthlog("annotate", "import", tmp_path / "logs", labels).returncode == 0
-    heard = find_coverage(tmp_path / "logs")["mic"]
-    assert heard.starts[1] - heard.starts[0] == round((3 + begins_late) * SECOND)
-    (before,), (after, _) = (read_marks(log) for log in heard.logs)
-    assert before.end == after.start == heard.starts[1]
+    labelled = find_coverage(tmp_path / "logs")["mic"]
+    assert labelled.starts[1] - labelled.starts[0] == round((3 + begins_late) * SECOND)
+    (before,), (after, _) = (read_marks(log) for log in labelled.logs)
+    assert before.end == after.start == labelled.starts[1]
     assert after.end - before.start == 4 * SECOND
 
 
 def test_where_nothing_was_recorded_nothing_can_be_marked(logs, hearthlog, tmp_path):
-    heard = find_coverage(logs)["mic"]
-    assert len(heard.logs) > 2
-    heard.logs[1].unlink()
+    labelled = find_coverage(logs)["mic"]
+    assert len(labelled.logs) > 2
+    labelled.logs[1].unlink()
     labels = tmp_path / "labels.txt"
-    border = (heard.starts[1] - heard.starts[0]) / SECOND
+    border = (labelled.starts[1] - labelled.starts[0]) / SECOND
     for start, end in ((border - 1, border + 1), (border + 1, border + 2)):
         labels.write_text(f"{start:.6f}\t{end:.6f}\tspeech\n")
         result = hearthlog("annotate", "import", logs, labels)

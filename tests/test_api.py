@@ -12,7 +12,7 @@ from threading import Event as Flag
 import numpy as np
 import pytest
 import soundfile
-from arrays import SQUARE, heard
+from arrays import SQUARE, array_frames
 
 import hearthlog
 from hearthlog.analyzer.marks.marks import Mark, write_marks
@@ -39,7 +39,7 @@ def make_logs(folder, model, sounds, **options):
 
 
 def make_array_logs(folder, model):
-    sound = heard(SQUARE, np.deg2rad(45)).reshape(-1, 4)
+    sound = array_frames(SQUARE, np.deg2rad(45)).reshape(-1, 4)
     soundfile.write(folder / "array.wav", sound, 16_000, subtype="PCM_16")
     microphone = MicrophoneSettings(array=SQUARE)
     settings = Settings(output=folder / "array", model=model, microphone=[microphone])
@@ -211,16 +211,16 @@ def test_a_span_of_time_is_what_is_read(folder):
     ids=["no message at all", "no log of the span", "neither"],
 )
 def test_a_topic_without_messages_is_a_table_without_rows(span, topic, folder):
-    logs, whole = hearthlog.open_logs(folder / "logs", *span), hearthlog.open_logs(folder / "logs")
+    logs, full = hearthlog.open_logs(folder / "logs", *span), hearthlog.open_logs(folder / "logs")
     columns = logs.columns(topic)
-    assert (len(columns), columns.type) == (0, whole.topics[topic])
+    assert (len(columns), columns.type) == (0, full.topics[topic])
     assert columns["header.stamp"].dtype == np.int64
     assert logs.columns(topic, ["header.frame_id"]).fields.keys() == {"header.frame_id"}
     assert logs.arrow(topic).num_rows == 0
-    assert logs.arrow(topic).schema.types == whole.arrow(topic).schema.types
+    assert logs.arrow(topic).schema.types == full.arrow(topic).schema.types
     assert len(logs.pandas(topic)) == 0
-    assert logs.pandas(topic).columns.equals(whole.pandas(topic).columns)
-    assert logs.pandas(topic).index.dtype == whole.pandas(topic).index.dtype
+    assert logs.pandas(topic).columns.equals(full.pandas(topic).columns)
+    assert logs.pandas(topic).index.dtype == full.pandas(topic).index.dtype
     with pytest.raises(HearthlogError, match="no topic /mic/other; there are /diagnostics, "):
         logs.columns("/mic/other")
 

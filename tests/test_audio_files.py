@@ -72,7 +72,7 @@ def wav(tmp_path, sound):
     return write
 
 
-def heard(path, **options):
+def recorded(path, **options):
     return np.concatenate([np.empty(0, np.float32), *read_audio(path, **options)])
 
 
@@ -410,8 +410,8 @@ def test_a_flac_file_without_a_length_is_read_to_its_end(hearthlog, sound, tmp_p
     path = tmp_path / "20260301_070000.flac"
     path.write_bytes(streamed(bytes_of(sound, "FLAC")))
     assert soundfile.info(path).frames > 1 << 62
-    np.testing.assert_array_equal(heard(path), sound)
-    np.testing.assert_array_equal(heard(path, start=0.5, end=1.25), sound[8000:20_000])
+    np.testing.assert_array_equal(recorded(path), sound)
+    np.testing.assert_array_equal(recorded(path, start=0.5, end=1.25), sound[8000:20_000])
     assert audio_seconds(path) == 2.0
     result = hearthlog("record", path, "--model", "none", "-o", tmp_path / "logs")
     assert (result.returncode, result.stderr) == (0, "")
@@ -426,7 +426,7 @@ def test_a_wav_file_that_was_never_completed_is_read_to_its_end(sound, tmp_path,
     path.write_bytes(data[:4] + claimed + data[8:place] + claimed + data[place + 4 :])
     before = path.read_bytes()
     faults = []
-    np.testing.assert_array_equal(heard(path, incomplete=faults.append), sound)
+    np.testing.assert_array_equal(recorded(path, incomplete=faults.append), sound)
     assert faults == []
     assert path.read_bytes() == before
 
@@ -436,27 +436,27 @@ def test_a_large_wav_file_that_was_never_completed_is_read_to_its_end(sound, tmp
     data = bytes_of(sound, "RF64")
     assert data[12:16] == b"ds64"
     path.write_bytes(data[:20] + bytes(24) + data[44:])
-    np.testing.assert_array_equal(heard(path)[: len(sound)], sound)
-    assert len(heard(path)) < len(sound) + 100, "libsndfile writes a chunk behind it"
+    np.testing.assert_array_equal(recorded(path)[: len(sound)], sound)
+    assert len(recorded(path)) < len(sound) + 100, "libsndfile writes a chunk behind it"
 
 
 def test_a_wav_file_of_no_samples_is_not_taken_for_one_that_was_not_completed(tmp_path):
     path = tmp_path / "a.wav"
     path.write_bytes(bytes_of(np.empty(0)) + b"LIST\x04\0\0\0INFO")
     with pytest.raises(SourceError, match="holds no audio"):
-        heard(path)
+        recorded(path)
 
 
 @pytest.mark.parametrize("kind", ["WAV", "FLAC", "OGG", "MP3", "W64", "AIFF", "AU", "RF64"])
 def test_a_cut_file_is_read_as_far_as_it_goes_with_a_word(sound, tmp_path, kind, capfd):
-    whole = tmp_path / f"whole.{kind.lower()}"
-    soundfile.write(whole, np.tile(sound, 6), RATE, format=kind)
+    full = tmp_path / f"whole.{kind.lower()}"
+    soundfile.write(full, np.tile(sound, 6), RATE, format=kind)
     faults = []
-    assert len(heard(whole, incomplete=faults.append)) == 12 * RATE
+    assert len(recorded(full, incomplete=faults.append)) == 12 * RATE
     assert faults == []
     path = tmp_path / f"cut.{kind.lower()}"
-    path.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2 + 1])
-    samples = heard(path, incomplete=faults.append)
+    path.write_bytes(full.read_bytes()[: full.stat().st_size // 2 + 1])
+    samples = recorded(path, incomplete=faults.append)
     assert 4 * RATE < len(samples) < 8 * RATE
     (fault,) = faults
     assert fault.startswith(f"{path}: is ")
@@ -470,7 +470,7 @@ def test_a_part_that_begins_behind_the_cut_of_a_file_is_said_not_to_be_there(sou
     cut = tmp_path / "a.flac"
     cut.write_bytes(bytes_of(np.tile(sound, 3), "FLAC")[:-80_000])
     faults = []
-    assert not len(heard(cut, start=5.0, end=5.5, incomplete=faults.append))
+    assert not len(recorded(cut, start=5.0, end=5.5, incomplete=faults.append))
     assert faults == [f"{cut}: is damaged or cut short before 5.00 s"]
 
 
@@ -479,7 +479,7 @@ def test_a_header_with_many_channels_takes_no_memory_for_sound_that_is_not_there
     soundfile.write(path, np.zeros((1, 1024)), 768_000)
     tracemalloc.start()
     try:
-        heard(path)
+        recorded(path)
         assert tracemalloc.get_traced_memory()[1] < 10_000_000
     finally:
         tracemalloc.stop()
@@ -519,13 +519,13 @@ def test_what_libsndfile_cannot_read_is_read_by_ffmpeg(wav, sound, tmp_path, suf
     path = converted(wav("a.wav"), tmp_path / f"b.{suffix}")
     assert is_audio(path.name)
     faults = []
-    samples = heard(path, incomplete=faults.append)
+    samples = recorded(path, incomplete=faults.append)
     assert faults == []
     assert abs(len(samples) - len(sound)) < 0.15 * RATE
     assert audio_seconds(path) == pytest.approx(len(samples) / RATE)
     if suffix == "oga":  # FLAC in Ogg
         np.testing.assert_array_equal(samples, sound)
-        np.testing.assert_array_equal(heard(path, start=0.5, end=1.0), sound[8000:16_000])
+        np.testing.assert_array_equal(recorded(path, start=0.5, end=1.0), sound[8000:16_000])
 
 
 @needs_ffmpeg
@@ -534,7 +534,7 @@ def test_what_ffmpeg_reads_of_a_cut_file_is_said_to_be_cut(wav, tmp_path, suffix
     path = converted(wav("a.wav", 8), tmp_path / f"b.{suffix}")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 + 1])
     faults = []
-    assert 2 * RATE < len(heard(path, incomplete=faults.append)) < 6 * RATE
+    assert 2 * RATE < len(recorded(path, incomplete=faults.append)) < 6 * RATE
     assert "cut short" in faults[0]
 
 
@@ -549,7 +549,7 @@ def test_a_file_that_leads_ffmpeg_elsewhere_is_refused(wav, tmp_path):
     ):
         path.write_text(text)
         with pytest.raises(SourceError, match="cannot be read as audio"):
-            heard(path)
+            recorded(path)
 
 
 @pytest.mark.parametrize(
@@ -564,7 +564,7 @@ def test_an_ffmpeg_that_gives_no_sound_is_ended(tmp_path, monkeypatch, script):
     path = tmp_path / "a.m4a"
     path.write_text("anything")
     with pytest.raises(SourceError, match="ffmpeg finds no more sound in it within"):
-        heard(path)
+        recorded(path)
 
 
 def test_an_ffmpeg_that_cannot_be_run_ends_one_file(tmp_path, monkeypatch):
@@ -575,7 +575,7 @@ def test_an_ffmpeg_that_cannot_be_run_ends_one_file(tmp_path, monkeypatch):
     path = tmp_path / "a.m4a"
     path.write_text("anything")
     with pytest.raises(SourceError, match=r"a.m4a: cannot be read \(Exec format error\)"):
-        heard(path)
+        recorded(path)
 
 
 def test_without_ffmpeg_the_line_says_what_to_do(tmp_path, monkeypatch):
@@ -583,7 +583,7 @@ def test_without_ffmpeg_the_line_says_what_to_do(tmp_path, monkeypatch):
     path.write_bytes(b"\0\0\0\x1cftypM4A \0\0\0\0M4A mp42isom")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(SourceError) as caught:
-        heard(path)
+        recorded(path)
     assert str(caught.value).endswith(
         "install ffmpeg (Debian: apt install ffmpeg), or convert it elsewhere: "
         "ffmpeg -i 'my voice.m4a' 'my voice.wav'"
@@ -606,10 +606,10 @@ def test_an_mp3_file_of_several_bit_rates_is_read_to_its_end_or_said_to_be_longe
     assert soundfile.info(path).duration < 8
     faults = []
     if shutil.which("ffmpeg"):
-        assert len(heard(path, incomplete=faults.append)) == pytest.approx(12 * RATE, rel=0.03)
+        assert len(recorded(path, incomplete=faults.append)) == pytest.approx(12 * RATE, rel=0.03)
         assert faults == []
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert len(heard(path, incomplete=faults.append)) < 8 * RATE
+    assert len(recorded(path, incomplete=faults.append)) < 8 * RATE
     assert "install ffmpeg, which reads" in faults[0]
 
 
@@ -654,4 +654,4 @@ def test_a_folder_has_the_files_of_all_formats_that_are_read(wav, tmp_path):
     )
     assert not refused
     for file in found:
-        assert len(heard(file)) > RATE
+        assert len(recorded(file)) > RATE

@@ -71,12 +71,12 @@ def test_the_command_multiplies_with_the_kernel_that_is_chosen():
         "print(kernel_in_use())"
     )
     environment = {n: v for n, v in os.environ.items() if n != "OPENBLAS_CORETYPE"}
-    said = subprocess.run(
+    output = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
     ).stdout.strip()
-    if not said.startswith("openblas"):
+    if not output.startswith("openblas"):
         pytest.skip("numpy multiplies with another library here")
-    assert said == "openblas SkylakeX" or not kernel_environment()
+    assert output == "openblas SkylakeX" or not kernel_environment()
 
 
 def runnable():

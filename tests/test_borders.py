@@ -122,10 +122,10 @@ def test_a_state_is_refined_after_the_delay_and_what_comes_later_does_not_change
     powers = 10 ** rng.uniform(-6, -1, len(states))
     delay = Borders(SILENCE, REACH, SHORTEST).delay
     assert delay == 2 * REACH + SHORTEST - 1
-    whole = refined(states, powers)
+    full = refined(states, powers)
     for end in (1, 10, delay, delay + 1, 100, 333):
         seen = Borders(SILENCE, REACH, SHORTEST).push(states[:end], powers[:end])
-        assert seen.tolist() == whole[: max(end - delay, 0)].tolist()
+        assert seen.tolist() == full[: max(end - delay, 0)].tolist()
 
 
 def test_levels_may_be_known_before_states():
@@ -167,8 +167,8 @@ def test_blocks_of_any_size_give_the_same_and_no_border_moves_too_far(
     levels = of_runs(*((level, count) for _, count, level in runs))
     levels = np.roll(levels, seed) + np.random.default_rng(seed).normal(0, 2, len(levels))
     powers = 10 ** (levels / 10)
-    whole = refined(states, powers, reach=reach, shortest=shortest)
-    assert len(whole) == len(states)
+    full = refined(states, powers, reach=reach, shortest=shortest)
+    assert len(full) == len(states)
     borders, parts, place, turn = Borders(SILENCE, reach, shortest), [], 0, 0
     while place < len(states):
         size = sizes[turn % len(sizes)]
@@ -176,7 +176,7 @@ def test_blocks_of_any_size_give_the_same_and_no_border_moves_too_far(
         place, turn = place + size, turn + 1
         due = max(min(place, len(states)) - borders.delay, 0)
         assert sum(map(len, parts)) == due
-    assert np.concatenate([*parts, borders.close()]).tolist() == whole.tolist()
+    assert np.concatenate([*parts, borders.close()]).tolist() == full.tolist()
     moved = refined(states, powers, reach=reach, shortest=1)
     before, after = runs_of(states), runs_of(moved)
     assert [state for state, _ in after] == [state for state, _ in before]
@@ -184,7 +184,7 @@ def test_blocks_of_any_size_give_the_same_and_no_border_moves_too_far(
     assert (np.abs(now - was) <= reach).all()
     of_silence = np.array([SILENCE in pair for pair in zip(*neighbours(before), strict=True)], bool)
     assert (now == was)[~of_silence].all()
-    assert all(count >= shortest for _, count in runs_of(whole)[1:])
+    assert all(count >= shortest for _, count in runs_of(full)[1:])
 
 
 def neighbours(rows):

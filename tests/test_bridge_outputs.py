@@ -32,7 +32,7 @@ def test_an_output_that_cannot_be_opened_is_tried_again_and_stops_no_other(
     home, tmp_path, monkeypatch
 ):
     monkeypatch.setattr("hearthlog.analyzer.bridge.bridge._AGAIN_SECONDS", 0.0)
-    said = []
+    printed = []
     token = tmp_path / "token"
     token.write_text("a-token-of-the-figures\n")
     with listen() as other:
@@ -45,11 +45,11 @@ def test_an_output_that_cannot_be_opened_is_tried_again_and_stops_no_other(
             BridgeSettings.model_validate(tables),
             home,
             BridgeState(tmp_path, "home", pytest.fail),
-            ProblemReporter(said.append),
+            ProblemReporter(printed.append),
         )
         opened["prometheus"].update(NEWS)
         assert list(opened) == ["prometheus", "ping"]
-        (line,) = said
+        (line,) = printed
         assert line.startswith(f"bridge.prometheus: cannot listen on port {port} (")
         assert line.endswith("; take another; trying again")
     opened["prometheus"].update(NEWS)
@@ -77,21 +77,24 @@ CONTRADICTIONS = [
     ("tables", "line"), CONTRADICTIONS, ids=[str(t) for t, _ in CONTRADICTIONS]
 )
 def test_a_table_that_contradicts_itself_closes_its_own_output_alone(home, tmp_path, tables, line):
-    said = []
+    printed = []
     with listen() as broker:
         port = {"port": broker.getsockname()[1]} if "mqtt" in tables else {}
         tables = {name: table | port for name, table in tables.items()}
         settings = BridgeSettings.model_validate(tables | {"page": {"port": free_port()}})
         opened, _ = open_outputs(
-            settings, home, BridgeState(tmp_path, "home", pytest.fail), ProblemReporter(said.append)
+            settings,
+            home,
+            BridgeState(tmp_path, "home", pytest.fail),
+            ProblemReporter(printed.append),
         )
         assert [name for name, output in opened.items() if output.output] == ["page"]
         opened["page"].close()
         broker.setblocking(False)
         with pytest.raises(BlockingIOError):  # nobody came, with a password or without
             broker.accept()
-    assert said[0].startswith(line)
-    assert said[0].endswith("; trying again")
+    assert printed[0].startswith(line)
+    assert printed[0].endswith("; trying again")
     problems, _ = output_problems(settings)
     assert any(each.startswith(line) for each in problems)
 
@@ -118,17 +121,20 @@ def test_a_text_file_that_cannot_be_looked_at_is_no_reason_to_refuse_the_configu
     settings = BridgeSettings.model_validate({"prometheus": {"text_file": file}})
     (line,), _ = output_problems(settings)
     assert problem.format(file) in line
-    said = []
+    printed = []
     with_readers = settings.prometheus.model_copy(update={"readable_by": "all"})
     outputs_of = settings.model_copy(update={"prometheus": with_readers})
     opened, _ = open_outputs(
-        outputs_of, home, BridgeState(tmp_path, "home", pytest.fail), ProblemReporter(said.append)
+        outputs_of,
+        home,
+        BridgeState(tmp_path, "home", pytest.fail),
+        ProblemReporter(printed.append),
     )
     opened["prometheus"].update(NEWS)
     opened["prometheus"].close()
-    assert said[0].startswith("bridge.prometheus: text_file: ")
-    assert said[0].endswith("; trying again")
-    assert all("cannot be removed" in line for line in said[1:])
+    assert printed[0].startswith("bridge.prometheus: text_file: ")
+    assert printed[0].endswith("; trying again")
+    assert all("cannot be removed" in line for line in printed[1:])
 
 
 def test_an_output_that_is_tried_again_leaves_no_thread(home, tmp_path, monkeypatch):
@@ -172,18 +178,18 @@ def test_without_a_table_nothing_is_opened(home, tmp_path):
 
 
 def test_a_package_that_is_missing_stops_no_other_output(home, tmp_path, monkeypatch):
-    said = []
+    printed = []
     monkeypatch.setitem(sys.modules, "paho.mqtt.client", None)
     monkeypatch.delitem(sys.modules, "hearthlog.analyzer.bridge.mqtt.publisher", raising=False)
     monkeypatch.delitem(sys.modules, "hearthlog.analyzer.bridge.mqtt.connection", raising=False)
     tables = {"mqtt": {"host": "127.0.0.1"}, "ping": {"url_file": str(tmp_path / "none")}}
     settings = BridgeSettings.model_validate(tables | {"page": {"port": free_port()}})
     opened, _ = open_outputs(
-        settings, home, BridgeState(tmp_path, "home", pytest.fail), ProblemReporter(said.append)
+        settings, home, BridgeState(tmp_path, "home", pytest.fail), ProblemReporter(printed.append)
     )
     assert [name for name, output in opened.items() if output.output] == ["page"]
-    assert said[0].startswith("paho.mqtt.client is not installed; try: ")
-    assert "no such file of a ping address; trying again" in said[-1]
+    assert printed[0].startswith("paho.mqtt.client is not installed; try: ")
+    assert "no such file of a ping address; trying again" in printed[-1]
     for output in opened.values():
         output.close()
 

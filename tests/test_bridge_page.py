@@ -51,8 +51,8 @@ HOSTILE = '<img src=x onerror="document.title=1">'
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     with serving(tmp_path_factory.mktemp("served")) as home:
-        home.log.heard("silence", 300, 60)
-        home.coughed = home.log.heard("coughing", 90, 3, 0.95)
+        home.log.write_segment("silence", 300, 60)
+        home.coughed = home.log.write_segment("coughing", 90, 3, 0.95)
         home.log.hears("silence")
         with home.stream() as part:
             part("events", lambda events: events["events"])
@@ -71,9 +71,9 @@ def test_without_the_token_one_learns_how_to_get_the_address_and_nothing_else(se
     token = served.token
     cookies = [None, "", f"hearthlog-{served.port}=", f"hearthlog-{served.port}={token}"]
     targets = [path, f"{path}?token=", f"{path}?token={token[:-1]}", f"{path}?token={token}x"]
-    answers = {served.ask("GET", path, cookie=cookie)[::2] for cookie in cookies}
-    answers |= {served.ask("GET", target, cookie=None)[::2] for target in targets}
-    answers.add(served.ask("POST", path, "{}", None, Origin=served.url.partition("/?")[0])[::2])
+    answers = {served.request("GET", path, cookie=cookie)[::2] for cookie in cookies}
+    answers |= {served.request("GET", target, cookie=None)[::2] for target in targets}
+    answers.add(served.request("POST", path, "{}", None, Origin=served.url.partition("/?")[0])[::2])
     assert {status for status, _ in answers} == {403}
     for _, text in answers:
         assert "its full address" in text
@@ -86,9 +86,9 @@ def test_without_the_token_one_learns_how_to_get_the_address_and_nothing_else(se
 )
 def test_a_name_that_somebody_lets_point_here_gets_nothing(served, host):
     for target in ("/", f"/?token={served.token}", "/events"):
-        assert served.ask("GET", target, Host=f"{host}:{served.port}")[0] == 403
-    assert served.ask("GET", "/", Host="127.0.0.1:9999")[0] == 200  # the other end of a tunnel
-    assert served.ask("GET", "/", Host=f"localhost:{served.port}")[0] == 200
+        assert served.request("GET", target, Host=f"{host}:{served.port}")[0] == 403
+    assert served.request("GET", "/", Host="127.0.0.1:9999")[0] == 200  # the other end of a tunnel
+    assert served.request("GET", "/", Host=f"localhost:{served.port}")[0] == 200
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def named(tmp_path_factory, dashboard):
     names = ["Raspberrypi.local", "home.example:8443"]
     settings = {"names": names, "frames": [dashboard.rstrip("/")]}
     with serving(tmp_path_factory.mktemp("named"), settings) as home:
-        home.log.heard("coughing", 90, 3, 0.95)
+        home.log.write_segment("coughing", 90, 3, 0.95)
         home.log.hears("silence")
         with home.stream() as part:
             part("events", lambda events: events["events"])
@@ -127,18 +127,18 @@ def named(tmp_path_factory, dashboard):
     ],
 )
 def test_a_name_that_the_configuration_has_opens_the_page(named, host, status):
-    assert named.ask("GET", "/", Host=host)[0] == status
-    assert named.ask("GET", "/", Host=host, cookie=None)[0] == 403
+    assert named.request("GET", "/", Host=host)[0] == status
+    assert named.request("GET", "/", Host=host, cookie=None)[0] == 403
 
 
 def test_who_asks_by_a_name_is_told_so_and_which_key_allows_it(served):
-    whole = f"/?token={served.token}"
-    status, _, text = served.ask("GET", whole, cookie=None, Host="raspberrypi.local:8380")
+    full = f"/?token={served.token}"
+    status, _, text = served.request("GET", full, cookie=None, Host="raspberrypi.local:8380")
     assert status == 403
     assert 'names = ["raspberrypi.local"] in [bridge.page]' in text
     assert "its full address" not in text
     for host in ("<script>", "a b", "x" * 300, '"', "[::1"):
-        status, _, text = served.ask("GET", whole, cookie=None, Host=host)
+        status, _, text = served.request("GET", full, cookie=None, Host=host)
         assert (status, host in text, "by its IP address" in text) == (403, False, True)
 
 
@@ -155,7 +155,7 @@ def test_who_asks_by_a_name_is_told_so_and_which_key_allows_it(served):
 )
 def test_behind_a_proxy_the_page_itself_marks_and_no_other(named, host, origin, status):
     body = json.dumps({"event": "none", "label": "music"})
-    answer = named.ask("POST", "/mark", body, Host=host, Origin=origin, **JSON)
+    answer = named.request("POST", "/mark", body, Host=host, Origin=origin, **JSON)
     assert answer[0] == status
     assert ("names" in answer[2]) == (status == 403)
 
@@ -163,8 +163,8 @@ def test_behind_a_proxy_the_page_itself_marks_and_no_other(named, host, origin, 
 def test_the_reasons_of_a_refusal_are_told_apart(served):
     cookie = served.cookie()
     until = int(cookie.partition("=")[2].partition("-")[0])
-    told = {
-        name: served.ask("GET", path, cookie=given)[2].partition(".")[0]
+    reported = {
+        name: served.request("GET", path, cookie=given)[2].partition(".")[0]
         for name, path, given in [
             ("nothing", "/", None),
             ("wrong", f"/?token={served.token[:-1]}", None),
@@ -173,9 +173,9 @@ def test_the_reasons_of_a_refusal_are_told_apart(served):
             ("broken", "/", f"{cookie}x"),
         ]
     }
-    assert told.pop("nothing").startswith("This page opens only with its full address")
-    assert told.pop("wrong") == "The token in this address is wrong"
-    assert {*told.values()} == {"The cookie of this browser is no longer valid"}
+    assert reported.pop("nothing").startswith("This page opens only with its full address")
+    assert reported.pop("wrong") == "The token in this address is wrong"
+    assert {*reported.values()} == {"The cookie of this browser is no longer valid"}
 
 
 def test_a_cookie_is_void_with_another_key_token_or_port_or_after_a_year(monkeypatch):
@@ -234,12 +234,12 @@ class FakeContent:
 
 @pytest.fixture
 def behind_ingress():
-    """A page that only the address of an ingress may open, and a way to ask it."""
+    """A page that only the address of an ingress may open, and a way to send it requests."""
     port, content = free_port(), FakeContent()
     admission = PageAdmission("0.0.0.0", port, "x" * 20, b"key", ingress=INGRESS)
     page = server.PageServer(admission, content)
 
-    def ask(client, method, path, body=None, **fields):
+    def query(client, method, path, body=None, **fields):
         connection = HTTPConnection("127.0.0.1", port, 30, source_address=(client, 0))
         named = {name.replace("_", "-"): value for name, value in fields.items()}
         connection.request(method, path, body, {"Host": "ha.example:8123"} | named)
@@ -248,7 +248,7 @@ def behind_ingress():
         connection.close()
         return found
 
-    yield SimpleNamespace(ask=ask, content=content, admission=admission)
+    yield SimpleNamespace(query=query, content=content, admission=admission)
     page.end()
 
 
@@ -256,13 +256,13 @@ MARK = json.dumps({"event": "x", "label": "music"})
 
 
 def test_the_ingress_opens_the_page_without_a_token_and_frames_it(behind_ingress):
-    status, fields, text = behind_ingress.ask(INGRESS, "GET", "/", Host="any.name:1")
+    status, fields, text = behind_ingress.request(INGRESS, "GET", "/", Host="any.name:1")
     assert status == 200
     assert "<html" in text
     assert "frame-ancestors 'self'" in fields["Content-Security-Policy"]
     assert fields["X-Frame-Options"] == "SAMEORIGIN"
     own = JSON | {"Origin": "https://ha.example:8123"}
-    assert behind_ingress.ask(INGRESS, "POST", "/mark", MARK, **own)[0] == 200
+    assert behind_ingress.request(INGRESS, "POST", "/mark", MARK, **own)[0] == 200
     assert behind_ingress.content.acts == [("/mark", "x", "music")]
 
 
@@ -282,11 +282,14 @@ def test_nobody_else_passes_for_the_ingress_not_even_with_the_token(behind_ingre
     own = {"Cookie": admission.cookie().partition(";")[0], "Origin": "http://ha.example:8123"}
     for path in ("/", f"/?token={admission.token}", "/page.js", f"/{admission.new_pass()}/"):
         for client in ("127.0.0.1", "127.0.0.90"):
-            status, fields, text = behind_ingress.ask(client, "GET", path, **own, **forged)
+            status, fields, text = behind_ingress.request(client, "GET", path, **own, **forged)
             assert status == 403
             assert "opens only in Home Assistant" in text
             assert "Set-Cookie" not in fields
-    assert behind_ingress.ask("127.0.0.1", "POST", "/mark", MARK, **JSON, **own, **forged)[0] == 403
+    assert (
+        behind_ingress.request("127.0.0.1", "POST", "/mark", MARK, **JSON, **own, **forged)[0]
+        == 403
+    )
     assert behind_ingress.content.acts == []
 
 
@@ -301,7 +304,7 @@ def test_nobody_else_passes_for_the_ingress_not_even_with_the_token(behind_ingre
     ],
 )
 def test_another_page_changes_nothing_through_the_ingress(behind_ingress, fields):
-    assert behind_ingress.ask(INGRESS, "POST", "/mark", MARK, **JSON, **fields)[0] == 403
+    assert behind_ingress.request(INGRESS, "POST", "/mark", MARK, **JSON, **fields)[0] == 403
     assert behind_ingress.content.acts == []
 
 
@@ -319,27 +322,27 @@ def test_another_page_marks_nothing_though_the_browser_sends_the_cookie(served, 
     before = served.marks()
     own = {} if origin is None else {"Origin": origin}
     body = json.dumps({"event": "x", "label": "music"})
-    assert served.ask("POST", "/mark", body, **JSON, **own)[0] == 403
+    assert served.request("POST", "/mark", body, **JSON, **own)[0] == 403
     if origin is not None:
-        assert served.ask("GET", "/events", Origin=origin)[0] == 403
+        assert served.request("GET", "/events", Origin=origin)[0] == 403
     assert served.marks() == before
 
 
 def test_the_address_gives_a_cookie_that_no_script_reads_and_that_has_no_token(served):
-    status, fields, text = served.ask("GET", f"/?token={served.token}", cookie=None)
+    status, fields, text = served.request("GET", f"/?token={served.token}", cookie=None)
     assert status == 200
     assert 'url=./"' in text
     rules = {rule.strip() for rule in fields["Set-Cookie"].split(";")[1:]}
     assert {"HttpOnly", "SameSite=Strict"} <= rules
     assert not any(rule.startswith("Path") for rule in rules)  # below a path of a proxy it is that
     assert served.token not in f"{fields}{text}"
-    assert served.ask("GET", "/")[0] == 200
+    assert served.request("GET", "/")[0] == 200
 
 
 @pytest.mark.parametrize("path", ["/", "/page.js", "/page.css", "/none"])
 def test_no_answer_is_kept_framed_guessed_at_or_handed_on(served, path):
     for cookie in ("own", None):
-        _, fields, _ = served.ask("GET", path, cookie=cookie)
+        _, fields, _ = served.request("GET", path, cookie=cookie)
         policy = fields["Content-Security-Policy"].split("; ")
         assert {"default-src 'none'", "script-src 'self'", "frame-ancestors 'none'"} <= {*policy}
         assert "unsafe" not in fields["Content-Security-Policy"]
@@ -353,7 +356,7 @@ def test_no_answer_is_kept_framed_guessed_at_or_handed_on(served, path):
     "path", ["/../server.py", "/server.py", "/%2e%2e/page.css", "/page.html", "/x"]
 )
 def test_only_the_files_of_the_page_are_served(served, path):
-    assert served.ask("GET", path)[::2] == (404, "Not Found\n")
+    assert served.request("GET", path)[::2] == (404, "Not Found\n")
 
 
 @pytest.mark.parametrize(
@@ -372,7 +375,7 @@ def test_only_the_files_of_the_page_are_served(served, path):
 )
 def test_what_is_no_mark_is_refused(served, body, fields, status):
     origin = f"http://127.0.0.1:{served.port}"
-    assert served.ask("POST", "/mark", body, Origin=origin, **fields)[0] == status
+    assert served.request("POST", "/mark", body, Origin=origin, **fields)[0] == status
 
 
 def test_a_head_that_is_too_long_is_not_read(served):
@@ -395,9 +398,9 @@ def test_strangers_who_hold_connections_do_not_keep_out_who_has_the_token(served
                 own = held.enter_context(served.connect())
                 with suppress(ConnectionError):
                     own.sendall(so_far)
-            assert served.ask("GET", "/", cookie=cookie)[0] == 200
+            assert served.request("GET", "/", cookie=cookie)[0] == 200
         with patiently(served.open_stream, bool):
-            assert served.ask("GET", "/", cookie=cookie)[0] == 200
+            assert served.request("GET", "/", cookie=cookie)[0] == 200
         assert len(served.threads()) <= http.MOST_ASKING + http.MOST_ADMITTED
 
 
@@ -419,8 +422,8 @@ def test_one_address_of_the_network_takes_no_place_of_another(monkeypatch):
 
 def test_too_many_open_pages_leave_room_for_the_page_itself(served):
     streams = [patiently(served.open_stream, bool) for _ in range(server._MOST_STREAMS)]
-    assert served.ask("GET", "/events")[0] == 503
-    assert served.ask("GET", "/")[0] == 200
+    assert served.request("GET", "/events")[0] == 503
+    assert served.request("GET", "/")[0] == 200
     for each in streams:
         each.close()
     assert patiently(served.open_stream, bool).close() is None
@@ -451,7 +454,7 @@ def test_a_reader_who_is_slow_gets_the_newest_and_nobody_waits_for_him():
 
 def test_a_browser_that_reads_nothing_does_not_hold_up_the_others(served):
     with patiently(served.open_stream, bool), served.stream() as part:
-        start = served.log.heard("laughing", 5)
+        start = served.log.write_segment("laughing", 5)
         part("events", lambda it: event_id(start, "laughing") in {e["id"] for e in it["events"]})
 
 
@@ -469,23 +472,23 @@ def test_nothing_listens_unless_the_page_is_configured(place, tmp_path):
 
 
 def test_the_page_listens_on_loopback_by_default(place, tmp_path):
-    said, port = [], free_port()
+    output, port = [], free_port()
     settings = BridgeSettings(page=PageSettings(port=port))
     outputs, _ = open_outputs(
-        settings, place, BridgeState(tmp_path, "home", pytest.fail), said.append
+        settings, place, BridgeState(tmp_path, "home", pytest.fail), output.append
     )
     assert address_of(port) == "127.0.0.1"
     outputs["page"].close()
     assert address_of(port) is None
-    assert len(said) == 1
+    assert len(output) == 1
 
 
 def test_an_address_of_the_network_comes_with_a_warning(place, tmp_path):
-    said = []
+    output = []
     settings = PageSettings(port=free_port(), bind="0.0.0.0")
-    HomePage(settings, place, tmp_path, said.append).close()
-    assert f" http://127.0.0.1:{settings.port}/?token=" in said[0]  # which a browser can open
-    assert "unencrypted" in said[1]
+    HomePage(settings, place, tmp_path, output.append).close()
+    assert f" http://127.0.0.1:{settings.port}/?token=" in output[0]  # which a browser can open
+    assert "unencrypted" in output[1]
 
 
 @pytest.mark.parametrize("bind", ["localhost", "box.example", ""])
@@ -502,22 +505,22 @@ def test_a_port_that_is_taken_is_named(served, tmp_path):
 def test_a_token_is_made_once_and_only_its_owner_reads_it(place, tmp_path, monkeypatch):
     journal = os.fstat(2)
     monkeypatch.setenv("JOURNAL_STREAM", f"{journal.st_dev}:{journal.st_ino}")
-    said = []
+    output = []
     for _ in range(2):
-        HomePage(PageSettings(port=free_port()), place, tmp_path / "state", said.append).close()
+        HomePage(PageSettings(port=free_port()), place, tmp_path / "state", output.append).close()
     secrets = {path.name: path for path in (tmp_path / "state").iterdir()}
     assert {*secrets} == {"page-token", "page-cookies", "page-address"}
     assert {path.stat().st_mode & 0o777 for path in secrets.values()} == {0o600}
     token = secrets["page-token"].read_text().strip()
     assert secrets["page-address"].read_text().strip().endswith(f"/?token={token}")
-    assert not any(path.read_text().strip() in line for path in secrets.values() for line in said)
-    assert all(str(secrets["page-address"]) in line for line in said)
+    assert not any(path.read_text().strip() in line for path in secrets.values() for line in output)
+    assert all(str(secrets["page-address"]) in line for line in output)
 
 
 def test_who_starts_the_bridge_is_shown_the_whole_address(place, tmp_path):
-    said = []
-    HomePage(PageSettings(port=free_port()), place, tmp_path, said.append).close()
-    assert said[0].endswith(f"/?token={(tmp_path / 'page-token').read_text().strip()}")
+    output = []
+    HomePage(PageSettings(port=free_port()), place, tmp_path, output.append).close()
+    assert output[0].endswith(f"/?token={(tmp_path / 'page-token').read_text().strip()}")
 
 
 @pytest.mark.parametrize(
@@ -531,10 +534,10 @@ def test_a_file_that_has_no_token_is_refused(place, tmp_path, text):
 
 
 def test_a_token_of_ones_own_opens_the_page(place, tmp_path):
-    file, said, port = tmp_path / "token", [], free_port()
+    file, output, port = tmp_path / "token", [], free_port()
     file.write_text("Correct.Horse_Battery~1\n")
     settings = PageSettings(port=port, token_file=file)
-    page = HomePage(settings, place, tmp_path, said.append)
+    page = HomePage(settings, place, tmp_path, output.append)
     connection = HTTPConnection("127.0.0.1", port, timeout=30)
     connection.request("GET", "/?token=Correct.Horse_Battery~1")
     assert connection.getresponse().status == 200
@@ -645,15 +648,15 @@ def test_what_was_not_heard_is_marked_as_such():
 
 
 @pytest.mark.parametrize(
-    ("said", "why"), [("listening", ""), ("reading", ""), ("paused by Anna", "paused by Anna")]
+    ("output", "why"), [("listening", ""), ("reading", ""), ("paused by Anna", "paused by Anna")]
 )
-def test_a_microphone_that_is_away_is_not_said_to_listen(said, why):
+def test_a_microphone_that_is_away_is_not_said_to_listen(output, why):
     state, now = HomeState(), time.time_ns()
     state.push([segments("mic", (now - 60 * NANOSECONDS, now - 30 * NANOSECONDS, "silence"))])
-    state.health["mic"] = Health(0, said)
+    state.health["mic"] = Health(0, output)
     news = News(state, [], [], today(now, UTC), UTC)
-    (heard,) = RoomStatus().describe(news)["rooms"]
-    assert (heard["words"], heard["why"]) == ("Not listening", why)
+    (recorded,) = RoomStatus().describe(news)["rooms"]
+    assert (recorded["words"], recorded["why"]) == ("Not listening", why)
     health = health_list(news, "home", now)[0]
     assert health["text"] == (f"not listening: {why}" if why else "not listening")
 
@@ -666,9 +669,9 @@ def test_times_and_lengths_are_said_in_words():
         "yesterday 23:00",
         "3 May 00:00",
     ]
-    said = [ENGLISH.length(seconds) for seconds in (0.4, 1, 89, 91, 5400, 7260)]
+    output = [ENGLISH.length(seconds) for seconds in (0.4, 1, 89, 91, 5400, 7260)]
     expected = "less than a second,1 second,89 seconds,2 minutes,1 hour 30 minutes,2 hours 1 minute"
-    assert said == expected.split(",")
+    assert output == expected.split(",")
 
 
 def test_a_day_of_thousands_of_sounds_is_small():
@@ -717,20 +720,20 @@ def test_what_cannot_be_a_class_is_explained(served, text):
 
 def test_what_somebody_says_is_a_mark_of_the_log_also_after_a_restart(tmp_path):
     with serving(tmp_path) as home:
-        start = home.log.heard("coughing", 10, 3)
+        start = home.log.write_segment("coughing", 10, 3)
         home.log.hears("silence")
         with home.stream() as part:
             part("events", lambda it: it["events"])
             status, answer = home.mark(event_id(start), "Kettle boiling")
             assert (status, json.loads(answer)) == (200, {"said": "You said: Kettle boiling"})
-            told = part("events", lambda it: it["events"][0]["said"])
-        assert told["events"][0]["said"] == "You said: Kettle boiling"
+            reported = part("events", lambda it: it["events"][0]["said"])
+        assert reported["events"][0]["said"] == "You said: Kettle boiling"
         (mark,) = home.marks()
         assert mark[:5] == ("mic", start, start + 3 * NANOSECONDS, "kettle_boiling", REVIEWER)
         home.restart()
         with home.stream() as part:
-            told = part("events", lambda it: it["events"] and it["events"][0]["said"])
-        assert told["events"][0]["said"] == "You said: Kettle boiling"
+            reported = part("events", lambda it: it["events"] and it["events"][0]["said"])
+        assert reported["events"][0]["said"] == "You said: Kettle boiling"
 
 
 def test_a_bridge_that_may_only_read_says_so(served, monkeypatch):
@@ -738,7 +741,7 @@ def test_a_bridge_that_may_only_read_says_so(served, monkeypatch):
         raise LogError(f"{log}: cannot be written") from PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("hearthlog.analyzer.bridge.corrections.write_marks", refuse)
-    start = served.log.heard("music", 30)
+    start = served.log.write_segment("music", 30)
     with served.stream() as part:
         part("events", lambda it: event_id(start, "music") in {e["id"] for e in it["events"]})
     status, answer = served.mark(event_id(start, "music"), "speech")
@@ -748,7 +751,7 @@ def test_a_bridge_that_may_only_read_says_so(served, monkeypatch):
 
 def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):
     home = LiveHome(tmp_path)
-    start = home.heard("music", 40)
+    start = home.write_segment("music", 40)
     home.close()
     (log,) = find_logs(tmp_path)
     event = SoundEvent("mic", "music", start, start + 4 * NANOSECONDS, 1.0, 4.0)
@@ -777,14 +780,14 @@ def lived(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lived")
     with serving(folder, microphones=names, scenarios=water) as home:
         for name in names:
-            home.log.heard("silence", 350, 60, microphone=name)
+            home.log.write_segment("silence", 350, 60, microphone=name)
             home.log.not_heard(200, 40, microphone=name)
         for number, label in enumerate(LIVED):
-            home.log.heard(label, 120 - 5 * number, 30, 0.55 + 0.05 * number, "living_room")
-        home.log.heard("tap_water", 30, 20, microphone="bathroom/scenario/water")
-        home.log.says("living_room", 0, "listening", level_dbfs="-43.2")
-        home.log.says("bathroom", 2, "no device of this name")
-        home.log.says("home disk", 1, "2 days left")
+            home.log.write_segment(label, 120 - 5 * number, 30, 0.55 + 0.05 * number, "living_room")
+        home.log.write_segment("tap_water", 30, 20, microphone="bathroom/scenario/water")
+        home.log.write_status("living_room", 0, "listening", level_dbfs="-43.2")
+        home.log.write_status("bathroom", 2, "no device of this name")
+        home.log.write_status("home disk", 1, "2 days left")
         home.log.hears("speech", "living_room")
         yield home
 
@@ -815,9 +818,9 @@ def test_the_page_says_what_is_heard_now_as_the_log_does(phone, lived):
     for label, words in (("coughing", "Coughing"), ("music", "Music")):
         lived.log.hears(label, "living_room")
         phone.shows("#heard", words)
-    heard = phone.text("#heard")
-    assert "Living room" in heard
-    assert " ".join(heard.split()).endswith("Bathroom: not listening (no device of this name).")
+    recorded = phone.text("#heard")
+    assert "Living room" in recorded
+    assert " ".join(recorded.split()).endswith("Bathroom: not listening (no device of this name).")
     phone.shows("#scenarios", "Water · Bathroom")
     phone.shows("#scenarios", "Now not listening. Today water tap once (20 seconds).")
     live = phone.of('[...document.querySelectorAll("[aria-live]")].map((e) => e.id)')
@@ -920,7 +923,7 @@ def test_a_form_that_somebody_fills_in_stays_when_sounds_come(phone, lived):
     phone.write("Kettle")
     texts = '[...document.querySelectorAll("#sounds .what")].map((e) => e.innerText).join()'
     before = phone.of(texts)
-    lived.log.heard("laughing", 1, 2, microphone="bathroom")
+    lived.log.write_segment("laughing", 1, 2, microphone="bathroom")
     phone.shows("#new-sounds", "1 new sound")
     assert phone.of(texts) == before
     assert phone.focus() == "Kettle"
@@ -933,10 +936,10 @@ def test_a_form_that_somebody_fills_in_stays_when_sounds_come(phone, lived):
 def test_texts_of_a_log_are_texts_of_the_page_whatever_they_are(phone, tmp_path):
     long = "w" * 64
     with serving(tmp_path, classes=["silence", HOSTILE, long]) as home:
-        home.log.heard(HOSTILE, 10)
-        home.log.heard(long, 5)
-        home.log.says("home disk", 1, HOSTILE)
-        home.log.says(HOSTILE, 1, "x" * 5000)
+        home.log.write_segment(HOSTILE, 10)
+        home.log.write_segment(long, 5)
+        home.log.write_status("home disk", 1, HOSTILE)
+        home.log.write_status(HOSTILE, 1, "x" * 5000)
         home.log.hears(HOSTILE)
         phone.open(home)
         phone.of('document.querySelectorAll("#events summary").forEach((e) => e.click())')
@@ -968,7 +971,7 @@ def test_a_script_that_got_into_the_page_would_not_run(phone, lived):
 
 def test_the_page_says_when_the_box_is_gone_and_goes_on_when_it_is_back(phone, tmp_path):
     with serving(tmp_path) as home:
-        home.log.heard("coughing", 10)
+        home.log.write_segment("coughing", 10)
         home.log.hears("coughing")
         phone.open(home)
         home.end()

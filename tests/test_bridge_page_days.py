@@ -298,16 +298,16 @@ EVENINGS = coughs_at(-1.5, 0.67, 6.99, 7, 21.99, 22, 23)
     ],
 )
 def test_no_sound_counts_twice_and_each_count_lists_what_it_counts(hour, columns, counts):
-    heard = [each for each in EVENINGS if each[0] < hour]
-    picture = picture_of(home_at(hour, tiled((-3, hour), *heard)))
+    recorded = [each for each in EVENINGS if each[0] < hour]
+    picture = picture_of(home_at(hour, tiled((-3, hour), *recorded)))
     (lane,) = (each for each in picture["rooms"][0]["lanes"] if each["label"] == "coughing")
     assert picture["columns"] == columns
     assert (lane["counts"], lane["count"]) == (counts, sum(counts))
-    whole, *each = [[own for _, own, *_ in times["times"]] for times in lane["times"]]
+    full, *each = [[own for _, own, *_ in times["times"]] for times in lane["times"]]
     assert [len(ids) for ids in each] == counts
-    assert whole == [own for ids in reversed(each) for own in ids]
+    assert full == [own for ids in reversed(each) for own in ids]
     shown = {n / 30 - 2 for n, bar in enumerate(lane["bars"]) if bar != "0"}
-    assert len(shown) == len(heard)
+    assert len(shown) == len(recorded)
     assert min(shown) == pytest.approx(-1.5, abs=1 / 30)
 
 
@@ -392,7 +392,7 @@ def test_sounds_of_one_class_within_five_minutes_are_one_entry():
 
 def test_an_answer_to_folded_sounds_marks_each_of_them(tmp_path):
     with serving(tmp_path) as home:
-        starts = [home.log.heard("speech", minutes) for minutes in (20, 18, 16)]
+        starts = [home.log.write_segment("speech", minutes) for minutes in (20, 18, 16)]
         home.log.hears("silence")
         with home.stream() as part:
             shown = part("events", lambda it: [len(one["ids"]) for one in it["events"]] == [3])[
@@ -440,9 +440,9 @@ def lived(tmp_path_factory):
     keep_sound(folder / "logs", "mic", start, 5)
     with serving(folder, {"sound": True}) as home:
         home.coughed = start
-        home.log.heard("silence", 350, 60)
-        home.log.heard("coughing", 40, 3)
-        home.log.heard("music", 30, 3)
+        home.log.write_segment("silence", 350, 60)
+        home.log.write_segment("coughing", 40, 3)
+        home.log.write_segment("music", 30, 3)
         home.log.hears("silence")
         with home.stream() as part:
             part("events", lambda events: len(events["events"]) == 2)
@@ -454,7 +454,7 @@ DAY_MINUTES = 24 * 60
 
 
 def got(home, path, **fields):
-    status, _, text = home.ask("GET", path, **fields)
+    status, _, text = home.request("GET", path, **fields)
     return status, json.loads(text)
 
 
@@ -496,13 +496,13 @@ def test_the_evening_of_a_past_day_is_of_the_night_of_the_next_and_of_no_other(t
 def test_a_day_without_logs_is_one_line(lived, text):
     status, answer = got(lived, f"/day?{text}")
     assert (status, answer) == (422, {"error": "There are no logs of this day."})
-    assert lived.ask("GET", f"/day?{lived.date}", cookie=None)[0] == 403
+    assert lived.request("GET", f"/day?{lived.date}", cookie=None)[0] == 403
 
 
 def test_a_day_within_one_longer_log_is_one_of_the_days(tmp_path):
     home = LiveHome(tmp_path, minutes_ago=4 * DAY_MINUTES)
     for days in (4, 3, 2):
-        home.heard("speech", days * DAY_MINUTES)
+        home.write_segment("speech", days * DAY_MINUTES)
     home.close()
     logs = find_home_logs([tmp_path])
     assert len(logs.entries) == 1
@@ -525,11 +525,11 @@ def test_a_day_is_read_once_and_only_some_are_kept(lived, monkeypatch):
 
 
 def test_a_day_that_takes_long_to_read_holds_nobody_up(lived):
-    with lived._page._past._lock, lived.connect() as asked:
+    with lived._page._past._lock, lived.connect() as requested:
         head = f"GET /day?{lived.date} HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {lived.cookie()}"
-        asked.sendall(f"{head}\r\n\r\n".encode())
+        requested.sendall(f"{head}\r\n\r\n".encode())
         with lived.stream() as part:
-            start = lived.log.heard("laughing", 5)
+            start = lived.log.write_segment("laughing", 5)
             part("events", lambda it: str(start) in json.dumps(it))
 
 
@@ -566,7 +566,7 @@ def test_kept_sound_is_played_only_of_an_event_that_has_it(lived):
         assert np.frombuffer(sound.readframes(80_000), "<i2").any()
     for other in (spoken, "none", f"mic-coughing-{lived.coughed + 1}", "../x"):
         assert sound_of(lived, other)[0] == 422
-    assert lived.ask("GET", f"/sound?{coughed}", cookie=None)[0] == 403
+    assert lived.request("GET", f"/sound?{coughed}", cookie=None)[0] == 403
 
 
 def test_the_sound_of_a_hidden_class_is_never_played(lived):
@@ -592,7 +592,7 @@ def test_a_hidden_sound_within_a_sound_is_silence(lived):
 
 def test_no_sound_leaves_a_home_whose_owner_did_not_allow_it(tmp_path):
     with serving(tmp_path) as home:
-        start = home.log.heard("coughing", 10, 3)
+        start = home.log.write_segment("coughing", 10, 3)
         home.log.hears("silence")
         with home.stream() as part:
             part("events", lambda events: events["events"])
@@ -609,14 +609,14 @@ def placeholders(text):
 
 
 def test_a_refusal_speaks_the_language_of_the_browser(lived):
-    _, _, text = lived.ask("GET", "/", cookie=None, **GERMAN)
+    _, _, text = lived.request("GET", "/", cookie=None, **GERMAN)
     assert text.startswith("Diese Seite öffnet sich nur mit ihrer vollständigen Adresse")
-    _, _, text = lived.ask("GET", f"/?token={'x' * 20}", cookie=None, **GERMAN)
+    _, _, text = lived.request("GET", f"/?token={'x' * 20}", cookie=None, **GERMAN)
     assert text.startswith("Der Schlüssel (token) in dieser Adresse ist falsch. Diese Seite öffnet")
-    _, _, text = lived.ask("GET", "/", Host="box.local", **GERMAN)
+    _, _, text = lived.request("GET", "/", Host="box.local", **GERMAN)
     assert "unter dem Namen box.local, den" in text
     assert 'names = ["box.local"] in [bridge.page]' in text
-    status, _, text = lived.ask("POST", "/mark", "{}", **GERMAN, **JSON)
+    status, _, text = lived.request("POST", "/mark", "{}", **GERMAN, **JSON)
     assert (status, text) == (
         403,
         "Eine Anfrage, die etwas ändert, muss ihre Seite nennen (Origin).\n",
@@ -664,7 +664,7 @@ def test_the_language_is_the_first_that_the_browser_wants_and_the_page_has(heade
 
 
 def test_a_german_browser_gets_german_words_dates_and_errors(lived):
-    _, _, page = lived.ask("GET", "/", **GERMAN)
+    _, _, page = lived.request("GET", "/", **GERMAN)
     assert '<html lang="de">' in page
     assert "Letzte Geräusche" in page
     assert "{{" not in page
@@ -678,7 +678,7 @@ def test_a_german_browser_gets_german_words_dates_and_errors(lived):
         ("none", "music", "Dieses Geräusch liegt für diese Seite zu lange zurück"),
     ):
         body = json.dumps({"event": event, "label": label})
-        answer = lived.ask("POST", "/mark", body, Origin=origin, **JSON, **GERMAN)
+        answer = lived.request("POST", "/mark", body, Origin=origin, **JSON, **GERMAN)
         assert (answer[0], json.loads(answer[2])["error"].startswith(text)) == (422, True)
     picture = picture_of(home_at(9, tiled((-3, 9), *NIGHT), language="de"))
     assert picture["sentence"] == (
@@ -689,7 +689,7 @@ def test_a_german_browser_gets_german_words_dates_and_errors(lived):
 def test_the_configured_language_holds_for_every_browser_and_a_missing_one_is_english(tmp_path):
     for language, title in (("de", "Zuhause"), ("fr", "The home")):
         with serving(tmp_path / language, {"language": language}) as home:
-            assert f"<title>{title}</title>" in home.ask("GET", "/", **GERMAN)[2]
+            assert f"<title>{title}</title>" in home.request("GET", "/", **GERMAN)[2]
     with pytest.raises(ValidationError):
         PageSettings(language="../../etc")
 
@@ -698,10 +698,10 @@ def test_the_configured_language_holds_for_every_browser_and_a_missing_one_is_en
 
 
 def test_the_page_can_be_installed_and_is_small(lived):
-    page = lived.ask("GET", "/")[2]
+    page = lived.request("GET", "/")[2]
     own = re.findall(r'(?:href|src)="([^"]+)"', page)
     assert not any(each.startswith(("/", "http")) for each in own)
-    manifest = json.loads(lived.ask("GET", "/page.webmanifest")[2])
+    manifest = json.loads(lived.request("GET", "/page.webmanifest")[2])
     assert (manifest["display"], manifest["start_url"]) == ("standalone", "./")
     assert {icon["src"] for icon in manifest["icons"]} == {"icon-512.png", "icon.svg"}
     scripts = ["picture.js", "sounds.js", "elements.js"]
@@ -734,9 +734,9 @@ def test_the_page_works_behind_the_ingress_of_home_assistant(phone, lived):
         assert phone.of("seen") == []
         assert phone.of("document.querySelector('[rel=manifest]').href.startsWith(location.href)")
     hostile = {"X-Ingress-Path": '"><script>alert(1)</script>'}
-    assert "alert(1)" not in str(lived.ask("GET", "/", **hostile))
-    assert lived.ask("GET", "/", cookie=None, **{"X-Ingress-Path": path})[0] == 403
-    assert lived.ask("GET", "/", Host="evil.example", **{"X-Ingress-Path": path})[0] == 403
+    assert "alert(1)" not in str(lived.request("GET", "/", **hostile))
+    assert lived.request("GET", "/", cookie=None, **{"X-Ingress-Path": path})[0] == 403
+    assert lived.request("GET", "/", Host="evil.example", **{"X-Ingress-Path": path})[0] == 403
 
 
 SCREAM = 4.0, "music", 0.33, {"coughing": 0.05, "yelling": 0.12}, 48.0
@@ -772,7 +772,7 @@ def test_a_loud_sound_that_the_model_is_unsure_of_needs_a_look_on_its_day_and_la
     sound = (3600.0 * yesterday.hour + 60 * yesterday.minute, *SCREAM)
     write_day(tmp_path / "logs", yesterday.date(), doubts=[sound])
     with serving(tmp_path) as served, served.stream() as part:
-        served.log.heard("music", 62, 4, 0.95)
+        served.log.write_segment("music", 62, 4, 0.95)
         served.log.doubts(60, 5.0, "objects_activity", 0.4, {"coughing": 0.05}, 20.0)
         scream = served.log.doubts(58, *SCREAM)
         events = part("events", lambda it: any(each["doubtful"] for each in it["events"]))["events"]
@@ -789,7 +789,7 @@ def test_a_loud_sound_that_the_model_is_unsure_of_needs_a_look_on_its_day_and_la
         assert served.mark(entry["id"], "yelling")[0] == 200
         assert [(mark.start, mark.label) for mark in served.marks()] == [(scream, "yelling")]
         date = yesterday.astimezone(served.home.zone).date().isoformat()
-        past = json.loads(served.ask("GET", f"/day?{date}")[2])
+        past = json.loads(served.request("GET", f"/day?{date}")[2])
         (entry,) = past["events"]
         assert (entry["words"], entry["look"]) == ("Perhaps shouting", True)
 
@@ -844,7 +844,7 @@ def test_a_lane_is_opened_by_keyboard_and_shows_its_times(phone, lived):
 def test_one_of_the_times_of_a_count_is_corrected_there_and_no_other(phone, tmp_path):
     with serving(tmp_path) as served:
         served.log.hears("silence")
-        starts = [served.log.heard("coughing", minutes, 2) for minutes in (65, 63, 61)]
+        starts = [served.log.write_segment("coughing", minutes, 2) for minutes in (65, 63, 61)]
         phone.open(served)
         phone.until(lane("Coughing"))
         phone.of(f"{lane('Coughing')}.dispatchEvent(new MouseEvent('click', {{bubbles: true}}))")
@@ -924,9 +924,9 @@ def drawn_lanes(day):
 @pytest.mark.parametrize("width", [390, 1366])
 def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, width):
     with serving(tmp_path) as home:
-        home.log.heard("silence", 350, 60)
+        home.log.write_segment("silence", 350, 60)
         for minutes, label in ((90, "coughing"), (60, "speech"), (30, "music")):
-            home.log.heard(label, minutes, 30)
+            home.log.write_segment(label, minutes, 30)
         home.log.hears("silence")
         with home.stream() as part:
             part("day", lambda day: len(drawn_lanes(day)) == 3)
@@ -935,10 +935,10 @@ def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, widt
         phone._browser.call("Emulation.setScrollbarsHidden", hidden=width < 640)
         phone.open(home, width)
         for label, words in (("speech", "Talking"), ("silence", "Quiet")):
-            home.log.heard(label, 0.05)
+            home.log.write_segment(label, 0.05)
             home.log.hears(label)
             phone.shows("#heard", words)
-        home.log.says("mic", 1, "too loud for this microphone, in one second of five")
+        home.log.write_status("mic", 1, "too loud for this microphone, in one second of five")
         phone.until("document.querySelector('.warning #attention')")
         phone.wait_until_drawn()
         assert sum(value for value, _ in phone.of("moved")) < 0.02, (
@@ -952,8 +952,8 @@ def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, widt
 def test_what_can_be_operated_has_a_name_of_its_own(phone, tmp_path):
     with serving(tmp_path, microphones=("bath", "kitchen")) as home:
         for name in ("bath", "kitchen"):
-            home.log.heard("silence", 350, 60, microphone=name)
-            home.log.heard("coughing", 60, 4, microphone=name)
+            home.log.write_segment("silence", 350, 60, microphone=name)
+            home.log.write_segment("coughing", 60, 4, microphone=name)
             home.log.hears("silence", name)
         phone.open(home)
         phone.until("document.querySelectorAll('#look details').length === 2")
@@ -991,7 +991,7 @@ def test_a_german_phone_is_shown_a_page_that_fits(phone, lived, scheme):
 
 def test_a_phone_that_is_offline_says_so_in_one_line_and_keeps_what_it_shows(phone, tmp_path):
     with serving(tmp_path) as home:
-        home.log.heard("coughing", 40, 3)
+        home.log.write_segment("coughing", 40, 3)
         home.log.hears("silence")
         phone.open(home)
         phone.until(lane("Coughing"))

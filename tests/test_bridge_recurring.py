@@ -199,7 +199,7 @@ def acting(monkeypatch, text):
 
 
 @pytest.mark.parametrize(
-    ("acts", "says"),
+    ("acts", "states"),
     [
         (
             "print('hearthlog: group 3: 7 marks of a; 1 are marked'); print('hearthlog: next')",
@@ -215,12 +215,12 @@ def acting(monkeypatch, text):
         ("import os; os.kill(os.getpid(), 9)", "ended by signal 9"),
     ],
 )
-def test_what_came_of_a_name_is_one_line(tmp_path, monkeypatch, acts, says):
+def test_what_came_of_a_name_is_one_line(tmp_path, monkeypatch, acts, states):
     acting(monkeypatch, f"import sys; sys.stdout = sys.stderr; {acts}")
     naming = GroupNaming(tmp_path)
     assert naming.start(KEY, 3, "kettle").startswith("Marking as Kettle.")
-    answer = patiently(lambda: naming.said[KEY], lambda text: "Marking as" not in text)
-    assert says in answer
+    answer = patiently(lambda: naming.output[KEY], lambda text: "Marking as" not in text)
+    assert states in answer
     assert len(answer) < 500
 
 
@@ -232,9 +232,9 @@ def test_one_group_is_named_at_a_time_and_an_end_of_the_bridge_is_one_of_that(
     naming.start(KEY, 3, "")
     with pytest.raises(BridgeError, match="still marking another sound"):
         naming.start("4 of 5b4e0d1c", 4, "kettle")
-    assert naming.said.keys() == {KEY}
+    assert naming.output.keys() == {KEY}
     naming.close()
-    patiently(lambda: naming.said[KEY], lambda text: "ended by signal 15" in text)
+    patiently(lambda: naming.output[KEY], lambda text: "ended by signal 15" in text)
     acting(monkeypatch, "")
     naming.start("4 of 5b4e0d1c", 4, "kettle")
 
@@ -246,14 +246,14 @@ def test_what_came_of_a_name_is_not_said_of_a_group_of_another_file(tmp_path, mo
     recurring.describe(MOMENT)
     recurring.name(KEY, "kettle")
 
-    def said():
+    def output():
         return [each["said"] for each in recurring.describe(MOMENT)["groups"]]
 
-    patiently(said, lambda texts: texts == ["This failed: exit status 4"])
+    patiently(output, lambda texts: texts == ["This failed: exit status 4"])
     keep(tmp_path, group(3), of="00c0ffee")
-    assert said() == [""]
+    assert output() == [""]
     keep(tmp_path, group(3))
-    assert said() == ["This failed: exit status 4"]
+    assert output() == ["This failed: exit status 4"]
 
 
 def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
@@ -263,7 +263,7 @@ def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("key", "text", "says"),
+    ("key", "text", "states"),
     [
         ("1 of 00000000", "kettle", "regrouped"),
         ("2 of 5b4e0d1c", "kettle", "regrouped"),
@@ -273,12 +273,12 @@ def test_a_folder_that_may_only_be_read_is_said_to_be_so(tmp_path, monkeypatch):
         ("1 of 5b4e0d1c", " ", "letters a to z"),
     ],
 )
-def test_what_cannot_be_a_name_starts_nothing(tmp_path, monkeypatch, key, text, says):
+def test_what_cannot_be_a_name_starts_nothing(tmp_path, monkeypatch, key, text, states):
     monkeypatch.setattr(group_naming, "module_command", pytest.fail)
     keep(tmp_path, group(1))
     recurring = RecurringSounds(tmp_path)
     recurring.describe(MOMENT)
-    with pytest.raises(BridgeError, match=says):
+    with pytest.raises(BridgeError, match=states):
         recurring.name(key, text)
 
 
@@ -303,8 +303,8 @@ def marks_of(folder):
     return [mark for log in find_logs(folder) for mark in read_marks(log)]
 
 
-def heard_once(home):
-    home.log.heard("coughing", 10)
+def recorded_once(home):
+    home.log.write_segment("coughing", 10)
     home.log.hears("coughing")
 
 
@@ -316,7 +316,7 @@ def test_one_names_a_sound_on_the_page_and_takes_the_name_back(
     before = load_summary(logs / SUMMARY)
     largest = before.groups[0]
     with serving(tmp_path) as home:
-        heard_once(home)
+        recorded_once(home)
         phone.open(home)
         phone.shows("#recurring li:first-child .what", f"Sound {largest.number}")
         assert f"{largest.times} times on 1 day" in phone.text("#recurring li:first-child")
@@ -346,7 +346,7 @@ def listed(tmp_path_factory):
     hostile = group(3, microphones=(HOSTILE,), labels={HOSTILE: 0.5, "w" * 200: 0.5})
     keep(folder / "logs", group(1), group(2, "k" * 64), hostile)
     with serving(folder) as home:
-        heard_once(home)
+        recorded_once(home)
         yield home
 
 
@@ -379,7 +379,7 @@ def test_the_list_is_not_there_before_sounds_were_grouped_and_a_damaged_one_is_a
     phone, tmp_path
 ):
     with serving(tmp_path) as home:
-        heard_once(home)
+        recorded_once(home)
         phone.open(home)
         phone.of('document.querySelector("#working").open = true')
         phone.shows("#health", "Bridge: Good")
@@ -395,7 +395,7 @@ def test_the_list_is_not_there_before_sounds_were_grouped_and_a_damaged_one_is_a
 def test_a_form_that_somebody_fills_in_stays_when_sounds_are_grouped_anew(phone, tmp_path):
     keep(tmp_path / "logs", group(1), group(2))
     with serving(tmp_path) as home:
-        heard_once(home)
+        recorded_once(home)
         phone.open(home)
         phone.until('document.querySelectorAll("#recurring li").length === 2')
         phone.of('document.querySelector("#recurring summary").click()')
@@ -410,8 +410,8 @@ def test_a_form_that_somebody_fills_in_stays_when_sounds_are_grouped_anew(phone,
 def test_another_page_names_nothing(listed):
     body = json.dumps({"group": "1 of 5b4e0d1c", "label": "kettle"})
     json_only = {"Content-Type": "application/json"}
-    assert listed.ask("POST", "/group", body, **json_only)[0] == 403
+    assert listed.request("POST", "/group", body, **json_only)[0] == 403
     foreign = {**json_only, "Origin": "http://evil.example"}
-    assert listed.ask("POST", "/group", body, **foreign)[0] == 403
+    assert listed.request("POST", "/group", body, **foreign)[0] == 403
     assert listed.post("/group", {"event": "1", "label": "kettle"})[0] == 400
     assert listed.post("/group", {"group": "9 of 5b4e0d1c", "label": "kettle"})[0] == 422

@@ -31,7 +31,7 @@ CLASSES = ["silence", "speech", "coughing"]
 VIENNA = ZoneInfo("Europe/Vienna")
 
 
-def heard(labels, cuts=()):
+def recorded(labels, cuts=()):
     """Tell what is heard after labels that came in pieces."""
     now, times = ActiveClasses(CLASSES), FRAME * np.arange(1, len(labels) + 1)
     for first, last in zip([0, *cuts], [*cuts, len(labels)], strict=True):
@@ -41,7 +41,7 @@ def heard(labels, cuts=()):
 
 @given(st.lists(st.sampled_from(CLASSES), max_size=300), st.lists(st.integers(0, 300), max_size=9))
 def test_what_is_heard_does_not_depend_on_how_the_labels_came(labels, cuts):
-    assert heard(labels, sorted(min(cut, len(labels)) for cut in cuts)) == heard(labels)
+    assert recorded(labels, sorted(min(cut, len(labels)) for cut in cuts)) == recorded(labels)
 
 
 def ends_of(spans, seconds):
@@ -81,15 +81,15 @@ def test_each_event_is_over_once_when_it_is(spans, ends):
     assert ends_of(spans, 80) == ends
 
 
-@pytest.mark.parametrize(("frames", "is_heard"), [(7, False), (8, True)])
-def test_eight_labels_of_a_second_are_a_sound(frames, is_heard):
+@pytest.mark.parametrize(("frames", "is_recorded"), [(7, False), (8, True)])
+def test_eight_labels_of_a_second_are_a_sound(frames, is_recorded):
     labels = 50 * ["silence"] + frames * ["coughing", "silence"]
-    assert heard(labels)[2:] == [is_heard, is_heard]
+    assert recorded(labels)[2:] == [is_recorded, is_recorded]
 
 
-@pytest.mark.parametrize(("frames", "is_heard"), [(200, True), (201 + 12, False)])
-def test_a_sound_is_held_for_ten_seconds(frames, is_heard):
-    assert heard(20 * ["coughing"] + frames * ["silence"])[2:] == [is_heard, is_heard]
+@pytest.mark.parametrize(("frames", "is_recorded"), [(200, True), (201 + 12, False)])
+def test_a_sound_is_held_for_ten_seconds(frames, is_recorded):
+    assert recorded(20 * ["coughing"] + frames * ["silence"])[2:] == [is_recorded, is_recorded]
 
 
 def test_a_clock_that_is_set_back_ends_what_was_heard():
@@ -185,22 +185,22 @@ def test_totals_survive_restarts_and_are_counted_once(tmp_path):
 
 
 def test_damaged_totals_are_named_and_counted_anew(tmp_path):
-    said, kept = [], BridgeState(tmp_path, "home", pytest.fail)
+    output, kept = [], BridgeState(tmp_path, "home", pytest.fail)
     kept.write("totals", '{"time": -1}')
-    assert Totals(kept, 7, said.append).time == 7
-    assert said == [f"{kept.path}, totals: cannot be read; counts start over"]
+    assert Totals(kept, 7, output.append).time == 7
+    assert output == [f"{kept.path}, totals: cannot be read; counts start over"]
 
 
 def test_a_trouble_is_said_again_after_an_hour(monkeypatch):
-    said, now = [], [1e6]
+    output, now = [], [1e6]
     monkeypatch.setattr("hearthlog.analyzer.bridge.bridge.time.monotonic", lambda: now[0])
-    say = ProblemReporter(said.append)
+    say = ProblemReporter(output.append)
     for _ in range(3):
         say("no broker")
         say("a full disk")
     now[0] += 3601
     say("no broker")
-    assert said == ["no broker", "a full disk", "no broker"]
+    assert output == ["no broker", "a full disk", "no broker"]
 
 
 def test_who_cannot_be_told_of_a_trouble_ends_nothing():

@@ -20,13 +20,13 @@ ALIVE = "hearthlog/home/bridge"
 @contextmanager
 def connected(broker, client_id="hearthlog-home", **settings):
     """A connection, and the lines that it says."""
-    said = []
+    output = []
     settings = MqttSettings(host="127.0.0.1", port=broker.port, **settings)
     connection = Connection(
-        settings, client_id, ALIVE, said.append, subscriptions=(), received=print
+        settings, client_id, ALIVE, output.append, subscriptions=(), received=print
     )
     try:
-        yield connection, said
+        yield connection, output
     finally:
         connection.close()
 
@@ -125,9 +125,9 @@ def test_an_event_that_is_too_old_when_the_broker_comes_is_no_news(broker, monke
 
 def test_a_broker_that_is_not_there_is_said_in_one_line_and_found_when_it_comes(broker):
     broker.kill()
-    with connected(broker) as (connection, said):
-        flush_until(connection, lambda: bool(said))
-        assert said[0] == f"127.0.0.1:{broker.port}: no broker (Connection refused); trying again"
+    with connected(broker) as (connection, output):
+        flush_until(connection, lambda: bool(output))
+        assert output[0] == f"127.0.0.1:{broker.port}: no broker (Connection refused); trying again"
         broker.start()
         with Listener(broker.port) as listener:
             flush_until(connection, lambda: listener.values.get(ALIVE) == "online")
@@ -136,22 +136,22 @@ def test_a_broker_that_is_not_there_is_said_in_one_line_and_found_when_it_comes(
 def test_a_refused_password_is_said_in_one_line_and_no_other_reason_after_it(tmp_path):
     broker = Broker(tmp_path, "allow_anonymous false\n")
     try:
-        with connected(broker) as (connection, said):
-            flush_until(connection, lambda: len(said) > 1)  # it is tried again
+        with connected(broker) as (connection, output):
+            flush_until(connection, lambda: len(output) > 1)  # it is tried again
     finally:
         broker.kill()
-    assert all(": refused: Not authorized; see user, password_file" in line for line in said)
+    assert all(": refused: Not authorized; see user, password_file" in line for line in output)
 
 
 def test_a_second_bridge_of_the_same_name_is_said_to_be_one(broker):
     with (
-        connected(broker) as (first, said),
+        connected(broker) as (first, output),
         Listener(broker.port) as listener,
     ):
         flush_until(first, lambda: listener.values.get(ALIVE) == "online")
         with connected(broker):
-            flush_until(first, lambda: any("another client named" in line for line in said))
-    assert "hearthlog-home running, a second bridge? give one of them another" in said[-1]
+            flush_until(first, lambda: any("another client named" in line for line in output))
+    assert "hearthlog-home running, a second bridge? give one of them another" in output[-1]
 
 
 @pytest.fixture
@@ -178,22 +178,24 @@ def tls_broker(tmp_path, authority):
 def test_a_client_certificate_opens_an_encrypted_connection(tls_broker, authority):
     certificate, key = authority.sign("bridge")
     files = {"ca_file": authority.file, "certificate_file": certificate, "key_file": key}
-    with connected(tls_broker, tls=True, **files) as (connection, said):
+    with connected(tls_broker, tls=True, **files) as (connection, output):
         connection.keep("hearthlog/home/mic/heard", "x")
         flush_until(connection, lambda: not connection._unsent)
         time.sleep(0.2)
-        assert said == []
+        assert output == []
         connection.send("elsewhere", "x")  # what the broker forbids
-        flush_until(connection, lambda: bool(said))
-    assert "a message was refused: Not authorized; the broker must let this client write" in said[0]
+        flush_until(connection, lambda: bool(output))
+    assert (
+        "a message was refused: Not authorized; the broker must let this client write" in output[0]
+    )
 
 
 def test_a_missing_client_certificate_is_guessed_where_the_broker_only_hangs_up(
     tls_broker, authority
 ):
-    with connected(tls_broker, tls=True, ca_file=authority.file) as (connection, said):
-        flush_until(connection, lambda: bool(said))
-    assert "does it need a client certificate? see certificate_file and key_file" in said[0]
+    with connected(tls_broker, tls=True, ca_file=authority.file) as (connection, output):
+        flush_until(connection, lambda: bool(output))
+    assert "does it need a client certificate? see certificate_file and key_file" in output[0]
 
 
 # The client leaves the socket to the garbage collector where a certificate is refused.
@@ -201,12 +203,12 @@ def test_a_missing_client_certificate_is_guessed_where_the_broker_only_hangs_up(
 def test_a_broker_whose_certificate_nobody_vouches_for_is_refused(tls_broker, tmp_path):
     with connected(tls_broker, tls=True, ca_file=Authority(tmp_path, "other").file) as (
         connection,
-        said,
+        output,
     ):
-        flush_until(connection, lambda: bool(said))
+        flush_until(connection, lambda: bool(output))
     gc.collect()
-    assert "its certificate is refused: " in said[0]
-    assert "see ca_file" in said[0]
+    assert "its certificate is refused: " in output[0]
+    assert "see ca_file" in output[0]
 
 
 @pytest.mark.parametrize("missing", ["ca_file", "certificate_file", "password_file"])
@@ -224,11 +226,11 @@ def test_a_password_is_taken_from_a_file(tmp_path, broker):
     password.chmod(0o600)
     broker.kill()
     guarded = Broker(tmp_path, f"password_file {users}\nallow_anonymous false\n")
-    with connected(guarded, user="home", password_file=password) as (connection, said):
-        flush_until(connection, lambda: bool(said))
+    with connected(guarded, user="home", password_file=password) as (connection, output):
+        flush_until(connection, lambda: bool(output))
     guarded.kill()
-    assert "refused: " in said[0]
-    assert "see user, password_file and client_id" in said[0]
+    assert "refused: " in output[0]
+    assert "see user, password_file and client_id" in output[0]
 
 
 def test_a_broker_that_hung_is_not_told_of_what_is_old(broker, monkeypatch):

@@ -15,7 +15,7 @@ from kept import keep_models
 from logreader import LogReader
 from logs import read
 from spliced import run
-from test_model_changes import block, count, labels_by, recording, said, wait_for
+from test_model_changes import block, count, labels_by, output, recording, wait_for
 
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
@@ -114,8 +114,8 @@ def test_a_candidate_comes_changes_and_goes_while_the_recorder_runs(folder, tmp_
     assert spoken == {frame: own[frame] for frame in spoken}
     assert len(spoken) == len(range(min(spoken), max(spoken) + 1)), "it was never interrupted"
     digest = load_model(folder / "two.safetensors").sha256[:12]
-    assert any(line.startswith(f"candidate two ({digest}) from frame ") for line in said(logs))
-    assert any(line.startswith("no candidate from frame ") for line in said(logs))
+    assert any(line.startswith(f"candidate two ({digest}) from frame ") for line in output(logs))
+    assert any(line.startswith("no candidate from frame ") for line in output(logs))
 
 
 def test_a_candidate_that_cannot_be_used_is_refused_and_the_champion_goes_on(
@@ -128,7 +128,7 @@ def test_a_candidate_that_cannot_be_used_is_refused_and_the_champion_goes_on(
     assert done.returncode == 3
     assert done.stderr.count("candidate refused: ") == 1
     assert count(tmp_path / "logs", "label")
-    assert any(line.startswith("candidate refused: ") for line in said(tmp_path / "logs"))
+    assert any(line.startswith("candidate refused: ") for line in output(tmp_path / "logs"))
 
 
 def test_the_champion_is_no_candidate(folder, tmp_path, day, capfd):
@@ -141,11 +141,11 @@ def test_the_champion_is_no_candidate(folder, tmp_path, day, capfd):
 class CountingWatch(CandidateWatch):
     """Counts what it has told."""
 
-    told = 0
+    reported = 0
 
     def news(self):
         found = super().news()
-        self.told += len(found)
+        self.reported += len(found)
         return found
 
 
@@ -159,18 +159,18 @@ def test_only_another_candidate_begins_a_log(folder, tmp_path, monkeypatch):
     )
     frames = iter(range(0, 100_000, 30))
 
-    def told():
+    def reported():
         session.add("mic", block(next(frames), 30))
-        return candidates.told
+        return candidates.reported
 
     shutil.copy(folder / "two.safetensors", folder / "copy")
     (folder / "copy").replace(folder / "two.safetensors")
-    wait_for(lambda: told() == 1)
-    told()
+    wait_for(lambda: reported() == 1)
+    reported()
     assert len(list(tmp_path.rglob("*.mcap*"))) == 1
     promote(folder, "broad", "candidate")
-    wait_for(lambda: told() == 2)
-    told()
+    wait_for(lambda: reported() == 2)
+    reported()
     session.finish()
     watch.close()
     candidates.close()
@@ -193,7 +193,7 @@ def test_a_microphone_is_heard_on_while_candidates_fail_and_the_champion_vanishe
         wait_for(lambda: count(logs, "info") == 3)
         (folder / "one.safetensors").unlink()
         before = count(logs, "label")
-        wait_for(lambda: len(said(logs, level=30)) == 2 and count(logs, "label") > before + 10)
+        wait_for(lambda: len(output(logs, level=30)) == 2 and count(logs, "label") > before + 10)
         refused = run(capfd, "models", "promote", "broad", "--folder", folder, "--logs", logs)
         assert (refused.returncode, target(folder, "champion")) == (1, "one")
         (line,) = refused.stderr.splitlines()
@@ -205,7 +205,7 @@ def test_a_microphone_is_heard_on_while_candidates_fail_and_the_champion_vanishe
         before = count(logs, "label")
         wait_for(lambda: count(logs, "label") > before + 10)
     assert process.returncode == 3
-    assert said(logs, level=30) == [
+    assert output(logs, level=30) == [
         "candidate refused: it is for feature set auros21, not home33",
         f"model champion refused: {folder}/one.safetensors: no such model file; going on with one",
     ]
@@ -333,10 +333,10 @@ def test_what_was_said_at_one_time_is_compared_by_what_was_reviewed(logs, capfd)
     assert known["gained"] - known["lost"] == known["after"] - known["before"]
     assert known["after"] == known["sounds"] > known["before"] > 0
     assert again["marks"]["sounds"] == 0  # that of which nothing is known is none
-    said = run(capfd, "models", "compare", "--live", "--logs", logs)
-    assert said.returncode == 0, said.stderr
-    assert "two is better: right where one is not" in said.stdout
-    assert "`hearthlog models promote two` makes it champion" in said.stdout
+    output = run(capfd, "models", "compare", "--live", "--logs", logs)
+    assert output.returncode == 0, output.stderr
+    assert "two is better: right where one is not" in output.stdout
+    assert "`hearthlog models promote two` makes it champion" in output.stdout
 
 
 def test_a_minute_in_a_quiet_that_ends_hours_later_is_known(folder, tmp_path, capfd):

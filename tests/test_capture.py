@@ -301,7 +301,7 @@ def test_a_microphone_that_nothing_is_called_is_waited_for_with_a_list_of_those_
 
 
 def test_a_microphone_that_is_lost_is_never_replaced_by_another_one(labmic, tmp_path):
-    labmic.beside("labmic2")
+    labmic.add_device("labmic2")
     logs = tmp_path / "logs"
     with recording(labmic, logs):
         wait_for_frames(logs, 20)
@@ -316,7 +316,7 @@ def test_a_microphone_that_is_lost_is_never_replaced_by_another_one(labmic, tmp_
 
 def test_several_microphones_are_heard_and_lost_apart_in_one_log(labmic, tmp_path):
     labmic.configure(data=sound())
-    second = labmic.beside("second")
+    second = labmic.add_device("second")
     second.configure(data=sound())
     logs, about = tmp_path / "logs", tmp_path / "home.toml"
     about.write_text(
@@ -339,9 +339,9 @@ def test_several_microphones_are_heard_and_lost_apart_in_one_log(labmic, tmp_pat
         second.restore()
         wait_for_frames(logs, len(features(logs)[0]) + 400)
         process.terminate()
-        _, said = process.communicate(timeout=30)
-    assert "hall: the microphone went silent" in said
-    assert "kitchen:" not in said
+        _, output = process.communicate(timeout=30)
+    assert "hall: the microphone went silent" in output
+    assert "kitchen:" not in output
     kitchen, hall = (frames_of(logs, name) for name in ("kitchen", "hall"))
     assert kitchen == list(range(len(kitchen)))
     (gap,) = read(logs, "gap")

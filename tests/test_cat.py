@@ -415,7 +415,7 @@ def test_of_many_logs_the_damaged_ones_are_named_and_the_rest_is_printed(
     logs = [tmp_path / log.name for log in find_logs(recorded)]
     for log in find_logs(recorded):
         shutil.copy(log, tmp_path)
-    whole = hearthlog("cat", tmp_path).stdout.splitlines()
+    full = hearthlog("cat", tmp_path).stdout.splitlines()
     first, last = (hearthlog("cat", log).stdout.splitlines() for log in (logs[0], logs[-1]))
     data = bytearray(logs[0].read_bytes())
     data[len(data) // 2] ^= 1
@@ -425,13 +425,13 @@ def test_of_many_logs_the_damaged_ones_are_named_and_the_rest_is_printed(
 
     done = hearthlog("cat", tmp_path)
     assert done.returncode == 3
-    told = sorted(done.stderr.splitlines())
-    assert len(told) == 2
-    assert told[0].startswith(f"hearthlog: {logs[0]}: damaged at byte ")
-    assert told[1] == f"hearthlog: {logs[-1]}: is not an MCAP file"
+    reported = sorted(done.stderr.splitlines())
+    assert len(reported) == 2
+    assert reported[0].startswith(f"hearthlog: {logs[0]}: damaged at byte ")
+    assert reported[1] == f"hearthlog: {logs[-1]}: is not an MCAP file"
     printed = done.stdout.splitlines()
-    others = set(whole) - set(first) - set(last)
-    assert others <= set(printed) <= set(whole) - set(last)
+    others = set(full) - set(first) - set(last)
+    assert others <= set(printed) <= set(full) - set(last)
     assert len(first) // 2 < len(set(first) & set(printed)) < len(first)
 
     alone = hearthlog("cat", logs[-1])
@@ -447,9 +447,9 @@ def test_of_many_logs_with_the_same_fault_the_first_are_named_and_the_others_cou
         (tmp_path / f"home_20260301T0700{second:02}Z.mcap").write_bytes(data)
     done = hearthlog("cat", tmp_path, "--topics", "/mic/info")
     assert done.returncode == 3
-    *told, rest = done.stderr.splitlines()
+    *reported, rest = done.stderr.splitlines()
     text = "its index is damaged, and messages may be missing; `hearthlog recover` says which"
-    named = [line.removeprefix("hearthlog: ").removesuffix(f": {text}") for line in told]
+    named = [line.removeprefix("hearthlog: ").removesuffix(f": {text}") for line in reported]
     assert len(set(named)) == 10
     assert set(named) <= {str(log) for log in find_logs(tmp_path)}
     assert rest == f"hearthlog: and 3 more: {text}"

@@ -374,12 +374,12 @@ def test_nothing_is_said_of_a_file_that_changed_since(fleet):
 
 def test_a_damaged_log_is_a_row_with_its_error_and_is_looked_at_every_time(fleet):
     path = find_logs(fleet)[1]
-    whole, about = path.read_bytes(), path.stat()
+    full, about = path.read_bytes(), path.stat()
     garbage(path)
     row = write_catalog(fleet).current(path)
     assert (row.state, row.span, row.frames) == (DAMAGED, None, 0)
     assert row.error == "is not an MCAP file"
-    path.write_bytes(whole)
+    path.write_bytes(full)
     os.utime(path, ns=(about.st_atime_ns, about.st_mtime_ns))
     assert write_catalog(fleet, read_catalog(fleet)).current(path).state == FINISHED
 
@@ -506,7 +506,7 @@ OF_OTHERS = {
 @pytest.mark.parametrize("kind", [*FOREIGN, *OF_OTHERS])
 def test_a_catalogue_that_cannot_be_used_is_not_used_and_made_anew(fleet, capfd, kind):
     before = select([fleet])
-    whole = rows(write_catalog(fleet))
+    full = rows(write_catalog(fleet))
     path = fleet / CATALOG
     path.write_bytes((FOREIGN | OF_OTHERS)[kind](path.read_bytes()))
     left = read_catalog(fleet)
@@ -517,7 +517,7 @@ def test_a_catalogue_that_cannot_be_used_is_not_used_and_made_anew(fleet, capfd,
     assert select([fleet]) == before
     done = run(capfd, "catalog", fleet)
     assert done.stderr == f"hearthlog: {why}; it is rebuilt\n"
-    assert rows(read_catalog(fleet)) == whole
+    assert rows(read_catalog(fleet)) == full
 
 
 @pytest.mark.parametrize("seed", range(24))
@@ -745,14 +745,16 @@ def test_the_command_says_in_json_what_the_table_says(fleet, capfd):
     done = run(capfd, "catalog", fleet, "--json")
     assert done.returncode == 3
     assert done.stderr == f"hearthlog: {path}: is not an MCAP file\n"
-    said = json.loads(done.stdout)
+    result_text = json.loads(done.stdout)
     catalog = read_catalog(fleet)
-    assert said["files"] == len(catalog)
-    assert said["damaged"] == {path.relative_to(fleet).as_posix(): "is not an MCAP file"}
-    assert [home["home"] for home in said["homes"]] == ["bert", "north/anna"]
-    assert [home["hours"] for home in said["homes"]] == [home.hours for home in homes(catalog)]
+    assert result_text["files"] == len(catalog)
+    assert result_text["damaged"] == {path.relative_to(fleet).as_posix(): "is not an MCAP file"}
+    assert [home["home"] for home in result_text["homes"]] == ["bert", "north/anna"]
+    assert [home["hours"] for home in result_text["homes"]] == [
+        home.hours for home in homes(catalog)
+    ]
     minutes = sum(one["minutes"] for row in catalog.rows() for one in row.labels)
-    assert sum(one["minutes"] for one in said["labels"]) == pytest.approx(minutes)
+    assert sum(one["minutes"] for one in result_text["labels"]) == pytest.approx(minutes)
 
 
 def test_the_command_exports_the_rows_to_a_new_parquet_file(fleet, tmp_path, capfd):

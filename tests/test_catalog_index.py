@@ -131,9 +131,9 @@ def is_replaced(fleet: Path) -> None:
 
 def is_appended_to(fleet: Path) -> None:
     (active,) = find_logs(fleet / "bert")
-    whole = north(fleet)[0].read_bytes()
+    full = north(fleet)[0].read_bytes()
     with active.open("ab") as stream:
-        stream.write(whole[active.stat().st_size :])
+        stream.write(full[active.stat().st_size :])
 
 
 def is_reviewed(fleet: Path) -> None:
@@ -239,14 +239,14 @@ def test_only_what_is_not_finished_or_in_the_span_is_looked_at(catalogued, opene
     for path in others:
         path.write_bytes(b"nonsense")  # which no program does: a finished log is never changed
     span = None, time_span(second)[1]
-    selection, _, said = found(catalogued, *span)
+    selection, _, output = found(catalogued, *span)
     assert {first, second} < set(selection.logs)
     assert not opened
-    assert not said
+    assert not output
     second.write_bytes(b"nonsense")
-    _, _, said = found(catalogued, *span)
+    _, _, output = found(catalogued, *span)
     assert opened == [second]
-    assert len(said) == 1
+    assert len(output) == 1
 
 
 def test_logs_without_a_span_are_asked_and_enrolled_sounds_are_left_out(fleet, opened, old):

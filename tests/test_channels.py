@@ -42,7 +42,7 @@ def written(path, *channels, rate=RATE):
     return path
 
 
-def heard(path, **options):
+def labelled(path, **options):
     return np.concatenate([*read_audio(path, **options)])
 
 
@@ -62,12 +62,12 @@ def test_the_best_channel_is_heard_where_the_mean_hides_sound(case, tmp_path):
     for place in (0, 1):
         channels = [*ONE_GOOD[case]]
         channels[0], channels[place] = channels[place], channels[0]
-        told = []
+        reported = []
         path = written(tmp_path / f"{place}.wav", *channels)
-        samples = heard(path, chosen=told.append)
+        samples = labelled(path, chosen=reported.append)
         best = 0 if case == "a sound and its negative" else place
         np.testing.assert_array_equal(samples, channels[best].astype(np.float32))
-        (line,) = told
+        (line,) = reported
         number = best + 1
         assert line.startswith(f"channel {number} of {len(channels)} is heard alone: ")
 
@@ -84,12 +84,12 @@ FINE = {
 
 @pytest.mark.parametrize("case", FINE)
 def test_other_channels_are_averaged_to_the_last_bit(case, tmp_path):
-    told = []
+    reported = []
     path = written(tmp_path / "stereo.wav", *FINE[case])
-    samples = heard(path, chosen=told.append)
+    samples = labelled(path, chosen=reported.append)
     mean = np.stack(FINE[case], axis=1).astype(np.float32).mean(axis=1)
     np.testing.assert_array_equal(samples, mean)
-    assert told == []
+    assert reported == []
 
 
 def test_a_channel_is_kept_while_the_others_are_only_quiet(tmp_path):
@@ -99,9 +99,9 @@ def test_a_channel_is_kept_while_the_others_are_only_quiet(tmp_path):
         np.concatenate([SOUND[: 20 * RATE], pause, SOUND]),
         np.concatenate([noise(0.02, 20), noise(0.02), noise(0.02)]),
     )
-    told = []
-    samples = heard(path, chosen=told.append)
-    assert len(told) == 1
+    reported = []
+    samples = labelled(path, chosen=reported.append)
+    assert len(reported) == 1
     assert samples[20 * RATE : 45 * RATE].std() < 4e-4
 
 
@@ -119,7 +119,7 @@ def test_the_choice_is_told_in_the_log_and_at_the_end(tmp_path):
 def test_a_channel_is_chosen_by_its_number(tmp_path):
     path = written(tmp_path / "two.wav", SOUND, noise(0.02))
     for number, channel in ((1, SOUND), (2, soundfile.read(path)[0][:, 1])):
-        np.testing.assert_array_equal(heard(path, channel=number), channel.astype(np.float32))
+        np.testing.assert_array_equal(labelled(path, channel=number), channel.astype(np.float32))
     with pytest.raises(SourceError) as error:
         FileSource([path], START, channel=3)
     assert str(error.value) == (
@@ -186,10 +186,10 @@ def test_a_sound_card_whose_first_channel_is_dead_is_heard_by_another_and_says_s
     labmic.configure(data=np.stack([dead, sound, -sound, dead], axis=1))
     with recording(labmic, tmp_path / "logs") as process:
         wait_for_frames(tmp_path / "logs", 60)
-    told = "channel 2 of 4 is heard alone: the first one is much fainter"
-    assert process.errors.count(told) == 1
+    reported = "channel 2 of 4 is heard alone: the first one is much fainter"
+    assert process.errors.count(reported) == 1
     states = [status for m in read(tmp_path / "logs", "diagnostics") for status in m.status]
-    assert [state.message for state in states if state.level == WARNING] == [told]
+    assert [state.message for state in states if state.level == WARNING] == [reported]
     assert features(tmp_path / "logs")[2][20:, 0].min() > 0.005
 
 
@@ -219,11 +219,11 @@ def test_what_is_no_number_is_a_gap_of_the_frames_that_hold_it(tmp_path, rate, v
         241,
         "samples are not finite (NaN or infinity)",
     )
-    whole = dict(frames_of(events))
-    assert [*whole] == [*range(100), *range(341, 500)]
+    full = dict(frames_of(events))
+    assert [*full] == [*range(100), *range(341, 500)]
     same = dict(frames_of(events_of(written(tmp_path / "whole.wav", sound, rate=rate))))
     for number in (0, 50, 345, 499):  # the zeros in the hole are heard some samples around it
-        np.testing.assert_array_equal(whole[number], same[number])
+        np.testing.assert_array_equal(full[number], same[number])
 
 
 def events_of(path):
@@ -326,9 +326,9 @@ def test_sound_in_one_channel_alone_is_heard_within_a_second_and_seldom_changes_
 @pytest.mark.parametrize("case", CHANGES)
 def test_of_a_file_sound_in_one_channel_alone_is_heard_from_its_beginning(case, tmp_path):
     channels = CHANGES[case][:2]
-    told = []
-    samples = heard(written(tmp_path / "two.wav", *channels), chosen=told.append)
-    assert len(told) <= 2
+    reported = []
+    samples = labelled(written(tmp_path / "two.wav", *channels), chosen=reported.append)
+    assert len(reported) <= 2
     assert longest_deafness(np.stack(channels, axis=1) * 32767, samples * 32767) <= 0.1
 
 
@@ -347,9 +347,11 @@ def test_one_sample_that_is_no_number_makes_no_channel_deaf(other, value, tmp_pa
     sound = TALK.copy()
     sound[12 * RATE] = value
     channels = {"noise": QUIET, "the sound": TALK * 0.8, "nothing": QUIET * 0}
-    told = []
-    samples = heard(written(tmp_path / "hole.wav", sound, channels[other]), chosen=told.append)
-    assert told == []
+    reported = []
+    samples = labelled(
+        written(tmp_path / "hole.wav", sound, channels[other]), chosen=reported.append
+    )
+    assert reported == []
     assert np.isnan(samples).sum() == (other != "the sound")
     assert longest_deafness(np.stack([TALK, TALK], axis=1), np.nan_to_num(samples) * 2) == 0
 
@@ -359,7 +361,7 @@ def test_a_microphone_goes_to_the_channel_that_holds_the_sound_and_says_so_live(
     labmic.configure(data=np.stack([np.zeros_like(sound), sound], axis=1))
     with recording(labmic, tmp_path / "logs") as process:
         wait_for_frames(tmp_path / "logs", 120)
-    told = "mic: channel 2 of 2 is heard alone: the first one is much fainter"
-    assert process.errors.count(told) == 1
+    reported = "mic: channel 2 of 2 is heard alone: the first one is much fainter"
+    assert process.errors.count(reported) == 1
     states = [status for m in read(tmp_path / "logs", "diagnostics") for status in m.status]
-    assert told.removeprefix("mic: ") in {s.message for s in states if s.level == WARNING}
+    assert reported.removeprefix("mic: ") in {s.message for s in states if s.level == WARNING}

@@ -88,9 +88,9 @@ def judged(model, rows):
 )
 def test_a_row_is_judged_the_same_in_any_company(classes, cuts):
     model = trained(classes)
-    whole = judged(model, unseen(classes))
+    full = judged(model, unseen(classes))
     parts = np.split(unseen(classes), sorted(cuts))
-    assert np.array_equal(np.concatenate([judged(model, p) for p in parts]), whole)
+    assert np.array_equal(np.concatenate([judged(model, p) for p in parts]), full)
 
 
 @pytest.mark.parametrize("classes", [2, 3])
@@ -115,8 +115,8 @@ def test_the_order_of_sums_changes_no_bit_of_a_distance(seed, width, spread):
         for order in (np.arange(width), rng.permutation(width))
     )
     np.testing.assert_array_equal(one, other)
-    whole = in_steps(rows, 50).astype(int), in_steps(vectors, 50).astype(int)
-    squares = ((whole[0][:, np.newaxis] - whole[1]) ** 2).sum(axis=-1)
+    full = in_steps(rows, 50).astype(int), in_steps(vectors, 50).astype(int)
+    squares = ((full[0][:, np.newaxis] - full[1]) ** 2).sum(axis=-1)
     np.testing.assert_allclose(one, -0.5 / width * squares / 50**2, rtol=1e-9)
 
 

@@ -64,9 +64,9 @@ def test_info_for_people_has_the_same_figures(logs, hearthlog):
 
 def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(logs, hearthlog):
     figures = json.loads(hearthlog("info", logs, "--json").stdout)
-    what, heard, state, title, *rest = hearthlog("info", logs).stdout.splitlines()
+    what, recorded, state, title, *rest = hearthlog("info", logs).stdout.splitlines()
     assert what.startswith("Home flat, microphone hall: 3.0 min, 2026-0")
-    assert heard.startswith("Listened: 3.0 min of 3.0 min; labelled most: ")
+    assert recorded.startswith("Listened: 3.0 min of 3.0 min; labelled most: ")
     assert state == f"All is well; next: {figures['next']}"
     assert state.endswith(f"review ten spans: hearthlog review {logs} --queue")
     assert title == "hall: time labelled as each sound, also that of a television"
@@ -105,9 +105,9 @@ def test_info_tells_times_of_the_home_and_trouble_and_names_no_class_that_is_hid
     write_list(tmp_path, ["music"])
     result = hearthlog("info", tmp_path)
     assert result.returncode == 3
-    what, heard, state, _, *rest = result.stdout.splitlines()
+    what, recorded, state, _, *rest = result.stdout.splitlines()
     assert re.search(r"2026-03-02 02:00 to 2026-03-03 01:00 \(Europe/Vienna\)", what)
-    assert heard.endswith("; labelled most: talking 2 h 30 min and coughing 1.5 min")
+    assert recorded.endswith("; labelled most: talking 2 h 30 min and coughing 1.5 min")
     assert state.startswith("Not heard: 1 gap, together 3600.000 s")
     assert [row.split()[0] for row in rest[:3]] == ["Coughing", "Talking", "Quiet"]
     assert "gap: mic 2026-03-02 21:00:00 3600.000 s" in result.stdout
@@ -190,25 +190,25 @@ def test_info_lists_the_first_gaps_and_json_all_of_them_with_status_3(hearthlog,
 
 
 def test_info_of_an_unfinished_log_says_so_with_status_3(logs, hearthlog, tmp_path):
-    whole = min(logs.rglob("*.mcap"))
-    cut = tmp_path / (whole.name + ".active")
-    cut.write_bytes(whole.read_bytes()[:60_000])
+    full = min(logs.rglob("*.mcap"))
+    cut = tmp_path / (full.name + ".active")
+    cut.write_bytes(full.read_bytes()[:60_000])
     result = hearthlog("info", cut, "--json")
     assert result.returncode == 3
     assert json.loads(result.stdout)["unfinished"] == [str(cut)]
 
 
 def test_info_names_what_is_damaged_and_shows_the_rest_with_status_3(logs, hearthlog, tmp_path):
-    whole, other = sorted(logs.rglob("*.mcap"))
-    shutil.copy(whole, tmp_path)
+    full, other = sorted(logs.rglob("*.mcap"))
+    shutil.copy(full, tmp_path)
     bad = tmp_path / other.name
     data = bytearray(other.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 3000] = bytes(3000)
-    said = data.rindex(b"hearthlog_contents", 0, data.rindex(b'"topics"'))
-    data[data.index(b"sha256", said)] ^= 1  # so that its messages are read
+    output = data.rindex(b"hearthlog_contents", 0, data.rindex(b'"topics"'))
+    data[data.index(b"sha256", output)] ^= 1  # so that its messages are read
     bad.write_bytes(data)
-    alone = json.loads(hearthlog("info", whole, "--json").stdout)
+    alone = json.loads(hearthlog("info", full, "--json").stdout)
     result = hearthlog("info", tmp_path, "--json")
     assert result.returncode == 3
     found = json.loads(result.stdout)
@@ -341,10 +341,10 @@ def denied(logs, tmp_path):
 def test_no_permission_is_not_no_logs(denied, verb):
     folder, deny = denied
     deny(folder)
-    status, said = as_another_account(verb, folder)
+    status, output = as_another_account(verb, folder)
     assert status == 1
-    assert said.startswith(f"hearthlog: {folder}: may not be read by you (owner ")
-    assert said.count("\n") == 1
+    assert output.startswith(f"hearthlog: {folder}: may not be read by you (owner ")
+    assert output.count("\n") == 1
 
 
 @needs_setpriv
@@ -352,8 +352,8 @@ def test_a_folder_that_may_not_be_read_leaves_the_others_to_the_doctor(denied, t
     folder, deny = denied
     log = shutil.copy(find_logs(folder)[0], tmp_path)
     deny(folder)
-    status, said = as_another_account("doctor", folder, log)
-    (line,) = said.splitlines()
+    status, output = as_another_account("doctor", folder, log)
+    (line,) = output.splitlines()
     assert status == 1
     assert line.startswith(f"hearthlog: {folder}: may not be read by you (owner ")
 
@@ -365,13 +365,13 @@ def test_what_may_be_read_of_a_folder_is_used_and_the_rest_is_a_line(denied):
     deny(second)
     (folder / "inner").mkdir()
     deny(folder / "inner")
-    status, said = as_another_account("cat", folder, "--topics", "/hall/segment")
-    assert (status, said.count("\n")) == (3, 1)
-    assert f"{folder}: 2 of its files and folders, left out, may not be read by you" in said
+    status, output = as_another_account("cat", folder, "--topics", "/hall/segment")
+    assert (status, output.count("\n")) == (3, 1)
+    assert f"{folder}: 2 of its files and folders, left out, may not be read by you" in output
     deny(first)
-    status, said = as_another_account("cat", folder)
-    assert (status, said.count("\n")) == (1, 1)
-    assert "what is in it may not be read by you" in said
+    status, output = as_another_account("cat", folder)
+    assert (status, output.count("\n")) == (1, 1)
+    assert "what is in it may not be read by you" in output
 
 
 def test_the_doctor_takes_many_paths_and_names_those_that_are_not_there(logs, hearthlog):

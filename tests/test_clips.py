@@ -67,12 +67,12 @@ def push(finder, first, private, unlabelled=0, blocks=(7, 20, 1)):
         numbers = np.arange(start, min(start + next(sizes), len(private)))
         samples = np.repeat((first + numbers[:, np.newaxis]) / 32768, FRAME_SAMPLES, axis=1)
         stamps = START + (first + numbers) * FRAME_NANOSECONDS
-        said = np.asarray(private, np.float32)[numbers[numbers >= unlabelled]]
-        rest = 1 - said
-        probabilities = np.stack([rest / 4, said, rest * 3 / 4], axis=1)
-        labelled = labels_of(probabilities, np.zeros(len(said), np.float32))
+        output = np.asarray(private, np.float32)[numbers[numbers >= unlabelled]]
+        rest = 1 - output
+        probabilities = np.stack([rest / 4, output, rest * 3 / 4], axis=1)
+        labelled = labels_of(probabilities, np.zeros(len(output), np.float32))
         frames = Frames(first + start, samples.astype(np.float32), stamps)
-        kept += finder.push(frames, labelled if len(said) else None)
+        kept += finder.push(frames, labelled if len(output) else None)
         start = int(numbers[-1]) + 1
     return numbers_of(kept)
 
@@ -194,7 +194,7 @@ def test_what_the_model_is_unsure_of_or_has_not_learned_is_kept():
 # What is written
 
 
-def asked(folder, model=None, **others):
+def requested(folder, model=None, **others):
     return Settings(output=folder, model=model, timezone="UTC", **others)
 
 
@@ -241,7 +241,7 @@ def noise(tmp_path):
     return write
 
 
-def said(logs, about="clips"):
+def output(logs, about="clips"):
     lines = (line for item in read(logs, "rosout") for line in [item.msg] if about in line)
     return list(lines)
 
@@ -250,7 +250,7 @@ def said(logs, about="clips"):
 def test_what_is_kept_is_the_sound_itself_and_no_window_of_it_is_like_speech(
     sounds, model_file, tmp_path, mode
 ):
-    about = asked(tmp_path, model_file, keep_audio=mode, max_bag_duration=60)
+    about = requested(tmp_path, model_file, keep_audio=mode, max_bag_duration=60)
     source = LossySource(FileSource(sounds, START), {3: 7})
     logs = record(about, source, Flag()).logs
     layers = [path for path in map(audio_path, logs) if path.exists()]
@@ -260,8 +260,8 @@ def test_what_is_kept_is_the_sound_itself_and_no_window_of_it_is_like_speech(
         if isinstance(event, Gap):
             infrasound.restart()
         elif isinstance(event, Frames):
-            heard = np.rint(infrasound(event.samples) * 32768)
-            original |= dict(zip(event.stamps.tolist(), heard, strict=True))
+            recorded = np.rint(infrasound(event.samples) * 32768)
+            original |= dict(zip(event.stamps.tolist(), recorded, strict=True))
     assert stamps == [*original]
     model = load_model(model_file)
     speech = model.classes.index("speech")
@@ -301,7 +301,7 @@ def kept_of_people_not_learned_from(all_household, tmp_path_factory):
     share = {}
     for label in ("speech", "yelling"):
         paths = [c.path for c in clips if (c.source, c.label) == (unseen, label)]
-        layers = keep(paths, asked(tmp_path / label, model, keep_audio="always"))
+        layers = keep(paths, requested(tmp_path / label, model, keep_audio="always"))
         share[label] = len(frames_of(layers)) / len(read(tmp_path / label, "features"))
     return share
 
@@ -317,9 +317,9 @@ def test_but_yelling_of_such_people_is(kept_of_people_not_learned_from):
 def test_no_sound_is_kept_unless_it_is_asked_for_and_the_log_is_the_same_either_way(
     day, model_file, tmp_path
 ):
-    assert keep([day], asked(tmp_path / "off", model_file)) == []
+    assert keep([day], requested(tmp_path / "off", model_file)) == []
     assert len(list((tmp_path / "off").rglob("*.mcap*"))) == 1
-    (layer,) = keep([day], asked(tmp_path / "on", model_file, keep_audio="always"))
+    (layer,) = keep([day], requested(tmp_path / "on", model_file, keep_audio="always"))
     assert is_layer(layer)
     off, on = (
         raw_messages(next(log for log in find_logs(tmp_path / x) if not is_layer(log)))
@@ -329,7 +329,7 @@ def test_no_sound_is_kept_unless_it_is_asked_for_and_the_log_is_the_same_either_
 
 
 def test_a_layer_says_what_it_is_and_is_only_made_when_there_is_sound(noise, model_file, tmp_path):
-    (layer,) = keep([noise(3)], asked(tmp_path / "a", keep_audio="always", never_keep=[]))
+    (layer,) = keep([noise(3)], requested(tmp_path / "a", keep_audio="always", never_keep=[]))
     about = LogReader(layer).metadata["hearthlog"]
     assert about["log"] == "home_20260301T070000Z.mcap"
     assert layer.name == "home_20260301T070000Z.audio.mcap"
@@ -338,13 +338,13 @@ def test_a_layer_says_what_it_is_and_is_only_made_when_there_is_sound(noise, mod
     assert (json.loads(about["never_keep"]), limits) == ([], (PRIVATE_LIMIT, ELSEWHERE))
     assert provenance("home").items() <= about.items()
     never = list(load_model(model_file).classes)  # one of them is always likely
-    about = asked(tmp_path / "b", model_file, keep_audio="always", never_keep=never)
+    about = requested(tmp_path / "b", model_file, keep_audio="always", never_keep=never)
     assert keep([noise(3)], about) == []
     assert len(list((tmp_path / "b").rglob("*.mcap*"))) == 1
 
 
 def test_layers_roll_with_their_logs(noise, tmp_path):
-    about = asked(tmp_path, keep_audio="always", never_keep=[], max_bag_duration=3)
+    about = requested(tmp_path, keep_audio="always", never_keep=[], max_bag_duration=3)
     layers = keep([noise(10)], about, START + SECOND // 2)
     assert [len(frames_of([layer])) for layer in layers] == [50, 60, 60, 30]
     for layer in layers:
@@ -356,7 +356,7 @@ def test_a_layer_is_complete_soon_after_its_log_though_no_sound_follows(tmp_path
     names = [tmp_path / f"home_20260301T07000{second}Z.mcap" for second in (0, 5)]
     rolls = START + 5 * SECOND
     log = ClipWriter(
-        asked(tmp_path, keep_audio="always"),
+        requested(tmp_path, keep_audio="always"),
         ["mic"],
         lambda stamp: (names[0], rolls) if stamp < rolls else (names[1], rolls + DAY),
     )
@@ -383,7 +383,7 @@ def test_when_the_clock_is_set_back_sound_stays_beside_its_own_log(noise, tmp_pa
             yield Gap(int(stamps[-1]), START - HOUR, "the clock was set", 1)
             yield Frames(81, samples, stamps - HOUR)
 
-    about = asked(tmp_path, keep_audio="always", never_keep=[])
+    about = requested(tmp_path, keep_audio="always", never_keep=[])
     logs = record(about, SetBack(), Flag()).logs
     kept = [frames_of([audio_path(log)]) for log in logs]
     assert [len(frames) for frames in kept] == [80, 80]
@@ -392,7 +392,7 @@ def test_when_the_clock_is_set_back_sound_stays_beside_its_own_log(noise, tmp_pa
 
 
 def test_clips_become_wav_files_and_doctor_finds_no_fault(noise, tmp_path, hearthlog):
-    keep([noise(5)], asked(tmp_path / "logs", keep_audio="always", never_keep=[]))
+    keep([noise(5)], requested(tmp_path / "logs", keep_audio="always", never_keep=[]))
     result = hearthlog("doctor", tmp_path / "logs")
     assert (result.returncode, result.stdout) == (0, "2 files: 0 errors, 0 warnings\n")
     result = hearthlog("export", tmp_path / "logs", "--format", "wav", "-o", tmp_path / "wav")
@@ -406,7 +406,7 @@ def test_clips_become_wav_files_and_doctor_finds_no_fault(noise, tmp_path, heart
 
 
 def test_relabelling_passes_over_clips(noise, model_file, tmp_path, hearthlog):
-    (layer,) = keep([noise(5)], asked(tmp_path / "logs", keep_audio="always", never_keep=[]))
+    (layer,) = keep([noise(5)], requested(tmp_path / "logs", keep_audio="always", never_keep=[]))
     result = hearthlog("relabel", tmp_path / "logs", "--model", model_file)
     assert result.returncode == 0, result
     assert len(list(layer.parent.iterdir())) == 3
@@ -418,14 +418,14 @@ def test_relabelling_passes_over_clips(noise, model_file, tmp_path, hearthlog):
 
 
 def test_only_so_many_minutes_are_kept_a_day_also_when_the_recorder_starts_again(noise, tmp_path):
-    about = asked(tmp_path, keep_audio="always", never_keep=[], clip_minutes_a_day=1)
+    about = requested(tmp_path, keep_audio="always", never_keep=[], clip_minutes_a_day=1)
     (layer,) = keep([noise(50)], about)
     assert len(frames_of([layer])) == 1000
     (layer,) = keep([noise(50)], about, START + HOUR)
     kept = len(frames_of([layer]))
     assert 160 < kept <= 200  # what frames a message takes place, too
     assert keep([noise(50)], about, START + 2 * HOUR) == []
-    assert said(tmp_path) == ["no clips: 1 minutes of this day are kept already"] * 2
+    assert output(tmp_path) == ["no clips: 1 minutes of this day are kept already"] * 2
     assert {item.level for item in read(tmp_path, "rosout") if "no clips" in item.msg} == {INFO}
     (layer,) = keep([noise(50)], about, START + DAY)
     assert len(frames_of([layer])) == 1000
@@ -433,12 +433,12 @@ def test_only_so_many_minutes_are_kept_a_day_also_when_the_recorder_starts_again
 
 def test_the_day_is_the_homes(noise, tmp_path):
     midnight = START - 7 * HOUR + 10 * HOUR  # in Honolulu
-    about = asked(tmp_path, keep_audio="always", never_keep=[], clip_minutes_a_day=1)
+    about = requested(tmp_path, keep_audio="always", never_keep=[], clip_minutes_a_day=1)
     about = about.model_copy(update={"timezone": "Pacific/Honolulu"})
     kept = frames_of(keep([noise(190)], about, midnight - 90 * SECOND))
     assert 1180 < sum(time < midnight for time in kept) <= 1200
     assert 1180 < sum(time >= midnight for time in kept) <= 1200
-    texts = said(tmp_path)
+    texts = output(tmp_path)
     assert texts[1] == "clips are kept again"
     assert len(texts) == 3
 
@@ -446,7 +446,7 @@ def test_the_day_is_the_homes(noise, tmp_path):
 @pytest.fixture
 def old(noise, tmp_path):
     """Record a log with clips, and put others beside it which are not to be touched."""
-    about = asked(tmp_path / "logs", keep_audio="always", never_keep=[])
+    about = requested(tmp_path / "logs", keep_audio="always", never_keep=[])
     (layer,) = keep([noise(3)], about)
     others = [
         layer.with_name("home_2_20260301T070000Z.audio.mcap"),
@@ -474,14 +474,14 @@ def recorded_later(layer, days):
 @pytest.mark.parametrize("mode", ["off", "always"])
 def test_old_clips_are_deleted_and_nothing_else(old, noise, tmp_path, mode):
     layer, others = old
-    about = asked(tmp_path / "logs", keep_audio=mode, never_keep=[], clip_retention_days=30)
+    about = requested(tmp_path / "logs", keep_audio=mode, never_keep=[], clip_retention_days=30)
     recorded_later(layer, 28)
     keep([noise(3)], about, START + 29 * DAY - HOUR)
     assert layer.exists()
     keep([noise(4)], about, START + 30 * DAY + HOUR)
     assert not layer.exists()
     assert all(path.exists() for path in others)
-    assert said(tmp_path / "logs") == ["clips of 1 logs deleted: they were 30 days old"]
+    assert output(tmp_path / "logs") == ["clips of 1 logs deleted: they were 30 days old"]
 
 
 def test_old_clips_are_looked_for_every_hour(old, tmp_path):
@@ -497,7 +497,7 @@ def test_old_clips_are_looked_for_every_hour(old, tmp_path):
 
 def test_a_clock_far_ahead_deletes_no_clips(old, noise, tmp_path):
     layer, _ = old
-    about = asked(tmp_path / "logs", keep_audio="off", clip_retention_days=2)
+    about = requested(tmp_path / "logs", keep_audio="off", clip_retention_days=2)
     keep([noise(3)], about, START + 60 * DAY)
     assert layer.exists()
 
@@ -533,11 +533,11 @@ def test_clips_that_cannot_be_deleted_are_said_and_the_others_go(old, tmp_path):
 
 def test_where_space_runs_out_clips_stop_and_the_log_goes_on(noise, tmp_path):
     with small_disk(tmp_path / "disk", "6M") as disk:
-        about = asked(disk, keep_audio="always", never_keep=[], clip_min_free_space=4)
+        about = requested(disk, keep_audio="always", never_keep=[], clip_min_free_space=4)
         (layer,) = keep([noise(190)], about)
         assert 300 < len(frames_of([layer])) < 2000
         assert len(read(_log(layer), "features")) == 3800
-        assert said(_log(layer)) == ["no clips: less than 4 MB are free on the disk"]
+        assert output(_log(layer)) == ["no clips: less than 4 MB are free on the disk"]
         assert [i.level for i in read(_log(layer), "rosout") if "no clips" in i.msg] == [WARN]
 
 
@@ -549,7 +549,7 @@ def test_a_layer_that_the_disk_refuses_is_given_up_and_the_next_one_is_written(t
         full, good = disk / "home_20260301T070000Z.mcap", tmp_path / "home_20260301T070030Z.mcap"
         rolls = START + 30 * SECOND
         log = ClipWriter(
-            asked(tmp_path, keep_audio="always"),
+            requested(tmp_path, keep_audio="always"),
             ["mic"],
             lambda stamp: (full, rolls) if stamp < rolls else (good, rolls + DAY),
         )
@@ -562,13 +562,13 @@ def test_a_layer_that_the_disk_refuses_is_given_up_and_the_next_one_is_written(t
 
 
 def test_a_name_that_is_taken_stops_the_clips_of_one_log(noise, tmp_path):
-    about = asked(tmp_path, keep_audio="always", never_keep=[], max_bag_duration=5)
+    about = requested(tmp_path, keep_audio="always", never_keep=[], max_bag_duration=5)
     taken = audio_path(tmp_path / "2026/03/01/home_20260301T070000Z.mcap")
     taken.mkdir(parents=True)
     layers = keep([noise(12)], about)
     assert [layer.name[14:20] for layer in layers] == ["070000", "070005", "070010"]
     assert sum(len(frames_of([layer])) for layer in layers[1:]) == 140
-    first, again = said(_log(layers[1]))
+    first, again = output(_log(layers[1]))
     assert (first.startswith(f"no clips: {taken}"), again) == (True, "clips are kept again")
 
 
@@ -586,13 +586,13 @@ def test_a_killed_recorder_leaves_clips_that_the_next_one_completes(noise, tmp_p
     process.kill()
     process.wait()
     (active,) = logs.rglob("*.audio.mcap.active")
-    heard, kept = len(read(_log(active), "features")), frames_of([active])
-    assert heard - 20 - 19 <= len(kept)
-    record_files(asked(logs), FileSource([noise(3)], START + HOUR), Flag())
+    recorded, kept = len(read(_log(active), "features")), frames_of([active])
+    assert recorded - 20 - 19 <= len(kept)
+    record_files(requested(logs), FileSource([noise(3)], START + HOUR), Flag())
     assert not active.exists()
-    whole = active.with_name(active.name.removesuffix(".active"))
-    assert LogReader(whole).complete
-    assert frames_of([whole]).keys() == kept.keys()
+    complete = active.with_name(active.name.removesuffix(".active"))
+    assert LogReader(complete).complete
+    assert frames_of([complete]).keys() == kept.keys()
 
 
 def _heard(logs, count):
@@ -602,11 +602,11 @@ def _heard(logs, count):
 
 def _leave(noise, folder, change):
     """Leave a layer of sound as a recorder that was killed does, and start the next one."""
-    (layer,) = keep([noise(5)], asked(folder, keep_audio="always", never_keep=[]))
+    (layer,) = keep([noise(5)], requested(folder, keep_audio="always", never_keep=[]))
     active = layer.with_name(layer.name + ".active")
     active.write_bytes(change(bytearray(layer.read_bytes())))
     layer.unlink()
-    result = record_files(asked(folder), FileSource([noise(3)], START + HOUR), Flag())
+    result = record_files(requested(folder), FileSource([noise(3)], START + HOUR), Flag())
     return layer, active, result.recovered
 
 
@@ -639,7 +639,7 @@ def test_clips_of_which_nothing_is_whole_are_deleted(noise, tmp_path, size):
 
 
 def test_sound_is_not_kept_without_a_model_that_knows_what_is_private(noise, model_file, tmp_path):
-    about = asked(tmp_path / "logs", keep_audio="events")
+    about = requested(tmp_path / "logs", keep_audio="events")
     for reason, others in {
         "keep_audio = \"always\" needs a model with the class 'speech', which is never kept "
         "(there is none); use such a model, or set never_keep = [] to keep that too": {
@@ -648,11 +648,11 @@ def test_sound_is_not_kept_without_a_model_that_knows_what_is_private(noise, mod
         'keep_audio = "events" needs a model to select the sound; name one, or use keep_audio = '
         "always": {"keep_audio": "events", "never_keep": []},
     }.items():
-        about = asked(tmp_path / "logs", **others)
+        about = requested(tmp_path / "logs", **others)
         with pytest.raises(ConfigurationError) as error:
             keep([noise(3)], about)
         assert str(error.value) == reason
-    about = asked(tmp_path / "logs", model_file, keep_audio="unsure", never_keep=["speach"])
+    about = requested(tmp_path / "logs", model_file, keep_audio="unsure", never_keep=["speach"])
     with pytest.raises(ConfigurationError, match=r"with the class 'speach'.*this one has "):
         keep([noise(3)], about)
     assert not (tmp_path / "logs").exists()
@@ -663,10 +663,10 @@ class Swapped:
 
     device = "test"
 
-    def __init__(self, folder, logs, names, asked, path):
+    def __init__(self, folder, logs, names, requested, path):
         samples = np.concatenate(list(read_audio(path)))
         self._blocks = samples[: len(samples) // 16_000 * 16_000].reshape(-1, 20, FRAME_SAMPLES)
-        self._folder, self._logs, self._names, self._asked = folder, logs, names, asked
+        self._folder, self._logs, self._names, self._asked = folder, logs, names, requested
         self._first = 0
         self.unfinished = []  # layers at the end of each day
 
@@ -710,18 +710,18 @@ def test_clips_stop_while_a_model_speaks_that_does_not_know_what_is_private(
     requests = ReloadRequests()
     names = ["other.safetensors", "one.safetensors"]
     source = Swapped(folder, logs, names, requests, day)
-    about = asked(
+    about = requested(
         logs, folder / "champion.safetensors", keep_audio="always", max_bag_duration=86_400
     )
     paths = record(about, source, Flag(), reload_requests=requests).logs
     assert [audio_path(path).exists() for path in paths] == [True, False, True]
     assert source.unfinished == [1, 0, 1]
-    assert said(paths[0]) == []
-    (text,) = said(paths[1])
+    assert output(paths[0]) == []
+    (text,) = output(paths[1])
     assert text.startswith(
         "no clips: keep_audio = \"always\" needs a model with the class 'speech'"
     )
-    assert said(paths[2]) == ["clips are kept again"]
+    assert output(paths[2]) == ["clips are kept again"]
 
 
 # Settings

@@ -35,9 +35,9 @@ def test_a_scheduler_that_is_killed_ends_a_run_with_one_line(
     fleet = write_fleet(small_logs, tmp_path / "fleet", 2, 6)
     ending = run_and_kill(fleet, model_file, tmp_path / "run", with_layers(done))
     assert ending.status == 1, ending
-    assert "Dask scheduler at tcp://" in ending.said
-    assert ending.said.startswith("hearthlog: ")
-    assert ending.said.count("\n") == 1
+    assert "Dask scheduler at tcp://" in ending.output
+    assert ending.output.startswith("hearthlog: ")
+    assert ending.output.count("\n") == 1
 
 
 def test_a_fleet_is_labelled_while_workers_are_killed(
@@ -47,12 +47,12 @@ def test_a_fleet_is_labelled_while_workers_are_killed(
     fleet, alone = (write_fleet(small_logs, tmp_path / str(homes), homes, 6) for homes in (12, 1))
     with open_workers() as workers:
         assert not relabel([alone], load_model(model_file), model_file, workers).failed
-    (whole,) = map(layers, alone.iterdir())
-    assert len(whole) == 6
+    (full,) = map(layers, alone.iterdir())
+    assert len(full) == 6
     run = relabel_under_fire(fleet, model_file, tmp_path, every_layers(fleet, 15))
     assert run.status == 0, run
     assert run.kills >= 3
-    assert [layers(home) for home in fleet.iterdir()] == [whole] * 12
+    assert [layers(home) for home in fleet.iterdir()] == [full] * 12
 
 
 def test_a_store_that_throttles_is_asked_again(

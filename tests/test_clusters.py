@@ -78,7 +78,7 @@ def test_a_review_with_a_file_that_is_not_there_is_one_line(home, hearthlog, tmp
 
 
 @pytest.mark.parametrize(
-    ("options", "status", "says"),
+    ("options", "status", "states"),
     [
         (["--name", "rex"], 2, "give the number of a {0.noun} and a "),
         (["--name", f"{'9' * 5000}=rex"], 2, "give the number of a {0.noun} and a "),
@@ -87,10 +87,10 @@ def test_a_review_with_a_file_that_is_not_there_is_one_line(home, hearthlog, tmp
         (["--undo", "99"], 1, "there is no {0.noun} 99; `hearthlog {0.verb} LOGS` lists"),
     ],
 )
-def test_a_name_that_makes_no_sense_is_one_line(home, hearthlog, options, status, says):
+def test_a_name_that_makes_no_sense_is_one_line(home, hearthlog, options, status, states):
     done = hearthlog(home.kind.verb, home.logs, *options)
     assert done.returncode == status
-    assert says.format(home.kind) in done.stderr
+    assert states.format(home.kind) in done.stderr
     assert done.stderr.count("\n") == 1
     assert not home.file.exists()
 

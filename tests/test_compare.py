@@ -65,31 +65,31 @@ def compare(folder, names, recordings):
     return compare_models(*models, recordings, scenario_of(models[0]))
 
 
-def heard(manifest):
+def recorded(manifest):
     scenario = load_scenario("general")
     return clip_recordings(read_manifest(manifest, scenario.labels), scenario, lambda *_: None)
 
 
 def test_a_model_that_guesses_is_clearly_worse(folder, unheard):
-    found = compare(folder, ["one", "broad"], heard(unheard))
+    found = compare(folder, ["one", "broad"], recorded(unheard))
     assert found.clear
     assert found.difference.macro_f1 < -0.3
     assert found.difference.interval[1] < 0
-    mirrored = compare(folder, ["broad", "one"], heard(unheard))
+    mirrored = compare(folder, ["broad", "one"], recorded(unheard))
     assert mirrored.difference.macro_f1 == -found.difference.macro_f1
     np.testing.assert_allclose(
         mirrored.difference.interval[::-1], -np.array(found.difference.interval)
     )
-    assert compare(folder, ["one", "broad"], heard(unheard)) == found
+    assert compare(folder, ["one", "broad"], recorded(unheard)) == found
 
 
 def test_the_order_of_the_classes_changes_nothing(folder, unheard):
     scenario = load_scenario("general")
     turned = replace(scenario, classes=dict(reversed(scenario.classes.items())))
     models = [load_model(folder / f"{name}.safetensors") for name in ("one", "broad")]
-    found = compare_models(*models, list(heard(unheard)), turned)
+    found = compare_models(*models, list(recorded(unheard)), turned)
     assert found.a.scores.classes == models[0].classes[::-1]
-    straight = compare(folder, ["one", "broad"], heard(unheard))
+    straight = compare(folder, ["one", "broad"], recorded(unheard))
     assert found.difference.macro_f1 == pytest.approx(straight.difference.macro_f1)
 
 
@@ -97,7 +97,7 @@ def test_clips_of_other_names_are_those_of_the_classes(folder, unheard):
     other = unheard.with_name("other.csv")
     other.write_text(unheard.read_text().replace(",coughing,", ",Cough,"))
     found, same = (
-        compare(folder, ["one", "broad"], heard(manifest)) for manifest in (other, unheard)
+        compare(folder, ["one", "broad"], recorded(manifest)) for manifest in (other, unheard)
     )
     assert found.b.scores == same.b.scores
     model, scenario = load_model(folder / "broad.safetensors"), load_scenario("general")
@@ -109,7 +109,7 @@ def test_clips_of_other_names_are_those_of_the_classes(folder, unheard):
 
 
 def test_a_model_and_itself_do_not_differ(folder, unheard):
-    found = compare(folder, ["one", "one"], heard(unheard))
+    found = compare(folder, ["one", "one"], recorded(unheard))
     assert (found.difference.macro_f1, found.clear) == (0.0, False)
 
 
@@ -172,9 +172,9 @@ def test_silence_has_a_row_though_nobody_marked_it(folder, days, tmp_path, capfd
     command = ("models", "compare", "one", "deaf", "--logs", logs, "--folder", folder)
     *_, before, after = row_of("silence", run(capfd, *command).stdout)
     assert (before.strip() != "0.0 min", after.strip()) == (True, "0.0 min")
-    said = json.loads(run(capfd, *command, "--json").stdout)["said"]
-    assert said["silence"][0] > 0.1
-    assert said["silence"][1] == 0
+    output = json.loads(run(capfd, *command, "--json").stdout)["said"]
+    assert output["silence"][0] > 0.1
+    assert output["silence"][1] == 0
 
 
 def test_without_marks_it_is_said_how_much_of_a_day_each_class_has(folder, days, tmp_path, capfd):

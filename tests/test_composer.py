@@ -152,13 +152,13 @@ def test_the_truth_covers_the_time_and_lies_where_the_energy_is(evening):
             assert np.percentile(span, 90) < 5
         else:
             assert span.max() > 1.5
-    heard = sum(event.audible_frames for event in truth.events) * FRAME_SECONDS
+    labelled = sum(event.audible_frames for event in truth.events) * FRAME_SECONDS
     silent = sum(end - start for start, end, label in truth.spans if label == "silence")
-    assert heard + silent == pytest.approx(frames * FRAME_SECONDS)
+    assert labelled + silent == pytest.approx(frames * FRAME_SECONDS)
 
 
-@pytest.mark.parametrize(("level", "heard"), [(-15.0, True), (-55.0, False)])
-def test_of_two_sounds_the_louder_one_is_true(library, rooms, level, heard):
+@pytest.mark.parametrize(("level", "labelled"), [(-15.0, True), (-55.0, False)])
+def test_of_two_sounds_the_louder_one_is_true(library, rooms, level, labelled):
     speech, cough = library.of("speech")[0], library.of("coughing")[0]
     sounds = [
         PlannedSound(100, 400, speech, "television", "living_room", -35.0, "television"),
@@ -166,21 +166,21 @@ def test_of_two_sounds_the_louder_one_is_true(library, rooms, level, heard):
     ]
     truth = truth_of(Composition(HomePlan(600, sounds, ()), library, rooms))
     here = {name for start, end, name in truth.spans if start < 220 / 20 and end > 200 / 20}
-    assert ("coughing" in here) is heard
+    assert ("coughing" in here) is labelled
     assert {name for *_, name in truth.spans} >= {"speech", "silence"}
     assert [event.plan.origin for event in truth.events] == ["television", "resident"]
-    assert bool(truth.events[1].audible_frames) is heard
+    assert bool(truth.events[1].audible_frames) is labelled
 
 
 def test_what_is_not_heard_through_a_wall_is_silence(library):
     tap = library.of("tap_water")[0]
     sound = PlannedSound(20, 100, tap, "resident", "bathroom", -62.0, "washing")
-    for room, heard in (("bathroom", True), ("living_room", False)):
+    for room, labelled in (("bathroom", True), ("living_room", False)):
         rooms = Rooms(room, seed=0)
         rooms.floor *= 1e-2 ** (room == "bathroom")
         truth = truth_of(Composition(HomePlan(200, [sound], ()), library, rooms))
-        assert bool(truth.events[0].audible_frames) is heard
-        assert (len(truth.spans) > 1) is heard
+        assert bool(truth.events[0].audible_frames) is labelled
+        assert (len(truth.spans) > 1) is labelled
 
 
 def test_walls_take_level_and_the_high_frequencies_first(library):
@@ -316,7 +316,7 @@ def test_what_a_manifest_lacks_is_made_up_and_the_table_says_so(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rows", "said"),
+    ("rows", "output"),
     [
         ("gone.flac,coughing,me", "no such file"),
         ("broken.flac,coughing,me", "take it out of"),
@@ -325,13 +325,13 @@ def test_what_a_manifest_lacks_is_made_up_and_the_table_says_so(tmp_path):
         ("", "lists no clips"),
     ],
 )
-def test_clips_that_cannot_be_used_are_named_in_one_line(tmp_path, rows, said):
+def test_clips_that_cannot_be_used_are_named_in_one_line(tmp_path, rows, output):
     (tmp_path / "broken.flac").write_bytes(b"no audio")
     for name, samples in (("short", 300), ("long", 9000)):
         soundfile.write(tmp_path / f"{name}.flac", np.zeros(samples), SAMPLE_RATE)
     manifest = tmp_path / "manifest.csv"
     manifest.write_text(f"path,label,source_group\n{rows}\n")
-    with pytest.raises(HearthlogError, match=said) as error:
+    with pytest.raises(HearthlogError, match=output) as error:
         ClipLibrary(manifest)
     assert "\n" not in str(error.value)
 
@@ -343,7 +343,7 @@ def simulate(*arguments):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (("0",), "1 to 3660 days, not 0"),
         (("9999",), "1 to 3660 days, not 9999"),
@@ -353,10 +353,10 @@ def simulate(*arguments):
         (("1", "--model", "gone.safetensors"), "gone.safetensors"),
     ],
 )
-def test_a_home_that_cannot_be_is_refused_in_one_line(tmp_path, arguments, said):
+def test_a_home_that_cannot_be_is_refused_in_one_line(tmp_path, arguments, output):
     result = simulate(*arguments, "-o", tmp_path / "home")
     assert result.returncode == 1
-    assert said in result.stderr
+    assert output in result.stderr
     assert len([line for line in result.stderr.splitlines() if "made up" not in line]) == 1
     assert not (tmp_path / "home").exists()
 

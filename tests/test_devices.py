@@ -89,7 +89,7 @@ def test_two_devices_of_one_name_are_numbered_and_known_by_their_ports(devices):
 
 
 @pytest.mark.parametrize(
-    ("asked", "index"),
+    ("requested", "index"),
     [
         ("", 2),
         ("yeti", 2),
@@ -99,8 +99,8 @@ def test_two_devices_of_one_name_are_numbered_and_known_by_their_ports(devices):
         ("pulse", 3),
     ],
 )
-def test_a_device_is_found_by_what_it_is_asked_for(devices, asked, index):
-    assert find_device(devices, asked).index == index
+def test_a_device_is_found_by_what_it_is_asked_for(devices, requested, index):
+    assert find_device(devices, requested).index == index
 
 
 def test_a_port_in_which_nothing_is_plugged_is_no_other_device(devices):

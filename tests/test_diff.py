@@ -135,19 +135,19 @@ def test_agreement_is_that_of_scikit_learn_on_every_frame(pairs):
             compare_labellings(frames("live", a), frames("relabel/two", b))
         return
     found = compare_labellings(frames("live", a), frames("relabel/two", b))
-    _, true, said = zip(*both, strict=True)
+    _, true, output = zip(*both, strict=True)
     minutes = FRAME_NANOSECONDS / (60 * NANOSECONDS)
-    expected = confusion_matrix(true, said, labels=CLASSES)
+    expected = confusion_matrix(true, output, labels=CLASSES)
     assert np.allclose(found.confusion, expected * minutes)
     assert found.total.agreement == pytest.approx(np.trace(expected) / len(both))
     if found.total.kappa is None:
-        assert len({*true, *said}) == 1
+        assert len({*true, *output}) == 1
     else:
-        assert found.total.kappa == pytest.approx(cohen_kappa_score(true, said), abs=1e-9)
+        assert found.total.kappa == pytest.approx(cohen_kappa_score(true, output), abs=1e-9)
     assert found.minutes_a == pytest.approx(sum(map(bool, a)) * minutes)
     for name, amounts in found.total.per_class.items():
         assert amounts.minutes_a == pytest.approx(true.count(name) * minutes)
-        assert amounts.events_b == (name in said)  # within three seconds there is one at most
+        assert amounts.events_b == (name in output)  # within three seconds there is one at most
 
 
 @given(st.lists(st.tuples(*[st.sampled_from(CLASSES)] * 2), min_size=1, max_size=60))
@@ -268,14 +268,14 @@ def test_a_review_is_compared_where_somebody_reviewed(logs, hearthlog):
 
 
 def test_a_part_of_the_time_is_compared(logs, hearthlog):
-    whole = json.loads(hearthlog("diff", logs, "live", "two", "--json").stdout)
-    start, end, *_ = max(spans_of(whole), key=lambda row: read_time(row[1]) - read_time(row[0]))
+    full = json.loads(hearthlog("diff", logs, "live", "two", "--json").stdout)
+    start, end, *_ = max(spans_of(full), key=lambda row: read_time(row[1]) - read_time(row[0]))
     part = json.loads(
         hearthlog("diff", logs, "live", "two", "--json", "--start", start, "--end", end).stdout
     )
     assert part["total"]["agreement"] == 0.0
     assert part["total"]["minutes"] == pytest.approx((read_time(end) - read_time(start)) / 60e9)
-    assert spans_of(part) == [spans_of(whole)[0]]
+    assert spans_of(part) == [spans_of(full)[0]]
 
 
 @pytest.mark.parametrize("names", [("live",), ("live", "two"), ("two", "live")])
@@ -367,16 +367,16 @@ def write_home(path, rows, probabilities, novelty=np.nan):
     stamps = MIDNIGHT + seconds * NANOSECONDS
     starts, ends, labels = zip(*rows, strict=True)
     starts, ends = (MIDNIGHT + np.array(each) * NANOSECONDS for each in (starts, ends))
-    said = [label for start, end, label in rows for _ in range(start, end)]
+    output = [label for start, end, label in rows for _ in range(start, end)]
     frames = {
         "header.stamp": stamps,
         "header.frame_id": "mic",
         "frame": seconds.astype(np.uint64),
-        "label": said,
+        "label": output,
         "confidence": np.full(len(stamps), 0.5, np.float32),
         "novelty": np.full(len(stamps), novelty, np.float32),
         "probabilities": np.array(
-            [probabilities(*each) for each in zip(seconds, said, strict=True)], "f4"
+            [probabilities(*each) for each in zip(seconds, output, strict=True)], "f4"
         ),
     }
     spans = {
@@ -405,11 +405,11 @@ def queue_of(log, count):
 def test_another_name_for_a_class_is_no_reason_to_review_it(tmp_path):
     rows = [(0, 4, "speech"), (4, 8, "coughing"), (8, 12, "speech")]
     sources = find_labellings(write_home(tmp_path / "home.mcap", rows, lambda *_: [0.0, 1.0, 0.0]))
-    said = [
+    output = [
         *((MIDNIGHT + 4 * NANOSECONDS, MIDNIGHT + 8 * NANOSECONDS, "cough"),),
         *((MIDNIGHT + 8 * NANOSECONDS, MIDNIGHT + 12 * NANOSECONDS, "laughter"),),
     ]
-    other = side("relabel/two", said, ("cough", "laughter"))
+    other = side("relabel/two", output, ("cough", "laughter"))
     live = sources.read("mic", "live")
     queue = make_queue(
         sources, "mic", live, other=other, reviewed=NONE, count=9, ranking="disagreeing"
@@ -509,8 +509,8 @@ def test_disagreement_is_the_share_of_the_span_in_which_the_other_says_something
 
 def test_uncertainty_is_how_far_another_class_comes_up_to_the_label():
     rows = np.array([[1, 0, 0], [0.5, 0.5, 0], [0, 1, 0], [0.4, 0.3, 0.3], [0.2, 0.2, 0.6]])
-    said = np.array([0, 0, 0, 0, -1])
-    assert uncertainty(rows, said) == pytest.approx([0.0, 0.5, 1.0, 0.45, 0.8])
+    output = np.array([0, 0, 0, 0, -1])
+    assert uncertainty(rows, output) == pytest.approx([0.0, 0.5, 1.0, 0.45, 0.8])
 
 
 def test_without_probabilities_a_queue_needs_a_second_labelling(logs, hearthlog):
@@ -554,7 +554,7 @@ GOOD = "mic,2026-03-01T08:00:00Z,2026-03-01T08:00:01Z,live,speech,,,0.5,uncertai
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "output"),
     [
         (GOOD.replace("mic", "=cmd()"), "cannot be a topic"),
         (GOOD.replace("mic", "m" * 10_000), "cannot be a topic"),
@@ -574,10 +574,10 @@ GOOD = "mic,2026-03-01T08:00:00Z,2026-03-01T08:00:01Z,live,speech,,,0.5,uncertai
         (GOOD + "\0" * 200_000, "is not CSV|is no reason"),
     ],
 )
-def test_a_list_that_cannot_be_is_refused_with_its_line(tmp_path, line, said):
+def test_a_list_that_cannot_be_is_refused_with_its_line(tmp_path, line, output):
     path = tmp_path / "list.csv"
     path.write_text(",".join(ReviewSpan._fields) + f"\n{GOOD}\n{line}\n")
-    with pytest.raises(DataError, match=rf"list\.csv:[34]: .*({said})") as error:
+    with pytest.raises(DataError, match=rf"list\.csv:[34]: .*({output})") as error:
         read_list(path)
     assert len(str(error.value)) < 400 + len(str(path))
 
@@ -641,9 +641,9 @@ def test_a_damaged_layer_is_said_where_it_is_missed(logs, hearthlog):
 def test_of_an_unfinished_log_what_is_there_is_compared(recorded, hearthlog, tmp_path):
     path = tmp_path / "unfinished.mcap.active"
     shutil.copy(recorded.parent / "unfinished.mcap.active", path)
-    whole = segments(path)
-    half = (whole[0][0] + whole[-1][1]) // 2
-    write_marks(path, [Mark("mic", whole[0][0], half, "speech")])
+    full = segments(path)
+    half = (full[0][0] + full[-1][1]) // 2
+    write_marks(path, [Mark("mic", full[0][0], half, "speech")])
     result = hearthlog("diff", path, "live", "review")
     assert result.returncode == 3
     assert result.stderr == (f"hearthlog: unfinished, read up to the last whole chunk: {path}\n")
@@ -673,19 +673,19 @@ def test_labellings_of_different_times_are_refused(logs, hearthlog):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "output"),
     [
         (lambda n: {"label": ["Speech!"] * n}, "'Speech!' cannot be the name of a class"),
         (lambda n: {"header.stamp": np.arange(-n, 0) * 10**12}, "has a segment before 1970"),
         (lambda n: {"duration": np.zeros(n, np.int64)}, "there is no segment"),
     ],
 )
-def test_segments_that_cannot_be_are_refused(logs, hearthlog, change, said):
+def test_segments_that_cannot_be_are_refused(logs, hearthlog, change, output):
     log = find_logs(logs)[0]
     write_layer(log, log, "odd", kinds=("segment",), change=lambda own: change(len(own)))
     result = hearthlog("diff", logs, "live", "odd")
     assert (result.returncode, result.stdout) == (1, "")
-    assert said in result.stderr
+    assert output in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 
@@ -697,17 +697,17 @@ def test_logs_in_a_store_are_compared(logs, hearthlog, in_memory):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (["live"], "name a second labelling, or use --queue"),
         (["live", "live"], "live and live are the same"),
         (["live", "two", "--list", "list.txt"], "a list of spans is named *.csv"),
     ],
 )
-def test_wrong_use_is_one_line(logs, hearthlog, arguments, said):
+def test_wrong_use_is_one_line(logs, hearthlog, arguments, output):
     result = hearthlog("diff", logs, *arguments)
     assert (result.returncode, result.stdout) == (2, "")
-    assert said in result.stderr
+    assert output in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 

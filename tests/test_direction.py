@@ -9,7 +9,7 @@ import hypothesis
 import numpy as np
 import pytest
 import soundfile
-from arrays import SQUARE, bursts, heard, plane_wave
+from arrays import SQUARE, array_frames, bursts, plane_wave
 from hypothesis import given
 from hypothesis import strategies as st
 from logs import features, read
@@ -60,19 +60,19 @@ def degrees_between(azimuths, azimuth):
 @pytest.mark.parametrize("places", [SQUARE, TRIANGLE, [[*p, 0.1] for p in TRIANGLE]])
 @pytest.mark.parametrize("degrees", [-179, -100, -1, 40, 91, 178])
 def test_a_sound_is_located_on_every_side(places, degrees):
-    azimuths = finder(places)(heard(places, np.deg2rad(degrees)), 0).azimuths
+    azimuths = finder(places)(array_frames(places, np.deg2rad(degrees)), 0).azimuths
     assert len(azimuths) >= 5
     assert np.median(degrees_between(azimuths, np.deg2rad(degrees))) < 1.5
 
 
 @pytest.mark.parametrize("degrees", [-80, 0, 33, 75])
 def test_a_pair_that_is_named_from_left_to_right_tells_the_half_circle_before_it(degrees):
-    azimuths = finder(PAIR)(heard(PAIR, np.deg2rad(degrees)), 0).azimuths
+    azimuths = finder(PAIR)(array_frames(PAIR, np.deg2rad(degrees)), 0).azimuths
     assert np.median(degrees_between(azimuths, np.deg2rad(degrees))) < 3
 
 
 def test_a_pair_takes_what_is_behind_it_for_its_mirror_image():
-    azimuths = finder(PAIR)(heard(PAIR, np.deg2rad(180 - 40)), 0).azimuths
+    azimuths = finder(PAIR)(array_frames(PAIR, np.deg2rad(180 - 40)), 0).azimuths
     assert np.median(degrees_between(azimuths, np.deg2rad(40))) < 3
 
 
@@ -100,7 +100,7 @@ def test_noise_of_each_microphone_alone_has_no_direction():
 
 
 def test_the_louder_of_two_sounds_is_located():
-    frames = heard(SQUARE, 0.5) + 0.3 * heard(SQUARE, 2.5, seed=9)
+    frames = array_frames(SQUARE, 0.5) + 0.3 * array_frames(SQUARE, 2.5, seed=9)
     assert np.median(degrees_between(finder(SQUARE)(frames, 0).azimuths, 0.5)) < 5
 
 
@@ -110,8 +110,8 @@ def test_sounds_in_a_room_with_an_echo_of_a_third_of_a_second_are_located(snr, m
     rng = np.random.default_rng(1)
     clips = [bursts(3, seed)[SAMPLE_RATE:] for seed in range(3)]
     scene = room.room_scene(clips, np.array(SQUARE), 0.3, rng)
-    heard_so = room.add_noise(scene, room.room_noise(scene, rng), snr)
-    frames = heard_so[: len(heard_so) // FRAME_SAMPLES * FRAME_SAMPLES]
+    recorded_so = room.add_noise(scene, room.room_noise(scene, rng), snr)
+    frames = recorded_so[: len(recorded_so) // FRAME_SAMPLES * FRAME_SAMPLES]
     directions = finder(SQUARE)(frames.reshape(-1, FRAME_SAMPLES, 4), 0)
     seconds = directions.places / 20
     errors = [
@@ -124,23 +124,23 @@ def test_sounds_in_a_room_with_an_echo_of_a_third_of_a_second_are_located(snr, m
 
 @cache
 def a_scene():
-    return np.concatenate([heard(SQUARE, 0.5), heard(SQUARE, -2.0, seed=4)])
+    return np.concatenate([array_frames(SQUARE, 0.5), array_frames(SQUARE, -2.0, seed=4)])
 
 
 @given(st.integers(0, 9), st.lists(st.integers(1, 25), max_size=8))
 @hypothesis.settings(max_examples=30, deadline=None)
 def test_frames_in_pieces_of_any_size_give_the_same_bits(first, sizes):
     frames = a_scene()[:90]
-    whole = finder(SQUARE)(frames, first)
+    full = finder(SQUARE)(frames, first)
     one, at, parts = finder(SQUARE), 0, []
     for size in [*sizes, len(frames)]:
         part = one(frames[at : at + size], first + at)
         parts.append(part._replace(places=part.places + at))
         at += size
-    for field, expected in zip(zip(*parts, strict=True), whole, strict=True):
+    for field, expected in zip(zip(*parts, strict=True), full, strict=True):
         np.testing.assert_array_equal(np.concatenate(field), expected)
-    assert ((whole.places + first) % BLOCK_FRAMES == 0).all()
-    assert len(whole.places) > 5
+    assert ((full.places + first) % BLOCK_FRAMES == 0).all()
+    assert len(full.places) > 5
 
 
 def test_a_restart_forgets_what_was_heard():
@@ -268,10 +268,10 @@ def test_segments_tell_whence_their_sound_came(array_log):
     logs = hearthlog.open_logs(array_log)
     came, spans = logs.directions(), logs.segments()
     assert len(came.azimuths) == len(spans.labels)
-    is_heard = came.counts > 0
-    assert is_heard.any()
+    is_recorded = came.counts > 0
+    assert is_recorded.any()
     early = spans.starts < START + 5_500_000_000
-    for rows, azimuth in ((is_heard & early, 0.5), (is_heard & ~early, -2.0)):
+    for rows, azimuth in ((is_recorded & early, 0.5), (is_recorded & ~early, -2.0)):
         assert degrees_between(came.azimuths[rows], azimuth).max() < 8
 
 

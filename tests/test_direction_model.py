@@ -11,7 +11,7 @@ import hypothesis
 import numpy as np
 import pytest
 import soundfile
-from arrays import SQUARE, heard
+from arrays import SQUARE, array_frames
 from hypothesis import given
 from hypothesis import strategies as st
 from logs import read
@@ -93,7 +93,9 @@ def model_path(tmp_path_factory):
 @cache
 def scene():
     parts = [(CORNER, 35, 1), (DOOR, 25, 4), (CORNER, 20, 5), (DOOR, 30, 6)]
-    return np.concatenate([heard(SQUARE, azimuth, length, seed) for azimuth, length, seed in parts])
+    return np.concatenate(
+        [array_frames(SQUARE, azimuth, length, seed) for azimuth, length, seed in parts]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +202,7 @@ def test_after_a_gap_nothing_is_left_of_the_directions_before_it(recorded):
 
 def test_a_model_that_takes_over_knows_the_directions_of_the_second_before(recorded):
     first = next(event for event in events(recorded) if isinstance(event, Features))
-    model, whole = taking(strong()), labels_of(taking(strong()), [first])
+    model, complete = taking(strong()), labels_of(taking(strong()), [first])
     general = load_model(starter_file(GENERAL))
     pipeline = Pipeline("mic", Classifier(general).feature_set, Classifier(general))
     messages = []
@@ -209,8 +211,8 @@ def test_a_model_that_takes_over_knows_the_directions_of_the_second_before(recor
             pipeline.change_model(model, Classifier(model), 118, int(part.stamps[0]))
         messages += pipeline.push_features(part.values, part.first, part.stamps, part.auxiliary)
     labels = [one.data for one in messages if one.topic == "/mic/label"]
-    assert labels[-100:] == whole[-100:]
-    assert labels[105:] == whole[105:]
+    assert labels[-100:] == complete[-100:]
+    assert labels[105:] == complete[105:]
 
 
 def test_states_begin_to_converge_once_a_second_of_directions_is_known(recorded, monkeypatch):
@@ -238,22 +240,22 @@ def of_blocks(blocks, seed):
 @hypothesis.settings(max_examples=40, deadline=None)
 def test_frames_in_pieces_of_any_size_give_the_same_evidence(blocks, sizes, seed):
     directions, weights = of_blocks(sorted(blocks), seed), strong()
-    whole = DirectionEvidence(weights).push(directions, 0, 100, 93)
+    complete = DirectionEvidence(weights).push(directions, 0, 100, 93)
     one, parts, at = DirectionEvidence(weights), [], 0
     for size in [*sizes, 100]:
         count = min(size, 100 - at)
         windows = min(max(at + count - 7, 0), count)
         parts.append(one.push(directions.known_at(at, count), at, count, windows))
         at += count
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    np.testing.assert_array_equal(np.concatenate(parts), complete)
 
 
 def test_evidence_is_the_mean_of_the_last_second_and_none_without_a_direction():
     directions, weights = of_blocks([10], 1), strong()
     evidence = DirectionEvidence(weights).push(directions, 0, 100, 100)
     known = 10 * BLOCK_FRAMES + BLOCK_FRAMES - 1
-    said = np.flatnonzero(evidence.any(axis=1))
-    assert said.tolist() == list(range(known, known + MEMORY_BLOCKS * BLOCK_FRAMES))
+    output = np.flatnonzero(evidence.any(axis=1))
+    assert output.tolist() == list(range(known, known + MEMORY_BLOCKS * BLOCK_FRAMES))
     np.testing.assert_allclose(evidence[known], weights[:, sectors_of(directions.azimuths)[0]])
 
 
@@ -261,8 +263,8 @@ def test_evidence_is_the_mean_of_the_last_second_and_none_without_a_direction():
 @hypothesis.settings(max_examples=40, deadline=None)
 def test_evidence_is_full_once_nothing_depends_on_what_was_before(blocks, first, seed):
     directions, weights = of_blocks(sorted(blocks), seed), strong()
-    whole, late = DirectionEvidence(weights), DirectionEvidence(weights)
-    expected = whole.push(directions, 0, 100, 100)
+    complete, late = DirectionEvidence(weights), DirectionEvidence(weights)
+    expected = complete.push(directions, 0, 100, 100)
     found = late.push(directions.known_at(first, 100 - first), first, 100 - first, 100 - first)
     full = next(frame for frame in range(first, 200) if late.is_full(frame))
     assert full <= first + 30
@@ -283,7 +285,7 @@ def taught(*marks):
     return with_directions(general, target, [one for _, one in marks])
 
 
-def told(*marks):
+def reported(*marks):
     """The weights that marks teach the starter model, by class."""
     model = taught(*marks)
     return dict(zip(model.classes, model.direction_weights[0], strict=True))
@@ -292,7 +294,7 @@ def told(*marks):
 def test_a_class_that_comes_from_a_corner_again_and_again_is_likelier_there_and_less_elsewhere():
     corner = [("music", seen(3, hour)) for hour in range(12)]
     about = [("speech", seen(3 * hour + 1, hour)) for hour in range(12)]
-    of = told(*corner, *about, *(("silence", seen(30, hour)) for hour in range(12)))
+    of = reported(*corner, *about, *(("silence", seen(30, hour)) for hour in range(12)))
     assert of["music"][3] > 0.5 > -2 > of["music"][20]
     assert of["speech"][3] < -2
     assert of["speech"][20] > 0.5
@@ -308,7 +310,7 @@ def test_what_was_heard_in_one_hour_alone_is_not_taken_to_come_from_there_always
 def test_many_marks_of_one_sound_are_one_sound():
     one, others = ("music", seen(3, 0)), [("speech", seen(9 * n, n)) for n in range(9)]
     others += [("music", seen(3 + n % 2, n)) for n in range(1, 9)]
-    np.testing.assert_equal(told(*[one] * 50, *others), told(one, *others))
+    np.testing.assert_equal(reported(*[one] * 50, *others), reported(one, *others))
 
 
 def test_marks_are_compared_by_whence_they_came_too():

@@ -103,8 +103,8 @@ def as_json(hearthlog, *arguments):
 
 def test_the_lock_of_the_groups_is_not_taken_for_a_recorder(grouped_home):
     assert (grouped_home / ".groups.safetensors.lock").exists()
-    told = [state.text for state in examine_live(grouped_home) if state.subject == "recorder"]
-    assert told == [f"nothing was ever recorded in {grouped_home}"]
+    reported = [state.text for state in examine_live(grouped_home) if state.subject == "recorder"]
+    assert reported == [f"nothing was ever recorded in {grouped_home}"]
 
 
 def test_each_sound_that_recurs_is_a_group_of_its_own(two_days):
@@ -152,10 +152,10 @@ def test_a_group_gets_a_name_and_each_of_its_sounds_a_mark_which_undo_takes_back
     )
     marks = [mark for log in logs_of(home) for mark in read_marks(log)]
     assert own in marks
-    said = [mark for mark in marks if mark != own]
+    output = [mark for mark in marks if mark != own]
     reason = f"group {largest['number']} of {load_groups(home / GROUPS.file).id}"
-    assert {mark[3:5] + mark[6:] for mark in said} == {("front_door", "Anna", "live", reason)}
-    assert len(said) == count
+    assert {mark[3:5] + mark[6:] for mark in output} == {("front_door", "Anna", "live", reason)}
+    assert len(output) == count
     assert as_json(hearthlog, home)["groups"][0]["name"] == "front_door"
     done = run(hearthlog, home, "--undo", largest["number"])
     assert f"{count} marks taken back" in done.stderr
@@ -211,15 +211,15 @@ main()
 
 
 def test_a_box_without_the_analyzer_names_what_another_one_has_grouped(grouped_home):
-    for asked, status, says in (
+    for requested, status, states in (
         (["--name", "1=dish"], 0, "marks of dish"),
         (["--undo", "1"], 0, "marks taken back"),
         ([], 1, "scikit-learn is not installed; try: "),
     ):
-        arguments = [sys.executable, "-c", _WITHOUT, "discover", grouped_home, *asked]
+        arguments = [sys.executable, "-c", _WITHOUT, "discover", grouped_home, *requested]
         done = subprocess.run(arguments, capture_output=True, text=True, timeout=500, check=False)
         assert done.returncode == status, done.stderr
-        assert says in done.stderr
+        assert states in done.stderr
 
 
 def test_a_name_adds_no_group(grouped_home, hearthlog):
@@ -370,7 +370,7 @@ def test_only_what_the_model_does_not_know_is_grouped_if_that_is_asked_for(two_d
 
 
 @pytest.mark.parametrize(
-    ("options", "status", "says"),
+    ("options", "status", "states"),
     [
         (["--name", "1=silence"], 2, "give the number of a group and a class"),
         (["--name", f"{'9' * 5000}=door"], 2, "give the number of a group and a class"),
@@ -379,10 +379,10 @@ def test_only_what_the_model_does_not_know_is_grouped_if_that_is_asked_for(two_d
         (["--end", "2026-01-01"], 1, "no log has features and labels"),
     ],
 )
-def test_what_makes_no_sense_is_one_line(home, hearthlog, options, status, says):
+def test_what_makes_no_sense_is_one_line(home, hearthlog, options, status, states):
     done = hearthlog("discover", home, *options)
     assert done.returncode == status
-    assert says in done.stderr
+    assert states in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (home / GROUPS.file).exists()
 
@@ -409,13 +409,13 @@ def test_a_damaged_file_of_groups_is_one_line_or_a_file_of_groups(groups_file, d
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     path = groups_file.with_name("damaged")
     path.write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
-    said = f"{path}: is well"
+    output = f"{path}: is well"
     try:
         assert np.isfinite(load_groups(path).space.examples).all()
     except DataError as error:
-        said = str(error)
-    assert said.startswith(f"{path}: is ")
-    assert "\n" not in said
+        output = str(error)
+    assert output.startswith(f"{path}: is ")
+    assert "\n" not in output
 
 
 @pytest.mark.parametrize(
@@ -470,10 +470,10 @@ def test_descriptions_are_the_same_in_blocks_of_any_size(monkeypatch):
     values = rng.normal(size=(5000, 3)).astype(np.float32)
     names, first = ("energy", "centroid", "rolloff"), np.arange(0, 4800, 60)
     last = first + rng.integers(4, 60, len(first))
-    whole = describe(values, names, first, last)
+    full = describe(values, names, first, last)
     for size in (1, 100, 1 << 30):
         monkeypatch.setattr(groups, "_DESCRIBED_AT_ONCE", size)
-        assert np.array_equal(describe(values, names, first, last), whole)
+        assert np.array_equal(describe(values, names, first, last), full)
 
 
 def test_a_description_is_what_it_says():

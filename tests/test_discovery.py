@@ -47,9 +47,9 @@ def payload(classes, gone=(), *, topics=HOME, microphone="mic"):
 
 
 def test_the_payload_is_the_one_that_home_assistant_has_taken():
-    told = payload(load_model(Path("general")).classes)
-    told["origin"]["sw_version"] = "VERSION"
-    assert told == json.loads(ACCEPTED.read_text()), (
+    reported = payload(load_model(Path("general")).classes)
+    reported["origin"]["sw_version"] = "VERSION"
+    assert reported == json.loads(ACCEPTED.read_text()), (
         "if that is meant: have .ci/home-assistant pass, and then store the new payload"
     )
 
@@ -69,8 +69,8 @@ def test_every_class_has_a_switch_of_its_own_and_one_that_is_gone_has_none():
     switches = [each for each in components.values() if each["p"] == "switch"]
     assert len({each["unique_id"] for each in switches}) == len(switches) == len(HOSTILE) - 1
     assert len({each["name"] for each in switches}) == len(switches)
-    told = [json.loads(each["payload_off"])["label"] for each in switches]
-    assert sorted(told) == sorted({*HOSTILE} - {"silence"})
+    reported = [json.loads(each["payload_off"])["label"] for each in switches]
+    assert sorted(reported) == sorted({*HOSTILE} - {"silence"})
     assert home_id("home") not in {device_id("home", name) for name in HOSTILE}
 
 
@@ -112,14 +112,14 @@ def test_a_text_can_be_told_from_its_identifier():
 
 def test_a_class_that_went_is_named_with_nothing_but_its_platform():
     before, now = payload(["silence", "coughing", "music"]), payload(["silence", "music"])
-    told = payload(["silence", "music"], ["coughing"])
+    reported = payload(["silence", "music"], ["coughing"])
     removed = {
         key: {"p": component["p"]}
         for key, component in before["components"].items()
         if key not in now["components"]
     }
     assert len(removed) == 5
-    assert told["components"] == now["components"] | removed
+    assert reported["components"] == now["components"] | removed
 
 
 def test_a_class_whose_name_looks_like_a_template_is_taken_as_it_is():

@@ -93,9 +93,9 @@ def test_a_disk_that_fails_for_a_while_loses_nothing(settings, monkeypatch, oper
     assert not errors(settings.output)
     assert not list(settings.output.rglob("*.active"))
     # Once, or anew at each file that could not be completed.
-    said = [m.msg for m in read(settings.output, "rosout") if "held in memory" in m.msg]
-    assert said
-    assert all("Input/output error" in line for line in said)
+    output = [m.msg for m in read(settings.output, "rosout") if "held in memory" in m.msg]
+    assert output
+    assert all("Input/output error" in line for line in output)
 
 
 @pytest.mark.usefixtures("at_once")
@@ -156,13 +156,13 @@ def small_disk(tmp_path):
 def wait_for_text(process, text, seconds=120):
     """Wait for a line on standard error."""
     deadline = time.monotonic() + seconds
-    said = ""
+    output = ""
     while time.monotonic() < deadline:
         if select.select([process.stderr], [], [], 0.5)[0]:
-            said += os.read(process.stderr.fileno(), 65536).decode()
-        if text in said:
+            output += os.read(process.stderr.fileno(), 65536).decode()
+        if text in output:
             return
-    pytest.fail(f"{text!r} was not said, but {said!r}")
+    pytest.fail(f"{text!r} was not said, but {output!r}")
 
 
 def test_a_disk_that_was_full_is_written_again_when_there_is_room(labmic, small_disk):

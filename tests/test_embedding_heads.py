@@ -81,14 +81,14 @@ def inputs_of(model, count, seed=3):
 def test_a_window_says_the_same_to_the_bit_whatever_is_computed_with_it():
     heads = Classifier(with_heads()).embedding_heads
     values = windows(5000)
-    whole = heads.log_probabilities(values)
-    assert (whole[:, list(plain().classes).index("silence")] == 0).all()
+    full = heads.log_probabilities(values)
+    assert (full[:, list(plain().classes).index("silence")] == 0).all()
     for size in (1, 7, 300):
         some = values[:600]
         parts = [heads.log_probabilities(some[i : i + size]) for i in range(0, len(some), size)]
-        np.testing.assert_array_equal(np.concatenate(parts), whole[:600])
+        np.testing.assert_array_equal(np.concatenate(parts), full[:600])
     order = RNG(5).permutation(len(values))
-    np.testing.assert_array_equal(heads.log_probabilities(values[order]), whole[order])
+    np.testing.assert_array_equal(heads.log_probabilities(values[order]), full[order])
 
 
 def test_sums_of_the_largest_weights_are_exact():
@@ -107,9 +107,9 @@ def test_sums_of_the_largest_weights_are_exact():
 
 def test_no_head_has_a_veto():
     heads = Classifier(with_heads()).embedding_heads
-    said = heads.log_probabilities(windows(500))
-    assert said.min() >= np.log(1e-4) * 2.5 - 1e-3
-    assert said.max() <= 2.5 * 1e-3
+    output = heads.log_probabilities(windows(500))
+    assert output.min() >= np.log(1e-4) * 2.5 - 1e-3
+    assert output.max() <= 2.5 * 1e-3
 
 
 def test_heads_share_what_silence_leaves_and_leave_silence_as_it_is():
@@ -117,15 +117,15 @@ def test_heads_share_what_silence_leaves_and_leave_silence_as_it_is():
     classifier, alone = Classifier(model), Classifier(plain())
     inputs = inputs_of(model, count)
     before, _ = alone.classify(inputs)
-    said = classifier.embedding_heads.log_probabilities(windows(count))
-    after, novelty = classifier.classify(inputs, None, said)
+    output = classifier.embedding_heads.log_probabilities(windows(count))
+    after, novelty = classifier.classify(inputs, None, output)
     silence = classifier.classes.index("silence")
     np.testing.assert_allclose(after[:, silence], before[:, silence], atol=2**-15)
     np.testing.assert_allclose(after.sum(axis=1), 1.0, atol=1e-3)
     sounds = np.delete(np.arange(len(classifier.classes)), silence)
     of_machine = before[:, sounds].astype(float)
     of_machine = np.log(of_machine / of_machine.sum(axis=1, keepdims=True) + 1e-4)
-    mean = (0.75 * of_machine + said[:, sounds]) / mix_weight(model.description.embedding)
+    mean = (0.75 * of_machine + output[:, sounds]) / mix_weight(model.description.embedding)
     expected = np.exp(1.4 * mean)
     expected *= (1 - before[:, [silence]]) / expected.sum(axis=1, keepdims=True)
     np.testing.assert_allclose(after[:, sounds], expected, atol=2e-2)
@@ -137,18 +137,18 @@ def test_where_heads_say_nothing_labels_are_as_without_them_to_the_bit():
     model, count = with_heads(), 600
     classifier, alone = Classifier(model), Classifier(plain())
     inputs = inputs_of(model, count)
-    said = classifier.embedding_heads.log_probabilities(windows(count))
-    said[::3] = np.nan
-    mixed, _ = classifier.classify(inputs, None, said)
+    output = classifier.embedding_heads.log_probabilities(windows(count))
+    output[::3] = np.nan
+    mixed, _ = classifier.classify(inputs, None, output)
     silent, _ = alone.classify(inputs)
     np.testing.assert_array_equal(mixed[::3], silent[::3])
     assert (mixed[1::3] != silent[1::3]).any(axis=1).mean() > 0.9
     np.testing.assert_array_equal(classifier.classify(inputs)[0], silent)
-    evidence = RNG(9).normal(size=said.shape)
+    evidence = RNG(9).normal(size=output.shape)
     for rows in (slice(0, 1), slice(5, 9), slice(250, 270)):
-        some, _ = classifier.classify(inputs[rows], evidence[rows], said[rows])
-        whole, _ = classifier.classify(inputs, evidence, said)
-        np.testing.assert_array_equal(some, whole[rows])
+        some, _ = classifier.classify(inputs[rows], evidence[rows], output[rows])
+        full, _ = classifier.classify(inputs, evidence, output)
+        np.testing.assert_array_equal(some, full[rows])
 
 
 def test_a_model_with_heads_is_saved_and_loaded_and_its_card_names_the_network(tmp_path):

@@ -53,7 +53,7 @@ COLLECTIONS = 4
 CLASSES = ("silence", "speech", "music", "coughing")
 
 
-def heard_as(target, classes, rng, noise=30.0):
+def labelled_as(target, classes, rng, noise=30.0):
     """Windows of classes that lie apart in the components, and in their groups of names."""
     centres = np.random.default_rng(5).normal(0, 6, (classes, WIDTH))
     values = centres[target] + rng.normal(0, noise, (len(target), WIDTH))
@@ -75,10 +75,10 @@ def made_up(classes=4, count=48):
         collection=collection,
         collection_names=tuple(f"collection {number}" for number in range(COLLECTIONS)),
         collections={(f"collection {number}", "CC0"): 6 for number in range(COLLECTIONS)},
-        embedded=heard_as(data.target, classes, rng),
+        embedded=labelled_as(data.target, classes, rng),
         is_embedded=np.ones(len(data), bool),
         embedding_windows=EmbeddingWindows(
-            heard_as(data.target[rows], classes, rng),
+            labelled_as(data.target[rows], classes, rng),
             data.target[rows],
             data.group[rows],
             collection[rows],
@@ -98,17 +98,17 @@ def learned():
     return train_model(data, scenario_of(data), ignore_progress, EMBEDDING)
 
 
-def said_of(model, data):
+def output_of(model, data):
     """What a model says of segments: of which class, and how sure it is."""
     classifier = Classifier(model)
     inputs = of_segments(classifier.inputs, data.windows, data.floor)[:, 0]
-    said = classifier.embedding_heads.log_probabilities(data.embedded)
-    return classifier.classify(np.ascontiguousarray(inputs), None, said)[0]
+    output = classifier.embedding_heads.log_probabilities(data.embedded)
+    return classifier.classify(np.ascontiguousarray(inputs), None, output)[0]
 
 
 def sounds_of(model, data):
     """Of which class of sound segments are, silence left aside."""
-    return 1 + said_of(model, data)[:, 1:].argmax(axis=1)
+    return 1 + output_of(model, data)[:, 1:].argmax(axis=1)
 
 
 def test_metrics_and_scores_elsewhere_are_those_of_the_mix():
@@ -143,7 +143,7 @@ def test_the_same_segments_give_the_same_model(tmp_path):
     save_model(train_model(data, scenario_of(data), ignore_progress, EMBEDDING), paths[1])
     assert paths[0].read_bytes() == paths[1].read_bytes()
     loaded = load_model(paths[0])
-    np.testing.assert_array_equal(said_of(loaded, data), said_of(learned(), data))
+    np.testing.assert_array_equal(output_of(loaded, data), output_of(learned(), data))
 
 
 def test_what_is_left_out_is_not_learned_from():
@@ -166,9 +166,9 @@ def test_a_class_of_hardly_any_source_is_left_to_others():
     assert not heads.weights[..., 3].any()
     assert (heads.bias[:, 3] == UNTAUGHT).all()
     mix = learned().description.embedding
-    said = EmbeddingHeads(mix, *heads, data.classes).log_probabilities(data.embedded)
-    assert np.ptp(said[:, 3]) < 1e-6
-    assert np.log(1e-4) < said[0, 3] < 0
+    output = EmbeddingHeads(mix, *heads, data.classes).log_probabilities(data.embedded)
+    assert np.ptp(output[:, 3]) < 1e-6
+    assert np.log(1e-4) < output[0, 3] < 0
 
 
 def test_names_are_mixed_in_where_a_class_has_hardly_any_source():
@@ -191,7 +191,7 @@ def bathroom(noise):
     rng = np.random.default_rng(17)
 
     def with_names(target):
-        values = heard_as(target, len(names), rng, noise=3)
+        values = labelled_as(target, len(names), rng, noise=3)
         values[:, first:] = -40
         values[np.arange(len(values)), own[target]] = 40
         drawn = values[:, first:] + rng.normal(0, noise, values[:, first:].shape)
@@ -245,7 +245,7 @@ def home_of(model, count, new="", seed=11):
     sounds = np.where(sounds == 1, 2, sounds)  # speech like music
     shift = np.zeros((len(target), WIDTH))
     shift[target == 1] = np.random.default_rng(13).normal(0, 12, WIDTH)
-    embedded = heard_as(sounds, 4, rng).astype(float) + shift
+    embedded = labelled_as(sounds, 4, rng).astype(float) + shift
     embedded = np.clip(np.rint(embedded), -127, 127).astype(np.int8)
     source = rng.permutation(np.flatnonzero(base.target > 0))[: len(target)]
     collection = np.zeros(len(target), np.intp)
@@ -292,7 +292,7 @@ def test_marks_of_a_home_move_the_heads_and_what_is_not_marked_stays(tmp_path):
     assert adapted.description.format == FORMAT_OF_EMBEDDINGS
     path = tmp_path / "home.safetensors"
     save_model(adapted, path)
-    np.testing.assert_array_equal(said_of(load_model(path), tried), said_of(adapted, tried))
+    np.testing.assert_array_equal(output_of(load_model(path), tried), output_of(adapted, tried))
 
 
 def test_adapted_again_it_is_as_adapted_once():
@@ -375,29 +375,29 @@ def tone(seconds, seed=1):
 
 def test_windows_of_a_clip_are_those_that_a_home_gives():
     network = Levels()
-    heard = clip_embeddings(tone(3.0), network, np.array([0, 10, 20]), silence=False)
-    assert np.bincount(heard.version).tolist() == [13, 7, 4]
-    assert heard.starts[heard.version == AS_IT_IS].tolist() == list(range(-10, 55, 5))
-    [half] = heard.at(-10)
+    recorded = clip_embeddings(tone(3.0), network, np.array([0, 10, 20]), silence=False)
+    assert np.bincount(recorded.version).tolist() == [13, 7, 4]
+    assert recorded.starts[recorded.version == AS_IT_IS].tolist() == list(range(-10, 55, 5))
+    [half] = recorded.at(-10)
     assert half[0] < half[2] - 40  # nothing was before the clip
-    assert heard.taught.all()
-    assert {*heard.version} == {AS_IT_IS, IN_A_ROOM, SHORT}
+    assert recorded.taught.all()
+    assert {*recorded.version} == {AS_IT_IS, IN_A_ROOM, SHORT}
     again = clip_embeddings(tone(3.0), Levels(), np.array([0, 10, 20]), silence=False)
-    for one, other in zip(heard, again, strict=True):
+    for one, other in zip(recorded, again, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("seconds", [0.05, 0.3, 0.95, 1.0])
 def test_a_short_clip_teaches_the_windows_that_it_fills_as_well_as_it_can(seconds):
-    heard = clip_embeddings(tone(seconds), Levels(), np.empty(0, np.intp), silence=False)
-    assert (heard.version == AS_IT_IS).sum() >= 1
-    assert (heard.version == SHORT).sum() == 4
+    recorded = clip_embeddings(tone(seconds), Levels(), np.empty(0, np.intp), silence=False)
+    assert (recorded.version == AS_IT_IS).sum() >= 1
+    assert (recorded.version == SHORT).sum() == 4
 
 
 def test_of_silence_only_the_segments_are_heard():
-    heard = clip_embeddings(tone(3.0), Levels(), np.array([0, 40]), silence=True)
-    assert heard.starts.tolist() == [0, 40]
-    assert not heard.taught.any()
+    recorded = clip_embeddings(tone(3.0), Levels(), np.array([0, 40]), silence=True)
+    assert recorded.starts.tolist() == [0, 40]
+    assert not recorded.taught.any()
     nothing = clip_embeddings(tone(0.5), Levels(), np.empty(0, np.intp), silence=True)
     assert nothing.values.shape == (0, 3)
 
@@ -417,24 +417,24 @@ def test_another_seed_hears_a_clip_in_another_room():
     first, again, other = Levels(), Levels(), Levels()
     for network, seed in ((first, 0), (again, 0), (other, 1)):
         ClipEmbedder(network, seed)(tone(2.0), np.array([0]), silence=False)
-    heard = [np.concatenate(one.windows) for one in (first, again, other)]
-    np.testing.assert_array_equal(heard[0], heard[1])
-    assert not np.array_equal(heard[0], heard[2])
+    recorded = [np.concatenate(one.windows) for one in (first, again, other)]
+    np.testing.assert_array_equal(recorded[0], recorded[1])
+    assert not np.array_equal(recorded[0], recorded[2])
 
 
 def test_segments_take_the_window_that_is_nearest():
-    heard = clip_embeddings(tone(3.0), Levels(), np.array([0, 10, 20]), silence=False)
-    assert len(heard.at(10)) == 1
-    np.testing.assert_array_equal(heard.at(12), heard.at(10))
-    assert not len(heard.at(200))
+    recorded = clip_embeddings(tone(3.0), Levels(), np.array([0, 10, 20]), silence=False)
+    assert len(recorded.at(10)) == 1
+    np.testing.assert_array_equal(recorded.at(12), recorded.at(10))
+    assert not len(recorded.at(200))
     features = ROOM.features
     frames = tone(3.0)
-    recording = Recording("speech", "one", "a", "", features.extractor()(frames), embedded=heard)
+    recording = Recording("speech", "one", "a", "", features.extractor()(frames), embedded=recorded)
     scenario = Scenario("made up", {name: (name,) for name in CLASSES})
     data = cut_recordings([recording], scenario, features)
     assert data.is_embedded.all()
-    assert len(data.embedding_windows.target) == len(heard.version)
-    assert data.embedding_windows.tried.sum() == (heard.version == AS_IT_IS).sum()
+    assert len(data.embedding_windows.target) == len(recorded.version)
+    assert data.embedding_windows.tried.sum() == (recorded.version == AS_IT_IS).sum()
 
 
 def test_without_the_network_the_method_says_what_to_fetch(monkeypatch):

@@ -87,11 +87,11 @@ def embeddings_at(*frames):
 def test_windows_begin_at_tens_of_frames_and_are_the_same_in_pieces_of_any_size(first, sizes):
     frames = np.random.default_rng(first).uniform(-1, 1, (120, FRAME_SAMPLES)).astype(np.float32)
     sound = np.ones(120, bool)
-    whole = pushed(EmbeddingStream(Doubling()), frames, sound, first, (len(frames),))
-    assert same(whole, pushed(EmbeddingStream(Doubling()), frames, sound, first, sizes))
+    full = pushed(EmbeddingStream(Doubling()), frames, sound, first, (len(frames),))
+    assert same(full, pushed(EmbeddingStream(Doubling()), frames, sound, first, sizes))
     begins = [n for n in range(first, first + 120 - WINDOW_FRAMES + 1) if n % 10 == 0]
-    assert whole.frames.tolist() == begins
-    assert whole.stamps.tolist() == [START + n * FRAME_NANOSECONDS for n in begins]
+    assert full.frames.tolist() == begins
+    assert full.stamps.tolist() == [START + n * FRAME_NANOSECONDS for n in begins]
 
 
 def test_only_windows_with_sound_within_half_a_second_of_their_middle_are_embedded():
@@ -165,13 +165,13 @@ def test_a_restart_embeds_no_window_from_both_sides():
 def test_frames_between_two_windows_have_both_in_proportion_and_others_the_only_one():
     evidence = EmbeddingEvidence(as_they_are, 2)
     evidence.push(embeddings_at(0, 10, 40), 0)
-    said = evidence.at(0, 70)
-    np.testing.assert_allclose(said[10:20, 0], np.arange(10) + 0.5)  # from 0 at 10 to 10 at 20
-    np.testing.assert_allclose(said[0:10, 0], 0.0)  # before the middle of the first window
-    np.testing.assert_allclose(said[20:30, 0], 10.0)
-    assert np.isnan(said[30:40]).all()
-    np.testing.assert_allclose(said[40:60, 0], 40.0)
-    assert np.isnan(said[60:]).all()
+    output = evidence.at(0, 70)
+    np.testing.assert_allclose(output[10:20, 0], np.arange(10) + 0.5)  # from 0 at 10 to 10 at 20
+    np.testing.assert_allclose(output[0:10, 0], 0.0)  # before the middle of the first window
+    np.testing.assert_allclose(output[20:30, 0], 10.0)
+    assert np.isnan(output[30:40]).all()
+    np.testing.assert_allclose(output[40:60, 0], 40.0)
+    assert np.isnan(output[60:]).all()
 
 
 def test_names_around_a_frame_count_as_the_higher_of_the_two_windows():
@@ -187,9 +187,9 @@ def test_names_around_a_frame_count_as_the_higher_of_the_two_windows():
 @pytest.mark.parametrize("step", [1, 7, 30])
 def test_what_is_said_of_frames_is_the_same_in_pieces_of_any_size(step):
     embeddings = embeddings_at(*range(0, 300, 10))
-    whole = EmbeddingEvidence(as_they_are, 2)
-    whole.push(embeddings, 0)
-    expected = whole.at(0, 300)
+    full = EmbeddingEvidence(as_they_are, 2)
+    full.push(embeddings, 0)
+    expected = full.at(0, 300)
     parts, pieces = EmbeddingEvidence(as_they_are, 2), []
     for first in range(0, 300, step):
         parts.push(embeddings.known_at(first, step), first)
@@ -203,13 +203,13 @@ def test_private_frames_are_those_of_labels_that_wait_for_embeddings_too():
     """The same frames are private, whether a label is known at once or sixteen frames later."""
     from test_privacy_filter import labels_of  # noqa: PLC0415  its labels of speech
 
-    said = np.zeros(200, np.float32)
-    said[80:85] = 0.9
+    output = np.zeros(200, np.float32)
+    output[80:85] = 0.9
     at_once = PrivateFrames(["speech"], 20)
-    early = np.concatenate([at_once.push(200, labels_of(said)), at_once.close()])
+    early = np.concatenate([at_once.push(200, labels_of(output)), at_once.close()])
     waiting, late = PrivateFrames(["speech"], 20, 19), []
     for frame in range(200):
-        known = labels_of(said[frame - 16 : frame - 15]) if frame >= 16 else None
+        known = labels_of(output[frame - 16 : frame - 15]) if frame >= 16 else None
         late.append(waiting.push(1, None if known is None else known._replace(ahead=16)))
     late = np.concatenate([*late, waiting.close()])
     count = 200 - 16 - 39  # beside the end: unlabelled
@@ -218,11 +218,11 @@ def test_private_frames_are_those_of_labels_that_wait_for_embeddings_too():
     assert not early[20:50].any()
 
 
-def private_frames(said, logit, *, elsewhere=True):
+def private_frames(output, logit, *, elsewhere=True):
     """Which of 100 frames are private, of one probability of speech and one logit of its names."""
     from test_privacy_filter import labels_of  # noqa: PLC0415  its labels of speech
 
-    labels = labels_of(np.full(100, said, np.float32))
+    labels = labels_of(np.full(100, output, np.float32))
     names = np.full(labels.probabilities.shape, logit)
     guard = PrivateFrames(["speech"], 20)
     decided = guard.push(100, labels._replace(by_names=names, calibrated_elsewhere=elsewhere))
@@ -230,7 +230,7 @@ def private_frames(said, logit, *, elsewhere=True):
 
 
 @pytest.mark.parametrize(
-    ("said", "logit", "elsewhere", "private"),
+    ("output", "logit", "elsewhere", "private"),
     [
         (0.0, PRIVATE_LOGIT, True, True),  # the network alone may forbid
         (0.0, PRIVATE_LOGIT - 0.25, True, False),
@@ -243,9 +243,9 @@ def private_frames(said, logit, *, elsewhere=True):
     ],
 )
 def test_names_of_a_network_forbid_and_where_they_do_not_features_may_be_less_sure(
-    said, logit, elsewhere, private
+    output, logit, elsewhere, private
 ):
-    decided = private_frames(said, logit, elsewhere=elsewhere)
+    decided = private_frames(output, logit, elsewhere=elsewhere)
     assert len(decided)
     assert (decided == private).all()
 

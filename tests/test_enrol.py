@@ -67,8 +67,8 @@ def features_of(path, seconds):
 def check_marked(log, label, seconds):
     """All of the log has one mark."""
     (mark,) = read_marks(log)
-    heard = find_coverage(log)["mic"]
-    assert (mark.label, mark.start, mark.end) == (label, heard.starts[0], heard.ends[0])
+    labelled = find_coverage(log)["mic"]
+    assert (mark.label, mark.start, mark.end) == (label, labelled.starts[0], labelled.ends[0])
     assert mark.end - mark.start == pytest.approx(seconds * NANOSECONDS, abs=1e6)
 
 
@@ -141,15 +141,15 @@ def test_many_files_in_a_moment_become_logs_that_do_not_overlap(hearthlog, cough
 
 
 def test_a_span_of_logs_is_enrolled_as_it_was_recorded(hearthlog, recorded, home):
-    heard = find_coverage(recorded)["mic"]
-    border = heard.starts[1]
+    labelled = find_coverage(recorded)["mic"]
+    border = labelled.starts[1]
     start, end = (np.datetime64(border + n * 10**9, "ns") for n in (-2, 3))
     command = ("enrol", "speech", "--home", home, "--log", recorded, "--start", start, "--end", end)
     result = hearthlog(*command)
     (log,) = enrolled(home)
     assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout == f"{log}: 5.00 s of speech\n"
-    wanted = read_columns(heard.logs, {FEATURES}, int(start.astype(int)), int(end.astype(int)))
+    wanted = read_columns(labelled.logs, {FEATURES}, int(start.astype(int)), int(end.astype(int)))
     assert np.array_equal(values(log), wanted[FEATURES]["values"])
     assert set(read_columns([log])) == {FEATURES, topic("mic", "info")}
     check_marked(log, "speech", 5)

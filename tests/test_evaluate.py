@@ -311,12 +311,12 @@ def test_frames_are_counted_as_if_each_were_looked_at(seed):
     start = max(found.starts[0], reference.starts[0])
     end = min(found.ends[-1], reference.ends[-1])
     middles = start + FRAME // 2 + FRAME * np.arange((end - start + FRAME // 2 - 1) // FRAME)
-    true, said = (
+    true, output = (
         each.labels[np.searchsorted(each.starts, middles, "right") - 1]
         for each in (reference, found)
     )
     known = true != "doorbell"
-    expected = confusion_matrix(true[known], said[known], labels=CLASSES)
+    expected = confusion_matrix(true[known], output[known], labels=CLASSES)
     assert result.scores.confusion == expected.tolist()
 
 
@@ -447,12 +447,12 @@ def test_bad_references_are_one_line(recorded, tmp_path, hearthlog):
         "nonsense\n": "labels.txt:1",
         "": "holds no labels",
     }
-    for text, said in cases.items():
+    for text, output in cases.items():
         track = tmp_path / "labels.txt"
         track.write_text(text)
         result = hearthlog("evaluate", "log", log, "--reference", track)
         assert result.returncode == 1
-        assert said in result.stderr
+        assert output in result.stderr
         assert result.stderr.count("\n") == 1
     track.write_text("0\t5\tspeech\n5\t9\tdoorbell\n")
     result = hearthlog("evaluate", "log", log, "--reference", track)
@@ -480,10 +480,10 @@ def test_wrong_use_is_refused_before_anything_is_read(tmp_path, hearthlog):
         (("model", "m.safetensors", "--data", "d"), 1, "no such model file"),
         (("method", "--data", "d", "--scenario", "general", "--plot", "p.pdf"), 2, "*.png"),
     )
-    for words, status, said in cases:
+    for words, status, output in cases:
         result = hearthlog("evaluate", *words)
         assert result.returncode == status
-        assert said in result.stderr
+        assert output in result.stderr
 
 
 def clip_and_log(model_file, day, tmp_path, hearthlog, *smoothing):
@@ -516,8 +516,8 @@ def test_clips_are_labelled_as_the_recorder_labels_them(
     method, day, second_file, tmp_path, hearthlog
 ):
     smoothing = Smoothing(method=method, lag_seconds=3.0, reach_seconds=0.6, shortest_seconds=0.25)
-    asked = ("smoothing", smoothing)
-    of_clip, of_log = clip_and_log(second_file, day, tmp_path, hearthlog, asked)
+    requested = ("smoothing", smoothing)
+    of_clip, of_log = clip_and_log(second_file, day, tmp_path, hearthlog, requested)
     assert (of_clip["evaluated_seconds"], of_log["evaluated_seconds"]) == (184.0, 183.5)
     clip, log = (one["event_based"]["per_class"] for one in (of_clip, of_log))
     assert {**clip, "silence": None} == {**log, "silence": None}

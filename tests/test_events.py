@@ -174,7 +174,7 @@ def test_a_sound_that_two_rooms_hear_is_one_and_names_both(home, hearthlog):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output"),
     [
         (["--label", "cugh"], "no class 'cugh' in these logs; there is coughing"),
         (["--day", "2026-04-01"], "no logs of 2026-04-01"),
@@ -185,10 +185,10 @@ def test_a_sound_that_two_rooms_hear_is_one_and_names_both(home, hearthlog):
         (["--play", "--json"], "--play and --json exclude each other"),
     ],
 )
-def test_bad_input_is_one_line(home, hearthlog, words, said):
+def test_bad_input_is_one_line(home, hearthlog, words, output):
     result = hearthlog("events", home, *words)
     assert result.returncode in {1, 2}
-    assert said in result.stderr
+    assert output in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert not result.stdout
 

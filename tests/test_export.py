@@ -609,21 +609,21 @@ def test_a_rosbag2_folder_is_opened_by_rosbags(recorded, exported):
 def test_a_folder_of_logs_is_a_bag_as_it_lies(recorded, hearthlog, tmp_path):
     logs = tmp_path / "logs"
     shutil.copytree(recorded, logs)
-    whole = find_logs(logs)
-    cut = whole[0].with_name("home_20300101T000000Z.mcap.active")
-    cut.write_bytes(whole[0].read_bytes()[:-1000])
+    full = find_logs(logs)
+    cut = full[0].with_name("home_20300101T000000Z.mcap.active")
+    cut.write_bytes(full[0].read_bytes()[:-1000])
     result = hearthlog("export", logs, "--format", "rosbag2", "--in-place")
     assert (result.returncode, result.stdout) == (3, f"{logs / 'metadata.yaml'}\n")
     assert result.stderr == f"hearthlog: not in the bag, because it is unfinished: {cut}\n"
-    (day,) = {log.parent for log in whole}
+    (day,) = {log.parent for log in full}
     cut.unlink()
     assert not hearthlog("export", day, "--format", "rosbag2", "--in-place").returncode
-    expected = sorted(row for log in whole for row in raw_messages(log))
+    expected = sorted(row for log in full for row in raw_messages(log))
     with rosbag2.Reader(day) as bag:
         assert bag.message_count == len(expected) == len(list(bag.messages()))
     text = (logs / "metadata.yaml").read_text()
     bag = json.loads(text.removeprefix("rosbag2_bagfile_information: "))
-    assert [logs / name for name in bag["relative_file_paths"]] == whole
+    assert [logs / name for name in bag["relative_file_paths"]] == full
     assert bag["message_count"] == sum(file["message_count"] for file in bag["files"])
 
 
@@ -748,13 +748,13 @@ def test_a_ros_1_bag_that_would_need_two_definitions_leaves_one_out(hearthlog, t
 
 def test_one_bad_topic_or_message_is_left_out_of_every_format(hearthlog, tmp_path):
     good = "std_msgs/msg/Int32", "int32 data\n", struct.pack("<i", 5)
-    whole = changing(tmp_path / "1.mcap", good, (*good[:2], b"\5"), topic="/good")
+    full = changing(tmp_path / "1.mcap", good, (*good[:2], b"\5"), topic="/good")
     bad = changing(tmp_path / "2.mcap", ("my_msgs/msg/Secret", "", b"abcd"), topic="/bad")
     for form in ("parquet", "csv", "npz", "bag"):
         output = tmp_path / (f"x.{form}" if form == "bag" else form)
         options = () if form == "bag" else ("--format", form)
         (logs := tmp_path / f"logs-{form}").mkdir()
-        for log in (whole, bad):
+        for log in (full, bad):
             shutil.copy(log, logs)
         result = hearthlog("export", logs, "-o", output, *options)
         assert (result.returncode, result.stderr.count("\n")) == (3, 2)

@@ -33,8 +33,8 @@ def installed(tmp_path_factory) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def trained(installed, tmp_path_factory, training_set) -> Path:
     model = tmp_path_factory.mktemp("octaves") / "octaves.safetensors"
-    asked = ["--data", training_set, "--scenario", "bathroom", "--method", "nearest-octaves"]
-    done = command(installed, "train", *asked, "-o", model)
+    requested = ["--data", training_set, "--scenario", "bathroom", "--method", "nearest-octaves"]
+    done = command(installed, "train", *requested, "-o", model)
     assert done.returncode == 0, done.stderr
     assert "macro F1" in done.stdout
     return model
@@ -44,8 +44,8 @@ def trained(installed, tmp_path_factory, training_set) -> Path:
 def logs(installed, trained, day, tmp_path_factory) -> Path:
     """The day, labelled by a model of the example."""
     folder = tmp_path_factory.mktemp("logs")
-    asked = ["--model", trained, "-o", folder, "--start", "2026-03-01T07:00:00"]
-    done = command(installed, "record", day, *asked)
+    requested = ["--model", trained, "-o", folder, "--start", "2026-03-01T07:00:00"]
+    done = command(installed, "record", day, *requested)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -121,8 +121,8 @@ def test_a_home_is_learned_from(installed, logs, day, trained, tmp_path):
 def test_what_reads_logs_reads_this_one_too(installed, logs, day, verb, tmp_path):
     words, *options = verb
     names = {"REFERENCE": day.with_suffix(".txt")}
-    asked = [names.get(o, o.replace("OUTPUT", str(tmp_path / "out"))) for o in options]
-    done = command(installed, *words.split(), logs, *asked)
+    requested = [names.get(o, o.replace("OUTPUT", str(tmp_path / "out"))) for o in options]
+    done = command(installed, *words.split(), logs, *requested)
     labels_of_no_class = words == "evaluate log"
     assert done.returncode == (3 if labels_of_no_class else 0), done.stderr
 
@@ -139,8 +139,8 @@ def test_a_model_for_other_features_than_the_log_is_refused(installed, day, trai
     done = command(installed, "relabel", tmp_path / "logs", "--model", trained)
     assert done.returncode == 1
     assert f"has features of set {DEFAULT.name}; model octaves is for octaves" in done.stderr
-    asked = {"HEARTHLOG_FEATURE_SET": DEFAULT.name} | installed
-    done = command(asked, "record", day, "--model", trained, "-o", tmp_path / "other")
+    requested = {"HEARTHLOG_FEATURE_SET": DEFAULT.name} | installed
+    done = command(requested, "record", day, "--model", trained, "-o", tmp_path / "other")
     assert done.returncode == 2
     assert f"the model is for feature set octaves, not '{DEFAULT.name}'" in done.stderr
 
@@ -151,9 +151,9 @@ def test_a_model_for_other_features_does_not_take_over_while_recording(
     link = tmp_path / "champion.safetensors"
     link.symlink_to(model_file)
     code = "from hearthlog.tools.cli.main import main; main()"
-    asked = ["record", day, "--realtime", "--model", link, "-o", tmp_path / "logs"]
+    requested = ["record", day, "--realtime", "--model", link, "-o", tmp_path / "logs"]
     recorder = subprocess.Popen(
-        [sys.executable, "-P", "-c", code, *map(str, asked)],
+        [sys.executable, "-P", "-c", code, *map(str, requested)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -177,13 +177,13 @@ def test_a_model_for_other_features_does_not_take_over_while_recording(
 @pytest.mark.parametrize("verb", ["replay", "relabel", "record", "doctor"])
 def test_where_the_example_is_not_installed_one_line_says_so(logs, day, trained, verb, tmp_path):
     copy = shutil.copytree(logs, tmp_path / "logs")
-    asked = {
+    requested = {
         "replay": [copy],
         "relabel": [copy, "--model", trained],
         "record": [day, "--model", trained, "-o", tmp_path / "new"],
         "doctor": [copy],
     }
-    done = command({}, verb, *asked[verb])
+    done = command({}, verb, *requested[verb])
     if verb == "doctor":
         assert done.returncode == 0, done.stdout
         return

@@ -43,7 +43,7 @@ def wait_for_more(logs, count):
 
 
 def test_a_device_that_is_lost_is_replaced_by_its_fallback_until_it_is_back(labmic, tmp_path):
-    labmic.beside("spare")
+    labmic.add_device("spare")
     logs = tmp_path / "logs"
     with recording(labmic, logs) as process:
         wait_for_frames(logs, 40)
@@ -66,17 +66,17 @@ def test_a_device_that_is_lost_is_replaced_by_its_fallback_until_it_is_back(labm
     assert (np.diff(stamps) > 0).all()
     assert f"hearthlog: mic: {INSTEAD}\nhearthlog: mic: listening\n" in process.errors
     statuses = [status for each in read(logs, "diagnostics") for status in each.status]
-    told = {
+    reported = {
         next(value.value for value in status.values if value.key == "device")
         for status in statuses
         if status.message == INSTEAD
     }
-    assert told == {"spare"}
+    assert reported == {"spare"}
     assert not [line for one in examine(logs) for line in one.shown if line.level == "error"]
 
 
 def test_a_fallback_is_heard_from_the_start_where_the_device_is_not_there(labmic, tmp_path):
-    labmic.beside("spare")
+    labmic.add_device("spare")
     labmic.unplug()
     logs = tmp_path / "logs"
     with recording(labmic, logs):
@@ -90,15 +90,15 @@ def test_a_fallback_is_heard_from_the_start_where_the_device_is_not_there(labmic
 
 
 def test_a_fallback_is_heard_where_the_device_has_too_few_channels_for_an_array(labmic, tmp_path):
-    labmic.beside("spare")
+    labmic.add_device("spare")
     labmic.configure(data=np.ones((1600, 2), np.int16))
     logs = tmp_path / "logs"
     with recording(labmic, logs, "array = [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]\n") as process:
         wait_for_frames(logs, 40)
     assert process.returncode == 0, process.errors
     assert devices(logs) == ["spare"]
-    told = "labmic' has 2 channels, and `array` names places for 3: name one for each channel"
-    assert told in process.errors
+    reported = "labmic' has 2 channels, and `array` names places for 3: name one for each channel"
+    assert reported in process.errors
     assert "; spare is heard in its place\n" in process.errors
 
 

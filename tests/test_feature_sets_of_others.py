@@ -57,10 +57,10 @@ def test_blocks_of_any_size_give_the_same_bits(sizes):
     frames = noise(sum(sizes), len(sizes))
     for one in SETS:
         extract = one.extractor()
-        whole = extract(frames)
+        complete = extract(frames)
         extract.restart()
         parts = [extract(part) for part in np.split(frames, np.cumsum(sizes)[:-1])]
-        assert np.concatenate(parts).tobytes() == whole.tobytes(), one.name
+        assert np.concatenate(parts).tobytes() == complete.tobytes(), one.name
 
 
 def test_a_gap_leaves_no_trace(features):
@@ -111,9 +111,9 @@ def test_prediction_solves_the_normal_equations():
 
 def test_cepstra_are_those_of_the_spectrum_of_the_model():
     bands = np.random.default_rng(5).uniform(1e-6, 1e-2, (3, prediction.BANDS))
-    heard = np.cbrt(bands * prediction._equal_loudness())
-    heard[:, 0], heard[:, -1] = heard[:, 1], heard[:, -2]
-    coefficients, error = prediction.prediction(np.fft.irfft(heard, axis=1)[:, :13])
+    labelled = np.cbrt(bands * prediction._equal_loudness())
+    labelled[:, 0], labelled[:, -1] = labelled[:, 1], labelled[:, -2]
+    coefficients, error = prediction.prediction(np.fft.irfft(labelled, axis=1)[:, :13])
     filters = np.concatenate([np.ones((3, 1)), coefficients], axis=1)
     log_spectrum = np.log(error[:, np.newaxis] / np.abs(np.fft.rfft(filters, 4096, axis=1)) ** 2)
     exact = np.fft.irfft(log_spectrum, axis=1)[:, :13]
@@ -245,10 +245,10 @@ def test_real_sound_is_learned_recorded_and_replayed(installed, tmp_path):
     blocks = [block for file in files for block in read_audio(file)]
     soundfile.write(sound, np.concatenate(blocks)[: 40 * SAMPLE_RATE], SAMPLE_RATE)
     model, logs = tmp_path / "rasta.safetensors", tmp_path / "logs"
-    asked = ["--data", CLIPS / "manifest.csv", "--scenario", scenario, "--method", "rasta"]
+    requested = ["--data", CLIPS / "manifest.csv", "--scenario", scenario, "--method", "rasta"]
     trained, recorded, replayed = run(
         installed,
-        ["train", *asked, "-o", model],
+        ["train", *requested, "-o", model],
         ["record", sound, "--model", model, "-o", logs],
         ["replay", logs, "--model", model, "--json"],
     )

@@ -59,7 +59,7 @@ def test_a_file_is_whole_and_all_may_read_it_whatever_the_umask(server, path):
     assert stat.S_IMODE(path.stat().st_mode) == 0o644
     assert {stat.S_IMODE(path.parents[n].stat().st_mode) for n in (0, 1)} == {0o755}
     assert list(path.parent.iterdir()) == [path]
-    assert server.asked == [None]
+    assert server.requested == [None]
 
 
 @pytest.mark.parametrize("mood", ["no length", "slow", "moved"])
@@ -73,7 +73,7 @@ def test_what_ends_early_is_gone_on_with(server, path):
     server.moods = [100_000, 50_000, "503", "well"]
     get(server, path)
     assert path.read_bytes() == DATA
-    assert server.asked == [None, "bytes=100000-", "bytes=150000-", "bytes=150000-"]
+    assert server.requested == [None, "bytes=100000-", "bytes=150000-", "bytes=150000-"]
 
 
 @pytest.mark.parametrize("mood", ["no ranges", "another range"])
@@ -91,9 +91,9 @@ def test_what_was_interrupted_is_private_and_is_gone_on_with_by_the_next_command
     (part,) = parts(path)
     assert part.read_bytes() == DATA[:100_000]
     assert stat.S_IMODE(part.stat().st_mode) == 0o600
-    server.moods, server.asked = ["well"], []
+    server.moods, server.requested = ["well"], []
     get(server, path)
-    assert server.asked == ["bytes=100000-"]
+    assert server.requested == ["bytes=100000-"]
     assert path.read_bytes() == DATA
     assert parts(path) == []
 
@@ -178,7 +178,7 @@ def test_https_is_of_a_server_that_is_trusted_and_leads_nowhere_less_safe(
             DownloadError, match=r"no certificate that this machine trusts \(.*clock"
         ):
             get(safe, path)
-        assert safe.asked == []
+        assert safe.requested == []
         monkeypatch.setenv("SSL_CERT_FILE", str(authority.file))
         get(safe, path)
         assert path.read_bytes() == DATA
@@ -186,7 +186,7 @@ def test_https_is_of_a_server_that_is_trusted_and_leads_nowhere_less_safe(
         path.unlink()
         with pytest.raises(DownloadError, match="not an https:// address"):
             get(safe, path)
-        assert server.asked == []
+        assert server.requested == []
 
 
 @pytest.mark.parametrize("url", ["http://example.org/x", "ftp://example.org/x", "file:///x", "x"])

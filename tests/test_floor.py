@@ -176,16 +176,16 @@ def sounding_frames(level):
 
 @pytest.mark.parametrize("level", [-60, -50, -40])
 def test_a_fridge_that_starts_is_a_sound_for_some_seconds_and_no_longer(level):
-    heard = sounding_frames(level)
-    assert 40 * SECOND - 10 < heard.min() < 40 * SECOND + 10
-    assert len(heard) > 3 * SECOND
-    assert (heard > 48.5 * SECOND).sum() < SECOND  # of 50 s
+    recorded = sounding_frames(level)
+    assert 40 * SECOND - 10 < recorded.min() < 40 * SECOND + 10
+    assert len(recorded) > 3 * SECOND
+    assert (recorded > 48.5 * SECOND).sum() < SECOND  # of 50 s
 
 
 @pytest.mark.parametrize("level", [-30, -20])
 def test_a_loud_tap_or_tone_is_a_sound_for_a_minute_however_steady(level):
-    heard = sounding_frames(level)
-    assert len(heard) > 50 * SECOND
+    recorded = sounding_frames(level)
+    assert len(recorded) > 50 * SECOND
 
 
 @pytest.mark.parametrize("spread", [0.7, 1.5, 3.0, 6.0])
@@ -245,9 +245,9 @@ def test_once_converged_another_past_gives_the_same_floors(size, first):
     assert converged > MINUTE  # so much is remembered
     same = len(powers) - converged + SECOND  # those of the second before, too
     for past in (noise(-80, 997), sound(-20, 2403, 4.0), noise(-10, 5005)):
-        whole = tracked(np.concatenate([past, powers]), first - len(past))
-        assert np.array_equal(whole[-same:], floors[-same:])
-        assert not np.array_equal(whole[-len(powers) + 200 :], floors[-len(powers) + 200 :])
+        full = tracked(np.concatenate([past, powers]), first - len(past))
+        assert np.array_equal(full[-same:], floors[-same:])
+        assert not np.array_equal(full[-len(powers) + 200 :], floors[-len(powers) + 200 :])
 
 
 def test_without_anything_steady_it_converges_after_half_a_day(monkeypatch):

@@ -67,8 +67,8 @@ class Told(Followed):
     """A follower that is told what is wrong, and goes on."""
 
     def run(self):
-        self.told = []
-        options = {"stop": self.stop, "damaged": lambda error: self.told.append(str(error))}
+        self.reported = []
+        options = {"stop": self.stop, "damaged": lambda error: self.reported.append(str(error))}
         for _, messages in follow_messages(self.folder, [TOPIC], **options, **self.options):
             for columns in decode(messages):
                 self.frames += columns["frame"].tolist()
@@ -350,7 +350,7 @@ def test_the_folder_may_go_away_and_come_back(tmp_path):
             write(other, first + 40)
             assert sorted(followed.wait_for(range(first + 60))) == list(range(first + 60))
             other.finish()
-        assert followed.told == [f"{logs}: the folder is gone; waiting for it"] * 2
+        assert followed.reported == [f"{logs}: the folder is gone; waiting for it"] * 2
     writer.abandon()
 
 
@@ -383,7 +383,7 @@ def test_a_folder_that_may_not_be_read_is_told_once_and_tried_again(tmp_path, mo
         is_open.set()
         assert followed.wait_for(range(20)) == list(range(20))
         problem = "may not be read (Permission denied); let the user of this process read it"
-        assert followed.told == [f"{closed}: {problem}"]
+        assert followed.reported == [f"{closed}: {problem}"]
     writer.abandon()
 
 
@@ -407,7 +407,7 @@ def test_a_log_that_cannot_be_opened_is_told_once_and_tried_again(
         sleep(2.5)
         write(writer, 20)
         assert followed.wait_for(range(first, 40)) == list(range(first, 40))
-        assert followed.told == [f"{writer.active_path}: cannot be read (Too many open files)"]
+        assert followed.reported == [f"{writer.active_path}: cannot be read (Too many open files)"]
     writer.abandon()
 
 
@@ -419,7 +419,7 @@ def test_a_log_that_vanishes_before_it_is_opened_is_passed_over(tmp_path, monkey
     writer = log(tmp_path, "home_0.mcap")
     with Told(tmp_path, start=0) as followed:
         sleep(1)
-        assert followed.told == []
+        assert followed.reported == []
     writer.abandon()
 
 

@@ -78,8 +78,8 @@ def test_a_file_as_people_have_it_is_taken(take, file):
     result, marks = take(file.name, file.content, *file.options, class_map=file.map)
     assert marks == list(file.marks)
     assert result.returncode == (1 if file.refused else 3 if file.left_out else 0)
-    for said in (*file.left_out, file.refused):
-        assert said in result.stderr
+    for output in (*file.left_out, file.refused):
+        assert output in result.stderr
     assert result.stderr.count("\n") <= 3
 
 
@@ -113,14 +113,14 @@ def test_at_a_terminal_it_asks(log, tmp_path, answer, status):
     command = [*HEARTHLOG, "annotate", "import", log, labels]
     with subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE, stderr=theirs) as process:
         os.close(theirs)
-        said = b""
-        while b"[y/N]" not in said and select.select([ours], [], [], 60)[0]:
-            said += os.read(ours, 1024)
+        output = b""
+        while b"[y/N]" not in output and select.select([ours], [], [], 60)[0]:
+            output += os.read(ours, 1024)
         assert not read_marks(log)
         os.write(ours, f"{answer}\n".encode())
         assert process.wait(60) == status
     os.close(ours)
-    assert b"'Tap Water' as tap_water (1 label)" in said
+    assert b"'Tap Water' as tap_water (1 label)" in output
     assert [mark.label for mark in read_marks(log)] == ["tap_water"] * (status == 0)
 
 
@@ -171,11 +171,11 @@ def test_each_name_that_is_no_class_is_said_once_with_its_number_and_its_first_l
     lines = [f"{i}\t{i}.5\t{name}\n" for i, name in enumerate([*names, *names])]
     result, marks = take("labels.txt", "".join([*lines, "40\t41\tspeech\n"]))
     assert (result.returncode, marks) == (3, [(40, 41, "speech")])
-    said = result.stderr.splitlines()
-    assert sum("'what 3?'" in line for line in said) == 1
-    assert "2 labels left out, the first: " in said[1]
-    assert "labels.txt:1: 'what 0?' is not a class name" in said[1]
-    assert said[-1] == "hearthlog: 8 labels more left out, of 4 kinds"
+    output = result.stderr.splitlines()
+    assert sum("'what 3?'" in line for line in output) == 1
+    assert "2 labels left out, the first: " in output[1]
+    assert "labels.txt:1: 'what 0?' is not a class name" in output[1]
+    assert output[-1] == "hearthlog: 8 labels more left out, of 4 kinds"
 
 
 def test_of_a_file_that_is_half_unreadable_the_other_half_is_taken(take):
@@ -265,7 +265,7 @@ HOSTILE = {  # and what is said of them
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_file_neither_hangs_nor_fills_the_memory(log, tmp_path, name):
-    content, said = HOSTILE[name]
+    content, output = HOSTILE[name]
     labels = tmp_path / name
     labels.write_bytes(content)
     result = subprocess.run(
@@ -277,6 +277,6 @@ def test_a_hostile_file_neither_hangs_nor_fills_the_memory(log, tmp_path, name):
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30)),
     )
     assert result.returncode in {1, 3}
-    assert said in result.stderr
+    assert output in result.stderr
     assert "Traceback" not in result.stderr
     assert len(result.stderr) < 5000

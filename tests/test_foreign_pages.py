@@ -76,7 +76,7 @@ def read(browser, urls, mode="cors"):
     return browser.wait_for(calls)
 
 
-def is_told(browser, url):
+def is_reported(browser, url):
     """Whether the page that is open reads something of the home."""
     (found,) = read(browser, [url])
     return MICROPHONE in found["text"]
@@ -119,7 +119,7 @@ def check_hidden(browser, process, page=""):
     browser.open_as(f"http://{HOST}:{free_port()}/", SCRIPT)
     patiently(
         lambda: any(
-            is_told(browser, f"http://{address}:{port}/{DATA}")
+            is_reported(browser, f"http://{address}:{port}/{DATA}")
             for address, port in listening(process)
         ),
         bool,
@@ -149,7 +149,7 @@ def test_a_stranger_reads_a_server_at_the_usual_address(logs, browser):
     with watching(logs, "--serve", "--bind", HOST, "--port", str(port)) as watcher:
         patiently(lambda: listening(watcher), bool)
         browser.open_as(f"http://{STRANGER}:{port}/", SCRIPT)
-        patiently(lambda: is_told(browser, f"http://{STRANGER}:{port}/{DATA}"), bool)
+        patiently(lambda: is_reported(browser, f"http://{STRANGER}:{port}/{DATA}"), bool)
 
 
 def test_a_stranger_reads_nothing_of_a_review_in_a_window(logs, browser, display):

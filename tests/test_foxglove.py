@@ -142,7 +142,7 @@ class Viewer:
     def go_on(self):
         self._process.send_signal(signal.SIGCONT)
 
-    def ask(self, *, play, speed=1.0, seek=None):
+    def request(self, *, play, speed=1.0, seek=None):
         """Ask for playback; wait for the answer and return it."""
         before = len(self.of("state"))
         request = {"play": play, "speed": speed} | ({} if seek is None else {"seek": str(seek)})
@@ -308,10 +308,12 @@ def test_a_foreign_page_a_wrong_token_and_another_name_get_nothing(logs):
             assert (event["event"], event["status"], event["body"]) == ("refused", 403, "")
             assert event["headers"] == nothing
         assert ended(watcher) == 0
-    said = "".join(watcher.lines)
-    assert said.count("a page of https://evil.example; if it is yours, allow it with --origin") == 1
-    assert said.count("the token is missing or wrong") == 1
-    assert said.count("the request used a host name") == 1
+    output = "".join(watcher.lines)
+    assert (
+        output.count("a page of https://evil.example; if it is yours, allow it with --origin") == 1
+    )
+    assert output.count("the token is missing or wrong") == 1
+    assert output.count("the request used a host name") == 1
 
 
 def test_pages_of_foxglove_and_of_this_machine_may_look(logs):
@@ -382,10 +384,10 @@ def test_what_can_be_read_in_two_ways_is_refused(change):
 
 def test_one_who_does_not_ask_as_a_viewer_gets_nothing(logs):
     with serving(logs) as (watcher, url):
-        asked = head(url)
-        for request in (asked[:-2], b"x" * 100_000, asked[:-2] + b"A: " + b"x" * 40_000):
+        requested = head(url)
+        for request in (requested[:-2], b"x" * 100_000, requested[:-2] + b"A: " + b"x" * 40_000):
             assert exchange(url, request) == b""
-        assert exchange(url, asked[:-2] + b"Ok\r\n\r\n").startswith(b"HTTP/1.1 403 ")
+        assert exchange(url, requested[:-2] + b"Ok\r\n\r\n").startswith(b"HTTP/1.1 403 ")
         assert ended(watcher) == 0
 
 
@@ -485,12 +487,12 @@ def test_a_recording_is_played_whole_and_in_order(logs):
         assert end["sec"] * SECOND + end["nsec"] == own[-1][1] + 1
         topics = {topic for topic, *_ in own} | {"/mic/gap"}
         viewer.wait(lambda: {event["topic"] for event in viewer.of("advertise")} == topics)
-        state = viewer.ask(play=True, speed=1000)
+        state = viewer.request(play=True, speed=1000)
         assert (state["status"], state["speed"], state["sought"]) == ("playing", 100, False)
         state = viewer.wait_for("state", count=2)[1]
         assert (state["status"], int(state["time"])) == ("ended", own[-1][1] + 1)
         viewer.wait(lambda: len(viewer.of("message")) >= len(own))
-        assert viewer.ask(play=True)["status"] == "ended"
+        assert viewer.request(play=True)["status"] == "ended"
         assert ended(watcher) == 0
     assert by_time(viewer.messages()) == own
     times = [int(event["timestamp"]) for event in viewer.of("time")]
@@ -509,7 +511,7 @@ def test_after_a_seek_one_sees_what_held_then_and_what_follows(logs, second):
     following = [each for each in own if each[1] >= moment]
     with serving(logs, "--start", "2026-03-01") as (_, url), Viewer(url) as viewer:
         viewer.wait_for("advertise", count=8)
-        state = viewer.ask(play=False, seek=moment)
+        state = viewer.request(play=False, seek=moment)
         assert (state["status"], state["sought"], int(state["time"])) == ("paused", True, moment)
         viewer.wait(lambda: len(viewer.of("message")) >= len(held))
         assert sorted(viewer.messages()) == sorted(held.values())
@@ -517,11 +519,11 @@ def test_after_a_seek_one_sees_what_held_then_and_what_follows(logs, second):
             late.wait_for("message", "/mic/info")
             assert late.messages() == infos[-1:]
         repeated = len(viewer.of("message"))  # it was told again, too
-        viewer.ask(play=True, speed=100)
+        viewer.request(play=True, speed=100)
         viewer.wait(lambda: viewer.of("state")[-1]["status"] == "ended")
         viewer.wait(lambda: len(viewer.of("message")) >= repeated + len(following))
         assert by_time(viewer.messages()[repeated:]) == following
-        viewer.ask(play=True, speed=100, seek=0)
+        viewer.request(play=True, speed=100, seek=0)
         viewer.wait(lambda: len(viewer.of("message")) >= repeated + len(following) + len(own))
         assert by_time(viewer.messages()[repeated + len(following) :]) == own
 
@@ -530,17 +532,17 @@ def test_what_is_paused_stands_still_and_goes_on(logs):
     own = [each[:3] for each in logged(logs)]
     with serving(logs, "--start", "2026-03-01") as (_, url), Viewer(url) as viewer:
         viewer.wait_for("advertise", count=8)
-        viewer.ask(play=True, speed=20)
+        viewer.request(play=True, speed=20)
         viewer.wait(lambda: len(viewer.of("message")) >= 200)
-        state = viewer.ask(play=False, speed=20)
+        state = viewer.request(play=False, speed=20)
         time.sleep(SILENT_SECONDS)
         came = viewer.messages()
         assert by_time(came) == [each for each in own if each[1] < int(state["time"])]
         assert len(came) < len(own)
         time.sleep(SILENT_SECONDS)
         assert viewer.messages() == came
-        assert viewer.ask(play=False, speed=0)["speed"] == pytest.approx(0.01)
-        viewer.ask(play=True, speed=100)
+        assert viewer.request(play=False, speed=0)["speed"] == pytest.approx(0.01)
+        viewer.request(play=True, speed=100)
         viewer.wait(lambda: len(viewer.of("message")) >= len(own))
         assert by_time(viewer.messages()) == own
 
@@ -551,7 +553,7 @@ def test_only_what_was_asked_for_is_played(logs):
     own = [each[:3] for each in logged(logs) if first <= each[1] < last]
     with serving(logs, *span) as (_, url), Viewer(url) as viewer:
         viewer.wait_for("message", "/mic/info")  # of before, as one comes in the middle
-        viewer.ask(play=True, speed=100, seek=0)
+        viewer.request(play=True, speed=100, seek=0)
         viewer.wait(lambda: viewer.of("state")[-1]["status"] == "ended")
         viewer.wait(lambda: {*own} <= {*viewer.messages()})
     extra = [each for each in viewer.messages() if each not in own]
@@ -583,7 +585,7 @@ def test_what_a_later_version_wrote_passes_as_it_is(tmp_path):
         write_as_later(golden, tmp_path / "later")
     with serving(tmp_path / "later", "--start", "2000-01-01") as (_, url), Viewer(url) as viewer:
         viewer.wait_for("advertise", count=6)
-        viewer.ask(play=True, speed=100)
+        viewer.request(play=True, speed=100)
         features = viewer.wait_for("message", "/hall/features")
     grown = GROWN[FEATURES]
     assert features[0]["fields"][grown.name] == grown.value
@@ -605,7 +607,7 @@ def test_a_damaged_log_is_told_once_and_the_others_are_played(logs, tmp_path, na
     shutil.copy(first, tmp_path / "home_0.mcap")
     with serving(tmp_path, *options) as (watcher, url), Viewer(url) as viewer:
         viewer.wait_for("serverInfo")
-        viewer.ask(play=True, speed=100)
+        viewer.request(play=True, speed=100)
         viewer.wait(lambda: viewer.of("state")[-1]["status"] == "ended")
         assert {each[:3] for each in logged(first)} <= {*viewer.messages()}
         assert ended(watcher) == 3
@@ -693,10 +695,10 @@ def rooms(tmp_path_factory):
     names = ["living_room", "bath"]
     write_list(folder, ["music"])
     home = LiveHome(folder, names, minutes_ago=0)
-    home.says("recorder", 0, "listening")
+    home.write_status("recorder", 0, "listening")
     for name in names:
         home.hears("coughing", name)
-        home.heard("coughing", 0, microphone=name)
+        home.write_segment("coughing", 0, microphone=name)
     home.close()
     return folder
 

@@ -70,7 +70,7 @@ def labelled(path, _folder):
     assert classifier.feature_set
 
 
-def heard(path, _folder):
+def recorded(path, _folder):
     """Take a file for a microphone; no more than it may hold is looked at."""
     frames = 0
     for event in FileSource([path], START).events(Flag()):
@@ -99,7 +99,7 @@ def victim_of(reader):
 of_configurations = victim_of(configured)
 of_environments = victim_of(configured_by_the_environment)
 of_models = victim_of(labelled)
-of_sounds = victim_of(heard)
+of_sounds = victim_of(recorded)
 of_pauses = victim_of(paused)
 
 

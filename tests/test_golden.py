@@ -164,13 +164,13 @@ def in_this_process(capfd) -> Run:
 
 def test_info_counts_what_every_version_wrote(golden, expected, run):
     done = run("info", "logs", "--json")
-    said = json.loads(done.stdout)
-    assert {name: topic["messages"] for name, topic in said["topics"].items()} == expected.topics
-    seconds = {label: minutes * 60 for label, minutes in said["labels"]["hall"].items()}
+    output = json.loads(done.stdout)
+    assert {name: topic["messages"] for name, topic in output["topics"].items()} == expected.topics
+    seconds = {label: minutes * 60 for label, minutes in output["labels"]["hall"].items()}
     assert seconds == pytest.approx(expected.live)
-    assert said["segments"]["hall/relabel/merged"] == expected.relabelled
-    assert len(said["layers"]) == len([p for p in find_logs(golden / "logs") if is_layer(p)])
-    assert said["schema_versions"] == [str(expected.schema)]
+    assert output["segments"]["hall/relabel/merged"] == expected.relabelled
+    assert len(output["layers"]) == len([p for p in find_logs(golden / "logs") if is_layer(p)])
+    assert output["schema_versions"] == [str(expected.schema)]
     assert (done.returncode, done.stderr) == (3, "")  # for the gap
     left = json.loads(run("info", "left", "--json").stdout)
     assert {name: topic["messages"] for name, topic in left["topics"].items()} == expected.left
@@ -213,9 +213,9 @@ def test_every_version_is_exported(expected, run):
 
 
 def test_a_replay_of_every_version_is_what_it_recorded(expected, run):
-    said, again = by_replay(run)
-    assert said["compared"]["labels"] == expected.topics["/hall/label"]
-    assert said["compared"]["segments"] == expected.topics["/hall/segment"]
+    output, again = by_replay(run)
+    assert output["compared"]["labels"] == expected.topics["/hall/label"]
+    assert output["compared"]["segments"] == expected.topics["/hall/segment"]
     recorded = {
         topic: plain(c.fields) for topic, c in read_columns(find_logs(Path("logs"))).items()
     }
@@ -238,8 +238,8 @@ def test_a_relabelling_of_every_version_stays_and_would_be_the_same(expected, ru
 
 
 def test_two_labellings_of_every_version_are_compared(expected, run):
-    said, queue = by_diff(run)
-    assert said["total"]["minutes"] == pytest.approx(sum(expected.live.values()) / 60, abs=0.01)
+    output, queue = by_diff(run)
+    assert output["total"]["minutes"] == pytest.approx(sum(expected.live.values()) / 60, abs=0.01)
     assert queue
 
 
@@ -250,10 +250,10 @@ def test_every_version_is_reported(run):
 
 
 def test_every_version_is_evaluated_against_its_reviewer(expected, run):
-    said = by_evaluate(run)
+    output = by_evaluate(run)
     known = load_model(Path("models/smoothed.safetensors")).classes
     seconds = sum(seconds for label, seconds in expected.marks if label in known)
-    assert said["frames"] * 0.05 == pytest.approx(seconds)
+    assert output["frames"] * 0.05 == pytest.approx(seconds)
 
 
 @pytest.mark.usefixtures("golden")
@@ -476,7 +476,7 @@ def test_a_newer_log_is_named_once_and_what_is_done_is_done_with_3(
 
 def test_the_doctor_warns_of_every_newer_file(later, run, monkeypatch):
     monkeypatch.chdir(later)
-    said = json.loads(run("doctor", "logs", "--json").stdout)
-    newer = {each["path"] for each in said["findings"] if each["rule"] == "newer"}
+    output = json.loads(run("doctor", "logs", "--json").stdout)
+    newer = {each["path"] for each in output["findings"] if each["rule"] == "newer"}
     assert newer == {str(path) for path in find_logs(Path("logs"))}
-    assert said["errors"] == 0
+    assert output["errors"] == 0

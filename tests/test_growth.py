@@ -351,15 +351,15 @@ def test_the_doctor_misses_what_the_version_of_a_log_had(golden, capfd, tmp_path
     log.write(golden)
     with grown_definitions(tmp_path), pytest.MonkeyPatch.context() as patch:
         patch.setattr("hearthlog.schemas.logs.metadata._KNOWN", {"1": 1, "2": 2, str(NEXT): NEXT})
-        said = json.loads(run(capfd, "doctor", golden, "--json").stdout)
-    wrong = [each["what"] for each in said["findings"] if each["level"] == "error"]
+        output = json.loads(run(capfd, "doctor", golden, "--json").stdout)
+    wrong = [each["what"] for each in output["findings"] if each["level"] == "error"]
     absent = {  # in this log
         message_types.MARK,
         message_types.REVIEWED,
         message_types.DIRECTION,
         message_types.EMBEDDING,
     }
-    assert said["errors"] == len({*OURS} - absent) + 1
+    assert output["errors"] == len({*OURS} - absent) + 1
     assert any("model.json" in what for what in wrong)  # which the first version had not
     assert any(
         what.endswith(f"{message_types.STATISTICS} has no field string formula") for what in wrong

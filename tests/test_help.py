@@ -143,10 +143,10 @@ def test_completing_a_word_imports_nothing_that_takes_long():
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
         "print(*sys.modules)\n"
     )
-    asked = {"COMP_WORDS": "hearthlog rec", "COMP_CWORD": "1"}
+    requested = {"COMP_WORDS": "hearthlog rec", "COMP_CWORD": "1"}
     result = subprocess.run(
         [sys.executable, "-c", code],
-        env=os.environ | asked | {"_HEARTHLOG_COMPLETE": "complete_bash"},
+        env=os.environ | requested | {"_HEARTHLOG_COMPLETE": "complete_bash"},
         capture_output=True,
         text=True,
         check=True,

@@ -72,11 +72,11 @@ def home(request, tmp_path_factory):
         ends.callback(home.household.close)
         home.start()
         home.household.record()
-        home.household.tell()
+        home.household.start_bridge()
         home.connect(broker.port)
-        home.told = Listener(broker.port, "lab/#")
-        ends.callback(home.told._client._reset_sockets)
-        ends.enter_context(home.told)
+        home.listener = Listener(broker.port, "lab/#")
+        ends.callback(home.listener._client._reset_sockets)
+        ends.enter_context(home.listener)
         wait_for(lambda: home.state(f"{SENSOR}coughing_today") not in {None, "unknown"}, 60)
         yield home
 
@@ -91,7 +91,7 @@ def is_well(home):
 
 def device_id(home):
     """Return what Home Assistant calls the device."""
-    devices = home.ask(type="config/device_registry/list")
+    devices = home.query(type="config/device_registry/list")
     (found,) = [each for each in devices if each["name"] == DEVICE]
     assert found["manufacturer"] == "hearthlog"
     return found["id"]
@@ -99,7 +99,7 @@ def device_id(home):
 
 def triggers(home):
     """Return what the device offers as a trigger of MQTT: type and subtype."""
-    offered = home.ask(type="device_automation/trigger/list", device_id=device_id(home))
+    offered = home.query(type="device_automation/trigger/list", device_id=device_id(home))
     return {(each["type"], each["subtype"]) for each in offered if each["domain"] == "mqtt"}
 
 
@@ -112,7 +112,7 @@ def test_everything_that_is_heard_is_an_entity_of_one_device(home):
     wait_for(lambda: is_well(home), 60)
     wait_for(lambda: home.state(f"{SENSOR}coughing_today").strip("0").isdigit(), 60)
     device = device_id(home)
-    registry = home.ask(type="config/entity_registry/list")
+    registry = home.query(type="config/entity_registry/list")
     assert {each["entity_id"] for each in registry if each["device_id"] == device} == entities_of(
         GENERAL
     )
@@ -140,8 +140,8 @@ def classes(home):
 
 
 def test_a_sound_can_be_chosen_as_a_trigger_of_the_device_and_it_fires(home):
-    heard = {("heard", name.replace("_", " ").capitalize()) for name in GENERAL.values()}
-    assert triggers(home) == heard
+    recorded = {("heard", name.replace("_", " ").capitalize()) for name in GENERAL.values()}
+    assert triggers(home) == recorded
     wanted = {"trigger": "device", "domain": "mqtt", "device_id": device_id(home)}
     home.automate(
         "device_trigger",
@@ -153,9 +153,9 @@ def test_a_sound_can_be_chosen_as_a_trigger_of_the_device_and_it_fires(home):
         triggers=[wanted | {"type": "heard", "subtype": "Music"}],
         actions=publishes("lab/music", "{{ trigger.payload }}"),
     )
-    event = json.loads(home.told.wait_for("lab/device", seconds=60))
+    event = json.loads(home.listener.wait_for("lab/device", seconds=60))
     assert event["event_type"] == "coughing"
-    assert "lab/music" not in home.told.values
+    assert "lab/music" not in home.listener.values
 
 
 def test_automations_on_the_event_and_on_the_sound_fire(home):
@@ -172,18 +172,18 @@ def test_automations_on_the_event_and_on_the_sound_fire(home):
         ],
         actions=publishes("lab/sound", "{{ trigger.to_state.state }}"),
     )
-    started = datetime.fromisoformat(home.told.wait_for("lab/event", seconds=60))
+    started = datetime.fromisoformat(home.listener.wait_for("lab/event", seconds=60))
     assert timedelta() < datetime.now(UTC) - started < timedelta(seconds=30)
-    assert home.told.wait_for("lab/sound", seconds=60) == "on"
+    assert home.listener.wait_for("lab/sound", seconds=60) == "on"
 
 
 def test_counts_and_times_are_numbers_and_times_for_long_term_statistics(home):
-    listed = home.ask(type="recorder/list_statistic_ids")
+    listed = home.query(type="recorder/list_statistic_ids")
     kept = {each["statistic_id"]: each for each in listed}
     for name in GENERAL.values():
         for kind in ("today", "last_night"):
             assert kept[f"{SENSOR}{name}_{kind}"]["has_sum"]
-    assert home.ask(type="recorder/validate_statistics") == {}
+    assert home.query(type="recorder/validate_statistics") == {}
 
 
 def test_a_class_is_switched_off_and_on_and_a_pause_is_asked_for_by_a_button(home):
@@ -214,12 +214,12 @@ def test_a_blueprint_notifies_of_a_sound_that_is_heard_again_and_again(home):
     for name, given in (("often", often), ("rare", rare)):
         notify = publishes(f"lab/{name}", "{{ message }}")
         home.automate(name, use_blueprint=use | {"input": given | {"notify": notify}})
-    text = home.told.wait_for("lab/often", seconds=120)
+    text = home.listener.wait_for("lab/often", seconds=120)
     assert text == "Hearthlog home mic Coughing: 2 times within 2 minutes"
     time.sleep(50)  # two coughs that are of the cooldown
-    assert len(home.told.payloads("lab/often")) == 1
-    home.told.wait_until(lambda: len(home.told.payloads("lab/often")) == 2, 120)
-    assert "lab/rare" not in home.told.values
+    assert len(home.listener.payloads("lab/often")) == 1
+    home.listener.wait_until(lambda: len(home.listener.payloads("lab/often")) == 2, 120)
+    assert "lab/rare" not in home.listener.values
     for name in ("often", "rare"):
         home.forget(name)
 
@@ -233,11 +233,11 @@ def test_a_blueprint_notifies_of_a_sound_that_is_not_heard(home):
         given = {"last_heard": f"{SENSOR}{name}_last_heard", "listening": f"{ON}listening"}
         notify = publishes(f"lab/no_{name}", "{{ message }}")
         home.automate(name, use_blueprint=use | {"input": given | times | {"notify": notify}})
-    text = home.told.wait_for("lab/no_music")
+    text = home.listener.wait_for("lab/no_music")
     since = times["since"][:5]
     assert text.startswith(f"Hearthlog home mic Music last heard: not since {since}.")
     time.sleep(2)
-    assert "lab/no_coughing" not in home.told.values
+    assert "lab/no_coughing" not in home.listener.values
     for name in ("coughing", "music"):
         home.forget(name)
 
@@ -252,18 +252,18 @@ def test_the_automation_of_the_page_fires(home):
     ((_, automation),) = blocks_of_page("triggers:")
     home.automate("page", **automation)
 
-    def said():
-        told = home.ask(type="persistent_notification/get")
-        return [each["message"] for each in told if each["message"].startswith("Coughing at ")]
+    def output():
+        reported = home.query(type="persistent_notification/get")
+        return [each["message"] for each in reported if each["message"].startswith("Coughing at ")]
 
-    (message,) = wait_for(said, 60)
+    (message,) = wait_for(output, 60)
     assert datetime.fromisoformat(message.removeprefix("Coughing at ")).tzinfo is not None
     home.forget("page")
 
 
 def test_the_card_of_the_page_shows_entities_that_are_there(home):
     ((text, card),) = blocks_of_page("type:")
-    home.ask(
+    home.query(
         type="lovelace/config/save",
         config={"title": "Home", "views": [{"title": "Sounds", "cards": [card]}]},
     )
@@ -296,7 +296,7 @@ def test_a_microphone_also_has_a_level(home, labmic):
     level = home.states()[f"{SENSOR}level"]
     assert -80 < float(level["state"]) < 0
     assert level["attributes"]["unit_of_measurement"] == "dBFS"
-    kept = {each["statistic_id"]: each for each in home.ask(type="recorder/list_statistic_ids")}
+    kept = {each["statistic_id"]: each for each in home.query(type="recorder/list_statistic_ids")}
     assert kept[f"{SENSOR}level"]["has_mean"]
     end(home.household.recorder)
     home.household.record()
@@ -307,19 +307,19 @@ def test_all_is_unavailable_when_the_bridge_is_killed_until_there_is_one_again(h
     count = int(home.state(f"{SENSOR}coughing_today"))
     end(home.household.bridge, signal.SIGKILL)
     wait_for(lambda: {each["state"] for each in home.states().values()} == {"unavailable"}, 5)
-    home.household.tell()
+    home.household.start_bridge()
     wait_for(lambda: is_well(home), 30)
     assert int(home.state(f"{SENSOR}coughing_today")) >= count
 
 
 def test_a_home_assistant_that_starts_again_shows_everything_and_its_automations_fire(home):
     home.stop()
-    before = len(home.told.payloads("lab/device"))
+    before = len(home.listener.payloads("lab/device"))
     home.start()
     wait_for(lambda: is_well(home), 30)
     assert home.state(f"{ON}recorder") == "on"
     assert triggers(home) == {("heard", name) for name in words(GENERAL)}
-    home.told.wait_until(lambda: len(home.told.payloads("lab/device")) > before, 60)
+    home.listener.wait_until(lambda: len(home.listener.payloads("lab/device")) > before, 60)
 
 
 def words(names):
@@ -344,11 +344,11 @@ def test_classes_that_went_while_there_was_no_bridge_are_gone_too(home):
     end(home.household.bridge, signal.SIGKILL)
     home.household.record()
     time.sleep(5)
-    home.household.tell()
+    home.household.start_bridge()
     wait_for(lambda: is_well(home), 60)
     assert triggers(home) == {("heard", name) for name in words(GENERAL)}
-    before = len(home.told.payloads("lab/device"))
-    home.told.wait_until(lambda: len(home.told.payloads("lab/device")) > before, 60)
+    before = len(home.listener.payloads("lab/device"))
+    home.listener.wait_until(lambda: len(home.listener.payloads("lab/device")) > before, 60)
 
 
 def test_what_is_gone_does_not_come_back_when_home_assistant_starts_again(home):

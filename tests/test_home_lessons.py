@@ -90,7 +90,7 @@ def write(logs, marks=(), reviewed=()):
     write_marks(log, [Mark("mic", *each) for each in marks], reviewed=reviewed)
 
 
-def whole(logs, **changed):
+def full(logs, **changed):
     begin, end = min(one[0] for one in segments(logs)), max(one[1] for one in segments(logs))
     return ReviewedSpan("mic", begin, end)._replace(**changed)
 
@@ -103,20 +103,20 @@ def sound(logs):
 def test_what_a_review_left_alone_is_to_stay_as_it_was_labelled(home, model_file):
     model = load_model(model_file)
     marked = next(one for one in segments(home) if one[2] != "silence")
-    write(home, [marked], [whole(home)])
+    write(home, [marked], [full(home)])
     found = confirmed_segments(sound(home), model.classes)
     assert len({one.label for one in found.recordings}) > 2
     for one in found.recordings:
         begin, end = one.span
         middle = (begin + end) // 2
-        (label,) = {said for a, b, said in segments(home) if a <= middle < b}
+        (label,) = {printed for a, b, printed in segments(home) if a <= middle < b}
         assert one.label == label
         assert end + SECOND // 2 <= marked[0] or begin - SECOND // 2 >= marked[1]
 
 
 def test_what_a_review_left_alone_weighs_as_much_as_the_sounds_of_others(home, model_file):
     model = load_model(model_file)
-    write(home, [next(one for one in segments(home) if one[2] != "silence")], [whole(home)])
+    write(home, [next(one for one in segments(home) if one[2] != "silence")], [full(home)])
     lessons = home_lessons([home], model).segments
     confirmed = lessons.collection == lessons.collection_names.index(CONFIRMED)
     assert set(lessons.weight[confirmed]) == {1.0}
@@ -124,7 +124,7 @@ def test_what_a_review_left_alone_weighs_as_much_as_the_sounds_of_others(home, m
 
 
 def test_what_a_model_is_less_than_half_sure_of_confirms_nothing(home, model_file):
-    write(home, reviewed=[whole(home)])
+    write(home, reviewed=[full(home)])
     model = load_model(model_file)
     candidates = [confirmed_segments(sound(home), model.classes)]
 
@@ -146,7 +146,7 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
     drawn = ReviewedSpan("mic", longest[0] - SECOND, longest[1] + SECOND, chosen=RANDOM)
     middle = (longest[0] + longest[1]) // 2
     halves = (longest[0], middle, "speech"), (middle, longest[1], "music")
-    write(home, halves, [drawn, whole(home)])
+    write(home, halves, [drawn, full(home)])
     assert not list(lesson_recordings(home))
     for found in (
         confirmed_segments(sound(home), model.classes),
@@ -217,7 +217,7 @@ def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(
     home, model_file, answer
 ):
     one, other = [each for each in segments(home) if each[2] != "silence"][:2]
-    write(home, [(*one[:2], answer), other], [whole(home)])
+    write(home, [(*one[:2], answer), other], [full(home)])
     assert [each.label for each in lesson_recordings(home)] == [other[2]]
     found = confirmed_segments(sound(home), load_model(model_file).classes)
     assert all(b <= one[0] or a >= one[1] for a, b in (each.span for each in found.recordings))
@@ -228,7 +228,7 @@ def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(
 
 def test_a_long_mark_is_not_more_than_a_few_short_ones(home, model_file):
     begin = min(one[0] for one in segments(home))
-    write(home, [(begin + 10 * SECOND, begin + 70 * SECOND, "speech")], [whole(home)])
+    write(home, [(begin + 10 * SECOND, begin + 70 * SECOND, "speech")], [full(home)])
     segments_ = home_lessons([home], load_model(model_file)).segments
     marked = segments_.collection == segments_.collection_names.index(HOME)
     assert 0 < marked.sum() <= MOST_OF_MARK
@@ -279,7 +279,7 @@ def test_a_home_that_is_never_silent_is_refused_and_a_mark_of_silence_helps(
 
 def test_a_model_says_from_which_time_of_the_home_it_has_learned(home, model_file):
     model = load_model(model_file)
-    write(home, [next(one for one in segments(home) if one[2] != "silence")], [whole(home)])
+    write(home, [next(one for one in segments(home) if one[2] != "silence")], [full(home)])
     lessons = home_lessons([home], model)
     training = adapt_model(model, lessons.segments).description.training_data
     spans = np.array(training.home_spans)
@@ -384,7 +384,7 @@ def test_a_class_of_two_days_and_ten_seconds_is_learned_and_stays_as_long_as_its
 
 
 @pytest.mark.parametrize(
-    ("seconds", "said"),
+    ("seconds", "printed"),
     [
         ((5, 0), "1 mark of kettle: 5 more seconds, from another day, make it a class"),
         ((3, 3), "2 marks of kettle: 4 more seconds make it a class"),
@@ -393,13 +393,13 @@ def test_a_class_of_two_days_and_ten_seconds_is_learned_and_stays_as_long_as_its
     ],
 )
 def test_what_lacks_of_a_new_class_is_said_before_learning(
-    two_days, model_file, capfd, seconds, said
+    two_days, model_file, capfd, seconds, printed
 ):
     kettle(two_days, seconds)
     output = two_days / "x.safetensors"
     done = run(capfd, "train", "--base", model_file, "--home", two_days, "-o", output, "--json")
     lines = done.stderr.splitlines()
-    assert lines[0] == f"hearthlog: {said}"
+    assert lines[0] == f"hearthlog: {printed}"
     assert "none of the marks can be learned from" in done.stderr
     assert "nothing is marked" not in done.stderr
     if done.returncode == 0:

@@ -90,10 +90,10 @@ def day_of(sounds):
 
 def test_sounds_are_described_by_the_embeddings_of_one_network_and_projection(days):
     with read_sounds(find_home_logs([days]), "all") as sounds:
-        heard = np.isfinite(sounds.embeddings).all(axis=1)
+        recorded = np.isfinite(sounds.embeddings).all(axis=1)
         assert sounds.embedding == ONE.source.space
         assert sounds.embeddings.shape[1] == WIDTH
-        assert set(day_of(sounds)[heard].tolist()) == {1, 4}
+        assert set(day_of(sounds)[recorded].tolist()) == {1, 4}
         assert len(sounds.unfit) == 3
         assert set(sounds.unfit) == {None, OTHER.source.space, PROJECTED.source.space}
         note = unembedded_note(sounds, discover(sounds, None)[0])
@@ -160,11 +160,11 @@ def test_marks_teach_only_by_the_embeddings_that_a_model_takes(home):
     for ear in (ONE, OTHER, PROJECTED):
         found = list(read_reviewed_sound(home, DEFAULT, space=ear.source.space))
         assert [one.embedding for one in found] == [e and e.source.space for e in EARS]
-        heard = [len(one.embeddings.frames) > 0 for one in found]
-        assert heard == [each is ear for each in EARS]
+        recorded = [len(one.embeddings.frames) > 0 for one in found]
+        assert recorded == [each is ear for each in EARS]
         lessons = list(lesson_recordings(home, space=ear.source.space))
-        assert [one.embedded is not None for one in lessons] == heard
-        assert [one.weight for one in lessons] == [1.0 if each else 3.0 for each in heard]
+        assert [one.embedded is not None for one in lessons] == recorded
+        assert [one.weight for one in lessons] == [1.0 if each else 3.0 for each in recorded]
     wider = EmbeddingSpace("one", "a" * 64, WIDTH)
     found = read_reviewed_sound(home, DEFAULT, space=wider)
     assert not any(len(one.embeddings.frames) for one in found)
@@ -196,13 +196,13 @@ def test_the_queue_compares_only_what_one_network_heard(days):
 def test_doctor_and_report_say_when_a_home_began_changed_or_lost_its_network(
     days, hearthlog, tmp_path
 ):
-    said = (
+    output = (
         "mic: heard without a network, …, from 2026-03-03 08:00 with other, from 2026-03-04"
         " 08:00 with one, from 2026-03-05 08:00 with another projection of one"
     )
     done = hearthlog("doctor", days)
     assert done.returncode == 0, done.stdout
-    assert said in done.stderr
+    assert output in done.stderr
     done = hearthlog("report", days, "--day", "2026-03-05", "-o", tmp_path / "day.html")
     assert done.returncode == 0, done.stderr
-    assert said in (tmp_path / "day.html").read_text()
+    assert output in (tmp_path / "day.html").read_text()

@@ -380,10 +380,10 @@ def test_the_doctor_looks_once_at_faults_that_are_alike(tmp_path, hearthlog, mon
 def test_the_doctor_passes_over_a_topic_of_countless_faults(tmp_path, hearthlog, monkeypatch):
     monkeypatch.setattr("hearthlog.analyzer.doctor.examination._MOST_WRONG", 100)
     bag = Bag(tmp_path / "x.mcap", CompressionType.NONE)
-    channel, whole = bag.channel("/s", STRING), bag.channel("/i", INT32)
+    channel, full = bag.channel("/s", STRING), bag.channel("/i", INT32)
     for i in range(1000):
         bag.add(channel, b"\0\1\0\0" + struct.pack("<I", 1000 + i), T0 + i)
-    bag.add(whole, int32(1)[:5], T0 + 1000)
+    bag.add(full, int32(1)[:5], T0 + 1000)
     done = hearthlog("doctor", bag.close())
     assert "messages of /s cannot be read, each for another reason" in done.stdout
     assert "996 more of this kind [cdr]" in done.stdout

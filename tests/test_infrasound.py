@@ -83,10 +83,10 @@ FAULTS = {
 def test_what_is_below_hearing_hides_no_sound(scene, model, fault, gain):
     sound = scene * gain
     plain = classify(model, as_int16(sound), RATE)
-    heard = classify(model, as_int16(sound + FAULTS[fault](sound)), RATE)
+    recorded = classify(model, as_int16(sound + FAULTS[fault](sound)), RATE)
     is_sound = plain.labels != "silence"
     assert 0.2 < is_sound.mean() < 0.6
-    same = heard.labels == plain.labels
+    same = recorded.labels == plain.labels
     assert same[is_sound].mean() > 0.85
     assert same[~is_sound].mean() > 0.95
 

@@ -91,7 +91,7 @@ def ingress(version, page_port):
 @pytest.mark.parametrize("version", versions())
 def test_the_page_works_through_the_ingress_of_home_assistant_since_2026_3(version, tmp_path):
     with serving(tmp_path / "home") as home, ingress(version, home.port) as port:
-        home.log.heard("coughing", 60, 5)
+        home.log.write_segment("coughing", 60, 5)
         if tuple(map(int, version.split("."))) < (2026, 3):
             # Compressed, the news stay in the buffer of the ingress.
             news = answer(port, f"{PATH}events", Cookie=home.cookie())

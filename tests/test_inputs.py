@@ -32,11 +32,11 @@ def floors_of(count, seed=0):
 def test_blocks_of_any_size_agree_bit_for_bit(described, kind, sizes, count, seed):
     values, inputs = values_of(described, count, seed), described.inputs[kind]
     floors = floors_of(count, seed)
-    whole, stream = inputs.stream()(values, floors), inputs.stream()
+    full, stream = inputs.stream()(values, floors), inputs.stream()
     borders = [0, *np.cumsum(sizes).clip(0, count).tolist(), count]
     parts = [stream(values[a:b], floors[a:b]) for a, b in pairwise(borders)]
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
-    assert whole.shape == (max(count - inputs.window_frames + 1, 0), inputs.width)
+    np.testing.assert_array_equal(np.concatenate(parts), full)
+    assert full.shape == (max(count - inputs.window_frames + 1, 0), inputs.width)
 
 
 @pytest.mark.parametrize(("described", "kind"), KINDS)

@@ -260,14 +260,14 @@ def test_the_channel_names_the_values_of_its_arrays(logs, model_file):
         if key.endswith("_names")
     }
     info = LogReader(logs[0])
-    (said,) = (m.decode() for m in info.messages(["/mic/info"]))
+    (output,) = (m.decode() for m in info.messages(["/mic/info"]))
     assert named == {
-        ("/mic/features", "values"): said.feature_names,
-        ("/mic/statistics", "mean"): said.feature_names,
-        ("/mic/statistics", "std"): said.feature_names,
-        ("/mic/label", "probabilities"): said.labels,
+        ("/mic/features", "values"): output.feature_names,
+        ("/mic/statistics", "mean"): output.feature_names,
+        ("/mic/statistics", "std"): output.feature_names,
+        ("/mic/label", "probabilities"): output.labels,
     }
-    assert said.labels == list(load_model(model_file).classes)
+    assert output.labels == list(load_model(model_file).classes)
 
 
 def until_the_cut(messages):
@@ -299,14 +299,14 @@ def chunks(data):
 
 def test_a_file_cut_anywhere_is_read_up_to_its_last_whole_chunk(recorded, tmp_path):
     _, unfinished = recorded
-    whole = unfinished.read_bytes()
-    layout = chunks(whole)
+    full = unfinished.read_bytes()
+    layout = chunks(full)
     assert len(layout) > 2
     middle = layout[len(layout) // 2][0]
     cut = tmp_path / "cut.mcap.active"
     rng = np.random.default_rng(5)
-    for length in [*rng.integers(1000, len(whole), 50).tolist(), middle - 1, middle, len(whole)]:
-        cut.write_bytes(whole[:length])
+    for length in [*rng.integers(1000, len(full), 50).tolist(), middle - 1, middle, len(full)]:
+        cut.write_bytes(full[:length])
         with cut.open("rb") as stream:
             records = StreamReader(stream).records
             streamed = until_the_cut(r for r in records if isinstance(r, Message))

@@ -113,7 +113,7 @@ def command(capfd, tmp_path, day, model_file):
     return run_on
 
 
-def told(result, log):
+def reported(result, log):
     """What a command says, but for where the logs are, how fast it was, and what is drawn."""
     texts = (_HIDDEN.sub("", text.replace(str(log.parents[4]), "")) for text in result[1:])
     return result.returncode, *(_TOOK.sub("", text) for text in texts)
@@ -121,7 +121,7 @@ def told(result, log):
 
 @pytest.mark.parametrize("words", AMONG)
 def test_among_the_logs_it_is_passed_over(command, homes, words):
-    plain, mixed = (told(command(log, words), log) for log in homes.values())
+    plain, mixed = (reported(command(log, words), log) for log in homes.values())
     assert mixed == plain
 
 

@@ -50,7 +50,7 @@ def logs(recorded, tmp_path):
     return shutil.copytree(recorded, tmp_path / "logs")
 
 
-def heard_in(log, microphones=MICROPHONES):
+def recorded_in(log, microphones=MICROPHONES):
     """Microphones of which the second began to listen a little later."""
     starts = [START + i * 1_234_567 for i in range(len(microphones))]
     return {
@@ -59,18 +59,18 @@ def heard_in(log, microphones=MICROPHONES):
     }
 
 
-def read_labels(path, heard, microphone=None):
+def read_labels(path, labelled, microphone=None):
     """Marks of a file of which nothing may be left out, and whose labels are names of classes."""
-    return import_labels(path, heard, ImportOptions(microphone, strict=True), refuse).by_log
+    return import_labels(path, labelled, ImportOptions(microphone, strict=True), refuse).by_log
 
 
 def refuse(folded):
     raise DataError(f"not names of classes: {folded}")
 
 
-def there_and_back(path, marks, heard):
-    write_labels(path, marks, heard)
-    ((_, found),) = read_labels(path, heard).items()
+def there_and_back(path, marks, labelled):
+    write_labels(path, marks, labelled)
+    ((_, found),) = read_labels(path, labelled).items()
     return sorted(found)
 
 
@@ -84,9 +84,9 @@ def marks_of(draw, unit=1, end=HOUR):
         borders = sorted(draw(st.sets(times, min_size=2, max_size=12)))
         for first, last in pairwise(borders):
             if draw(st.booleans()):
-                says = draw(NAMES), draw(st.integers(0, LATEST)), draw(NAMES)
+                states = draw(NAMES), draw(st.integers(0, LATEST)), draw(NAMES)
                 span = START + first * unit, START + last * unit
-                found.append(Mark(name, *span, draw(labels), *says))
+                found.append(Mark(name, *span, draw(labels), *states))
     assume(found)
     return sorted(found)
 
@@ -97,21 +97,21 @@ def test_marks_go_through_a_file_and_lose_only_what_it_has_no_place_for(
     tmp_path_factory, marks, suffix
 ):
     path = tmp_path_factory.mktemp("labels") / f"labels{suffix}"
-    heard = heard_in(path)
+    labelled = recorded_in(path)
     if suffix == ".txt":
         marks = [mark for mark in marks if mark.microphone == marks[0].microphone]
-        heard = {marks[0].microphone: heard[marks[0].microphone]}
+        labelled = {marks[0].microphone: labelled[marks[0].microphone]}
     kept = len(Mark._fields) if suffix in SAYING else 4
-    assert there_and_back(path, marks, heard) == [Mark(*mark[:kept]) for mark in marks]
+    assert there_and_back(path, marks, labelled) == [Mark(*mark[:kept]) for mark in marks]
 
 
 @given(marks=marks_of(unit=MILLISECOND))
 @settings(deadline=None)
 def test_marks_of_whole_milliseconds_go_through_elan_as_they_are(tmp_path_factory, marks):
     path = tmp_path_factory.mktemp("labels") / "labels.eaf"
-    heard = heard_in(path)
+    labelled = recorded_in(path)
     marks = [*marks, Mark("hall", START, START + MILLISECOND, "first")]  # when ELAN's time begins
-    assert there_and_back(path, marks, heard) == sorted(marks)
+    assert there_and_back(path, marks, labelled) == sorted(marks)
 
 
 @given(marks=marks_of(end=HOUR - 100 * MILLISECOND))  # what is beyond all that was heard is refused
@@ -120,7 +120,7 @@ def test_elan_rounds_marks_and_none_vanishes_overlaps_or_moves_an_older_one(
     tmp_path_factory, marks
 ):
     path = tmp_path_factory.mktemp("labels") / "labels.eaf"
-    found = there_and_back(path, marks, heard_in(path))
+    found = there_and_back(path, marks, recorded_in(path))
     assert [mark[3:] + mark[:1] for mark in found] == [mark[3:] + mark[:1] for mark in marks]
     if all(mark.end - mark.start > MILLISECOND for mark in marks):
         for mark, rounded in zip(marks, found, strict=True):
@@ -131,16 +131,16 @@ def test_elan_rounds_marks_and_none_vanishes_overlaps_or_moves_an_older_one(
 
 @pytest.mark.parametrize("suffix", EXACT)
 def test_after_most_of_a_year_no_nanosecond_is_lost(tmp_path, suffix):
-    heard = {"hall": Coverage([tmp_path], [START], [START + 24 * 365 * HOUR])}
+    labelled = {"hall": Coverage([tmp_path], [START], [START + 24 * 365 * HOUR])}
     begin = START + 24 * 300 * HOUR + 123_456_789
     mark = Mark("hall", begin, begin + 987_654_321, "cry")
-    assert there_and_back(tmp_path / f"labels{suffix}", [mark], heard) == [mark]
+    assert there_and_back(tmp_path / f"labels{suffix}", [mark], labelled) == [mark]
 
 
 def test_many_marks_within_a_millisecond_stay_apart_in_elan(tmp_path):
-    heard = heard_in(tmp_path)
+    labelled = recorded_in(tmp_path)
     marks = [Mark("hall", START + i * 1000, START + i * 1000 + 900, "cry") for i in range(40)]
-    found = there_and_back(tmp_path / "labels.eaf", marks, heard)
+    found = there_and_back(tmp_path / "labels.eaf", marks, labelled)
     assert [(m.start - START) // MILLISECOND for m in found] == list(range(40))
 
 
@@ -149,10 +149,10 @@ def test_a_file_that_says_when_it_begins_fits_when_older_logs_are_gone(tmp_path,
     path = tmp_path / f"labels{suffix}"
     earlier = {
         name: Coverage([tmp_path, tmp_path], [START - HOUR, one.starts[0]], [START, one.ends[0]])
-        for name, one in heard_in(tmp_path).items()
+        for name, one in recorded_in(tmp_path).items()
     }
     write_labels(path, SOME, earlier)
-    (found,) = read_labels(path, heard_in(tmp_path)).values()
+    (found,) = read_labels(path, recorded_in(tmp_path)).values()
     if suffix != ".eaf":
         assert sorted(found) == SOME
     assert new_marks(found, SOME) == []
@@ -164,14 +164,14 @@ def test_a_file_that_says_when_it_begins_fits_when_older_logs_are_gone(tmp_path,
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 def test_what_an_elan_file_says_of_its_encoding_changes_no_name(tmp_path, declared, encoding):
-    heard = heard_in(tmp_path)
+    labelled = recorded_in(tmp_path)
     mark = SOME[0]._replace(reviewer="Jörg 日本")
-    write_labels(tmp_path / "written.eaf", [mark], heard)
+    write_labels(tmp_path / "written.eaf", [mark], labelled)
     text = (tmp_path / "written.eaf").read_text("utf-8")
     assert 'encoding="UTF-8"' in text
     path = tmp_path / "labels.eaf"
     path.write_bytes(text.replace("UTF-8", declared).encode(encoding))
-    ((_, (found,)),) = read_labels(path, heard).items()
+    ((_, (found,)),) = read_labels(path, labelled).items()
     assert (found.reviewer, found.label) == ("Jörg 日本", mark.label)
 
 
@@ -181,14 +181,14 @@ def test_what_an_elan_file_says_of_its_encoding_changes_no_name(tmp_path, declar
 def test_a_name_that_a_spreadsheet_would_run_is_disarmed_in_csv_and_read_as_it_was(tmp_path, name):
     path = tmp_path / "labels.csv"
     mark = SOME[0]._replace(reviewer=name)
-    assert there_and_back(path, [mark], heard_in(tmp_path)) == [mark]
+    assert there_and_back(path, [mark], recorded_in(tmp_path)) == [mark]
     (row,) = csv.DictReader(path.read_text().splitlines())
     assert row["reviewer"] == (name if name in {"'x", "-5"} else f"'{name}")
 
 
 def test_pympi_reads_what_elan_would(tmp_path):
     path = tmp_path / "labels.eaf"
-    write_labels(path, SOME, heard_in(tmp_path))
+    write_labels(path, SOME, recorded_in(tmp_path))
     document = pympi.Elan.Eaf(path)
     times = {
         name: document.get_annotation_data_for_tier(name) for name in document.get_tier_names()
@@ -217,7 +217,7 @@ def test_what_pympi_and_people_write_as_elan_is_read(tmp_path):
     document.add_tier("remarks", "remark", parent="sounds")
     document.add_ref_annotation("remarks", "sounds", 1600, "on the telephone")
     document.to_file(path)
-    found = read_labels(path, heard_in(tmp_path, ["hall"]))[tmp_path]
+    found = read_labels(path, recorded_in(tmp_path, ["hall"]))[tmp_path]
     assert found == [
         Mark("hall", START + 1500 * MILLISECOND, START + 2500 * MILLISECOND, "speech", "Ann"),
         Mark("hall", START + 2500 * MILLISECOND, START + 3000 * MILLISECOND, "coughing", "Ann"),
@@ -234,17 +234,17 @@ def test_a_tier_of_elan_below_another_is_read_where_it_is_chosen(tmp_path):
     document.add_annotation("sounds", 1500, 2500, "speech")
     document.to_file(path)
     options = ImportOptions(choice=Choice(["sounds"]), strict=True)
-    found = import_labels(path, heard_in(tmp_path, ["hall"]), options, refuse).by_log[tmp_path]
+    found = import_labels(path, recorded_in(tmp_path, ["hall"]), options, refuse).by_log[tmp_path]
     span = START + 1500 * MILLISECOND, START + 2500 * MILLISECOND
     assert found == [Mark("hall", *span, "speech")]
 
 
 def test_pyannote_reads_and_writes_rttm_alike(tmp_path):
     path = tmp_path / "labels.rttm"
-    heard = heard_in(tmp_path)
-    write_labels(path, SOME, heard)
+    labelled = recorded_in(tmp_path)
+    write_labels(path, SOME, labelled)
     loaded = load_rttm(path)
-    late = heard["kitchen"].starts[0]
+    late = labelled["kitchen"].starts[0]
     assert list(loaded["hall"].itertracks(yield_label=True)) == [
         (Segment(1, 2), 0, "speech"),
         (Segment(2, 3), 1, "coughing"),
@@ -256,7 +256,7 @@ def test_pyannote_reads_and_writes_rttm_alike(tmp_path):
     written[Segment(0.25, 1.5)] = "speech"
     with path.open("w") as stream:
         written.write_rttm(stream)
-    (found,) = read_labels(path, heard)[tmp_path]
+    (found,) = read_labels(path, labelled)[tmp_path]
     assert found == Mark("hall", START + SECOND // 4, START + SECOND * 3 // 2, "speech")
 
 
@@ -267,13 +267,13 @@ def test_rttm_of_older_tools_and_its_other_lines_are_read(tmp_path):
         "SPKR-INFO hall 1 <NA> <NA> <NA> unknown speech <NA>\n\n"
         "SPEAKER hall 1   1.50   .50 <NA> <NA> speech <NA>\n"
     )
-    (found,) = read_labels(path, heard_in(tmp_path))[tmp_path]
+    (found,) = read_labels(path, recorded_in(tmp_path))[tmp_path]
     assert found == Mark("hall", START + SECOND * 3 // 2, START + SECOND * 2, "speech")
 
 
 def test_a_selection_table_has_the_columns_of_raven(tmp_path):
     path = tmp_path / "day.Table.1.selections.txt"
-    write_labels(path, SOME, heard_in(tmp_path))
+    write_labels(path, SOME, recorded_in(tmp_path))
     with path.open(newline="") as stream:
         rows = list(csv.DictReader(stream, delimiter="\t"))
     assert rows[0] == {
@@ -303,7 +303,7 @@ def test_a_table_that_raven_saved_is_known_by_its_content_and_its_views_are_one(
         b"1\tSpectrogram 1\t1\t6.709509878\t15.096397225\t1739.0\t3798.8\t8.38\tspeech\r\n"
         b"2\tSpectrogram 1\t1\t29.383026016\t40.257059266\t1587.1\t4136.5\t\tcoughing\r\n"
     )
-    found = read_labels(path, heard_in(tmp_path, ["hall"]))[tmp_path]
+    found = read_labels(path, recorded_in(tmp_path, ["hall"]))[tmp_path]
     assert found == [
         Mark("hall", START + 6_709_509_878, START + 15_096_397_225, "speech"),
         Mark("hall", START + 29_383_026_016, START + 40_257_059_266, "coughing"),
@@ -312,7 +312,7 @@ def test_a_table_that_raven_saved_is_known_by_its_content_and_its_views_are_one(
 
 def test_label_studio_gets_a_task_for_each_microphone(tmp_path):
     path = tmp_path / "tasks.json"
-    write_labels(path, SOME, heard_in(tmp_path))
+    write_labels(path, SOME, recorded_in(tmp_path))
     hall, kitchen = json.loads(path.read_text())
     assert hall["data"] == {
         "audio": "hall.wav",
@@ -370,7 +370,7 @@ def test_an_export_of_label_studio_says_who_annotated_and_when(tmp_path, by, nam
     cancelled = task(item(1, 2, "speech"), was_cancelled=True)
     done |= {"predictions": [{"result": [item(0, 1, "cry")]}]}
     path = tasks_file(tmp_path, done, cancelled)
-    (found,) = read_labels(path, heard_in(tmp_path, ["hall"]))[tmp_path]
+    (found,) = read_labels(path, recorded_in(tmp_path, ["hall"]))[tmp_path]
     span = START + 12_778_410_892, START + 28_505_685_836
     assert found == Mark("hall", *span, "speech", name, 1_615_328_168_728_353_000)
 
@@ -379,14 +379,14 @@ def test_predictions_that_label_studio_would_import_are_read_but_not_those_besid
     tmp_path,
 ):
     predicted = task(item(1, 2, "speech"), kind="predictions", model_version="m", created_at="x")
-    heard = heard_in(tmp_path, ["hall"])
+    labelled = recorded_in(tmp_path, ["hall"])
     path = tasks_file(tmp_path, predicted)
-    assert read_labels(path, heard)[tmp_path] == [
+    assert read_labels(path, labelled)[tmp_path] == [
         Mark("hall", START + SECOND, START + 2 * SECOND, "speech")
     ]
     path = tasks_file(tmp_path, predicted | {"annotations": []})
     with pytest.raises(DataError, match="holds no labels"):
-        read_labels(path, heard)
+        read_labels(path, labelled)
 
 
 EAF = """<?xml version="1.0" encoding="UTF-8"?>
@@ -568,7 +568,7 @@ def test_a_label_that_cannot_be_is_refused_with_its_place(tmp_path, case):
     labels = tmp_path / name
     labels.write_text(text)
     with pytest.raises(DataError) as refused:
-        read_labels(labels, heard_in(tmp_path, ["mic"]))
+        read_labels(labels, recorded_in(tmp_path, ["mic"]))
     assert str(refused.value).startswith(f"{tmp_path}/{line}")
     assert "\n" not in str(refused.value)
 
@@ -612,20 +612,20 @@ def test_a_class_that_no_model_knows_is_taken_for_it_is_new(logs, hearthlog, tmp
 
 
 def test_of_several_microphones_one_is_chosen_where_the_file_has_no_place_for_them(tmp_path):
-    heard = heard_in(tmp_path)
+    labelled = recorded_in(tmp_path)
     with pytest.raises(DataError, match=r"choose one with --microphone \(hall, kitchen\)"):
-        write_labels(tmp_path / "labels.txt", SOME, heard)
-    write_labels(tmp_path / "labels.txt", SOME[:2], heard)
+        write_labels(tmp_path / "labels.txt", SOME, labelled)
+    write_labels(tmp_path / "labels.txt", SOME[:2], labelled)
     with pytest.raises(DataError, match=r":1: of which microphone\? choose one with"):
-        read_labels(tmp_path / "labels.txt", heard)
-    (found,) = read_labels(tmp_path / "labels.txt", heard, "hall").values()
+        read_labels(tmp_path / "labels.txt", labelled)
+    (found,) = read_labels(tmp_path / "labels.txt", labelled, "hall").values()
     assert [mark[:4] for mark in found] == [mark[:4] for mark in SOME[:2]]
 
 
 def test_labels_of_another_microphone_are_counted_where_one_is_chosen(tmp_path):
-    path, heard = tmp_path / "labels.csv", heard_in(tmp_path)
-    write_labels(path, SOME, heard)
-    found = import_labels(path, heard, ImportOptions("kitchen"), refuse)
+    path, labelled = tmp_path / "labels.csv", recorded_in(tmp_path)
+    write_labels(path, SOME, labelled)
+    found = import_labels(path, labelled, ImportOptions("kitchen"), refuse)
     assert found.moved == {"hall": 2}
     (marks,) = found.by_log.values()
     assert [mark.microphone for mark in marks] == ["kitchen"] * 3
@@ -636,13 +636,13 @@ def test_what_would_be_too_large_to_be_read_again_is_not_written(tmp_path):
     marks = [Mark("hall", time, time + MILLISECOND, "cry", "x" * 200) for time in times]
     path = tmp_path / "labels.csv"
     with pytest.raises(DataError, match="would be larger than 16 MB; export fewer logs"):
-        write_labels(path, marks, heard_in(tmp_path))
+        write_labels(path, marks, recorded_in(tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_xml_cannot_hold_of_a_name_is_replaced(tmp_path):
     (found,) = there_and_back(
-        tmp_path / "a.eaf", [SOME[0]._replace(reviewer="A\uffffn")], heard_in(tmp_path)
+        tmp_path / "a.eaf", [SOME[0]._replace(reviewer="A\uffffn")], recorded_in(tmp_path)
     )
     assert found.reviewer == "A\N{REPLACEMENT CHARACTER}n"
 
@@ -650,7 +650,7 @@ def test_what_xml_cannot_hold_of_a_name_is_replaced(tmp_path):
 @pytest.mark.parametrize("suffix", SAYING)
 def test_what_would_steer_a_terminal_is_replaced(tmp_path, suffix):
     mark = SOME[0]._replace(reviewer="A\x9b31mn", corrects="\x8flive")
-    (found,) = there_and_back(tmp_path / f"a{suffix}", [mark], heard_in(tmp_path))
+    (found,) = there_and_back(tmp_path / f"a{suffix}", [mark], recorded_in(tmp_path))
     assert (found.reviewer, found.corrects) == (
         "A\N{REPLACEMENT CHARACTER}31mn",
         "\N{REPLACEMENT CHARACTER}live",
@@ -737,13 +737,13 @@ def test_whatever_is_in_a_label_file_it_is_read_or_refused_in_one_line(
 ):
     path = tmp_path_factory.mktemp("labels") / f"labels{suffix}"
     path.write_bytes(b"".join(parts))
-    heard = {"mic": Coverage([path], [SECOND], [9 * SECOND])}
-    said = []
+    labelled = {"mic": Coverage([path], [SECOND], [9 * SECOND])}
+    output = []
     for strict in (True, False):
         try:
             options = ImportOptions(strict=strict)
-            found = import_labels(path, heard, options, lambda _: None)
-            said += [str(error) for _, error in found.left_out.kinds()]
+            found = import_labels(path, labelled, options, lambda _: None)
+            output += [str(error) for _, error in found.left_out.kinds()]
         except DataError as error:
-            said.append(str(error))
-    assert not any("\n" in line for line in said)
+            output.append(str(error))
+    assert not any("\n" in line for line in output)

@@ -60,10 +60,10 @@ class Tones:
         spectrum = np.abs(np.fft.rfft(samples * np.hanning(len(samples))))
         tone = int(spectrum.argmax()) * 16_000 // len(samples)
         named = next((name for hertz, name in TONES.items() if abs(tone - hertz) < 50), None)
-        return said(*([] if named is None or np.abs(samples).max() < 0.05 else [named]))
+        return output(*([] if named is None or np.abs(samples).max() < 0.05 else [named]))
 
 
-def said(*names):
+def output(*names):
     """Return what is logged where some names are said, and no others."""
     values = np.full(len(PROJECTION.names), -127, np.int8)
     for name in names:
@@ -75,7 +75,7 @@ def logits_of(name, logits):
     """Return embeddings of successive windows; None where there was none."""
     column = PROJECTION.names.index(NAMES[name].group)
     numbers = [number for number, logit in enumerate(logits) if logit is not None]
-    values = np.tile(said(), (len(numbers), 1))
+    values = np.tile(output(), (len(numbers), 1))
     steps = [logits[number] / float(PROJECTION.steps[column]) for number in numbers]
     values[:, column] = np.clip(np.rint(steps), -127, 127)
     frames = 10 * np.array(numbers, np.int64)
@@ -85,7 +85,7 @@ def logits_of(name, logits):
 def windows_of(*names):
     """Return embeddings of successive windows, in each of which some names are said."""
     frames = 10 * np.arange(len(names), dtype=np.int64)
-    values = np.stack([said(*each) for each in names])
+    values = np.stack([output(*each) for each in names])
     return Embeddings(frames, START + frames * FRAME_NANOSECONDS, values)
 
 
@@ -166,22 +166,22 @@ def test_a_sound_that_takes_long_to_be_certain_is_labelled_later_and_never_lost(
 @given(LOGITS, st.lists(st.integers(1, 70), min_size=1, max_size=4))
 def test_labels_are_the_same_in_pieces_of_any_size(logits, sizes):
     embeddings, count = logits_of("rain", logits), 10 * len(logits) + 60
-    whole = labelled(NamesLabeller(classifier_of("rain", "dog"), SOURCE), embeddings, count)
+    full = labelled(NamesLabeller(classifier_of("rain", "dog"), SOURCE), embeddings, count)
     parts = labelled(NamesLabeller(classifier_of("rain", "dog"), SOURCE), embeddings, count, sizes)
-    assert parts == whole
+    assert parts == full
 
 
 @given(st.lists(st.sampled_from([None, -3.0, -2.0, 3.0]), min_size=60, max_size=90))
 def test_what_was_heard_before_leaves_no_trace_once_that_is_certain(logits):
     embeddings, count = logits_of("rain", logits), 10 * len(logits)
     classifier = classifier_of("rain")
-    whole, _ = labelled(NamesLabeller(classifier, SOURCE), embeddings, count)
+    full, _ = labelled(NamesLabeller(classifier, SOURCE), embeddings, count)
     late = NamesLabeller(classifier, SOURCE)
     for begin in range(200, count, 10):
         stamps = START + (begin + np.arange(10)) * FRAME_NANOSECONDS
         labels, _ = pushed(late, embeddings, begin, stamps)
         if late.states_converged:
-            assert classes_of(labels) == [whole[frame] for frame in labels.frames.tolist()]
+            assert classes_of(labels) == [full[frame] for frame in labels.frames.tolist()]
 
 
 def test_of_two_names_at_once_that_of_the_shorter_sound_counts():
@@ -225,7 +225,7 @@ def written(log: Path) -> list[tuple[str, int, bytes]]:
     return [(m.topic, m.log_time, m.data) for m in LogReader(log).messages(TOPICS)]
 
 
-def heard(log: Path, topic: str = TOPICS[1]) -> list[tuple[str, int, int]]:
+def recorded(log: Path, topic: str = TOPICS[1]) -> list[tuple[str, int, int]]:
     segments = [m.decode() for m in LogReader(log).messages([topic])]
     return [
         (one.label, (one.header.stamp.sec - START // 10**9), one.duration.sec)
@@ -238,7 +238,7 @@ def test_a_recorder_labels_the_names_that_its_model_was_not_taught(
     sound, tmp_path, monkeypatch, capfd
 ):
     log = record(sound, tmp_path / "logs", monkeypatch)
-    assert [label for label, _, _ in heard(log)] == ["dog", "rain"]  # not speech: general has it
+    assert [label for label, _, _ in recorded(log)] == ["dog", "rain"]  # not speech: general has it
     assert run(capfd, "doctor", log).stdout == "1 file: 0 errors, 0 warnings\n"
     again = run(capfd, "replay", log, "-o", tmp_path / "again", "--scenario", "audioset=audioset")
     assert again.returncode == 0, again.stderr
@@ -254,10 +254,10 @@ def test_a_relabelling_of_a_log_with_embeddings_gives_all_names(
     assert written(log) == []
     assert run(capfd, "relabel", log, "--model", "audioset").returncode == 0
     (layer,) = (tmp_path / "logs").rglob("*.relabel-audioset.mcap")
-    named = heard(layer, "/mic/relabel/audioset/segment")
+    named = recorded(layer, "/mic/relabel/audioset/segment")
     assert [label for label, _, _ in named] == ["dog", "speech", "rain"]
     alone = record(sound, tmp_path / "alone", monkeypatch, model="none")
-    assert heard(alone) == named
+    assert recorded(alone) == named
 
 
 def test_hours_that_are_relabelled_apart_have_the_names_of_one_long_recording(
@@ -344,13 +344,13 @@ def test_a_model_that_is_taught_a_class_takes_it_from_the_names(tmp_path, monkey
 def test_a_scenario_of_names_without_a_network_says_so_and_is_silent(sound, tmp_path, capfd):
     settings = Settings(output=tmp_path, model=GENERAL, scenarios={"audioset": AUDIOSET})
     (log,) = record_files(settings, FileSource([sound], START), Flag()).logs
-    assert heard(log) == []
+    assert recorded(log) == []
     assert "it labels nothing (hearthlog models fetch yamnet)" in capfd.readouterr().err
 
 
 def test_names_alone_can_label_a_home_and_the_log_is_sound(sound, tmp_path, monkeypatch, capfd):
     log = record(sound, tmp_path, monkeypatch, model=AUDIOSET, scenarios={})
-    assert [label for label, _, _ in heard(log, "/mic/segment")] == ["dog", "speech", "rain"]
+    assert [label for label, _, _ in recorded(log, "/mic/segment")] == ["dog", "speech", "rain"]
     assert run(capfd, "doctor", log).returncode == 0
 
 

@@ -167,11 +167,11 @@ def test_there_is_no_such_folder():
 @pytest.fixture
 def watchdog():
     """A server that remembers what it was asked for."""
-    asked = []
+    requested = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            asked.append(self.path)
+            requested.append(self.path)
             self.send_response(200)
             self.end_headers()
 
@@ -180,20 +180,20 @@ def watchdog():
 
     server = HTTPServer(("127.0.0.1", 0), Handler)
     Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}/mine", asked
+    yield f"http://127.0.0.1:{server.server_port}/mine", requested
     server.shutdown()
     server.server_close()
 
 
 def test_a_watchdog_is_told_whether_all_is_well(labmic, tmp_path, watchdog):
-    url, asked = watchdog
+    url, requested = watchdog
     logs = tmp_path / "logs"
     with recording(labmic, logs):
         wait_for_frames(logs, 30)
         doctor(logs, "--ping", url)
     (tmp_path / "url").write_text(f"{url}\n")
     doctor(logs, "--ping-file", tmp_path / "url")
-    assert asked == ["/mine", "/mine/fail"]
+    assert requested == ["/mine", "/mine/fail"]
 
 
 def test_a_watchdog_that_hangs_is_waited_for_a_while(monkeypatch):
@@ -213,5 +213,5 @@ def test_what_is_no_address_of_a_watchdog_is_refused(tmp_path, url):
     result = doctor(tmp_path, "--ping-file", tmp_path / "url")
     assert (result.returncode, result.stdout) == (1, "")
     assert "has no web address" in result.stderr
-    said = result.stderr.replace(str(tmp_path / "url"), "").replace("https://hc-ping.com", "")
-    assert url not in said
+    output = result.stderr.replace(str(tmp_path / "url"), "").replace("https://hc-ping.com", "")
+    assert url not in output

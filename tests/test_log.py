@@ -133,10 +133,10 @@ def test_every_file_says_in_words_what_is_recorded(description):
     log.finish()
     for path in log.finished:
         (first,) = LogReader(path).messages(["/rosout"])
-        said = first.decode()
-        assert first.log_time == nanoseconds(said.stamp) == features(path)[1][0]
-        assert (said.level, said.name) == (said.INFO, "hearthlog.mic")
-        assert said.msg == "recording test: no model, no labels"
+        output = first.decode()
+        assert first.log_time == nanoseconds(output.stamp) == features(path)[1][0]
+        assert (output.level, output.name) == (output.INFO, "hearthlog.mic")
+        assert output.msg == "recording test: no model, no labels"
 
 
 def test_another_file_begins_where_one_has_grown_large(description, tmp_path):

@@ -300,13 +300,16 @@ def test_each_microphone_has_its_own_gaps_in_the_order_of_log_time(recover, tmp_
         writer.flush()
     writer.finish()
     path = recover(broken((tmp_path / "two.mcap").read_bytes(), 2, 3))
-    heard = [(item.topic, item.log_time) for item in LogReader(path).messages()]
-    assert [time for _, time in heard] == sorted(time for _, time in heard)
+    labelled = [(item.topic, item.log_time) for item in LogReader(path).messages()]
+    assert [time for _, time in labelled] == sorted(time for _, time in labelled)
     lost = START + 2 * BLOCK * FRAME_NANOSECONDS, START + 4 * BLOCK * FRAME_NANOSECONDS
     assert gaps(path) == [
         (lost[0] + late, lost[1] + late, 2 * BLOCK, LOG_DAMAGED) for late in (0, 20_000_000)
     ]
-    assert [topic for topic, _ in heard if topic.endswith("/gap")] == ["/kitchen/gap", "/hall/gap"]
+    assert [topic for topic, _ in labelled if topic.endswith("/gap")] == [
+        "/kitchen/gap",
+        "/hall/gap",
+    ]
 
 
 def test_of_another_recording_in_the_same_file_no_frames_are_missing(log, recover, tmp_path):

@@ -17,15 +17,15 @@ ZONE = "class/thermal/thermal_zone{}/temp"
 def sys(tmp_path):
     """A tree such as /sys of a small board."""
 
-    def tell(path, text):
+    def write(path, text):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(text)
         return tmp_path
 
-    tell(ZONE.format(0), "51200\n")
-    tell(ZONE.format(1), "48000\n")
-    tell(THROTTLED, "0x0\n")
-    return tell
+    write(ZONE.format(0), "51200\n")
+    write(ZONE.format(1), "48000\n")
+    write(THROTTLED, "0x0\n")
+    return write
 
 
 def test_the_hottest_part_counts(sys, tmp_path):
@@ -67,10 +67,10 @@ def test_the_log_tells_of_the_machine_and_of_each_microphone(labmic, tmp_path):
     labmic.configure(data=noise.astype(np.int16))
     with recording(labmic, logs):
         wait_for_frames(logs, 250)
-    told = [status for each in read(logs, "diagnostics") for status in each.status]
-    machine = [each for each in told if each.name == "hearthlog: home machine"]
+    reported = [status for each in read(logs, "diagnostics") for status in each.status]
+    machine = [each for each in reported if each.name == "hearthlog: home machine"]
     assert 1 <= len(machine) <= 3
-    microphone = [each for each in told if each.name == "hearthlog: mic"][-1]
+    microphone = [each for each in reported if each.name == "hearthlog: mic"][-1]
     values = {pair.key: pair.value for pair in microphone.values}
     assert float(values["level_dbfs"]) <= float(values["peak_dbfs"]) <= 0.0
     assert values["overruns"] == "0"

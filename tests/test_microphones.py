@@ -85,13 +85,13 @@ def steps(samples):
 def index_error(microphone, blocks):
     """First sample of each block against the index at its ADC time, in samples."""
     expected = [microphone.index_at(round(seconds * 1e9)) for seconds in blocks["adc_time"]]
-    heard = blocks["samples"][:, 0].astype(np.int64) + 32_768
-    return (np.array(expected) - heard + 32_768) % 65_536 - 32_768
+    recorded = blocks["samples"][:, 0].astype(np.int64) + 32_768
+    return (np.array(expected) - recorded + 32_768) % 65_536 - 32_768
 
 
-def is_stretch_of_loop(heard, played):
-    laps = heard.size // played.size + 2
-    return heard.tobytes() in np.tile(played, laps).tobytes()
+def is_stretch_of_loop(recorded, played):
+    laps = recorded.size // played.size + 2
+    return recorded.tobytes() in np.tile(played, laps).tobytes()
 
 
 def hears_only(recording, level):
@@ -164,7 +164,7 @@ def test_given_samples_are_heard_in_a_loop(labmic, record):
 
 
 def test_two_microphones_are_heard_and_unplugged_apart(labmic, record):
-    kitchen = labmic.beside("kitchen")
+    kitchen = labmic.add_device("kitchen")
     first, second = record(labmic), record(kitchen)
     first.wait_for(5)
     second.wait_for(5)

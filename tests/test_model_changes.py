@@ -78,7 +78,7 @@ def count(logs, kind):
     return 0
 
 
-def said(logs, level=None):
+def output(logs, level=None):
     lines = [
         item.decode() for log in find_logs(logs) for item in LogReader(log).messages(["/rosout"])
     ]
@@ -127,7 +127,7 @@ def check_swap(folder, logs, names):
     for path, name in zip(paths[1:], names[1:], strict=True):
         first = features(path)[0][0]
         digest = load_model(folder / f"{name}.safetensors").sha256[:12]
-        assert f"model {name} ({digest}) from frame {first} on" in said(path)
+        assert f"model {name} ({digest}) from frame {first} on" in output(path)
     segments = read(logs, "segment")
     spans = [(s.header.stamp.sec * SECOND + s.header.stamp.nanosec, s.duration) for s in segments]
     for (start, duration), (following, _) in pairwise(spans):
@@ -150,8 +150,8 @@ def test_a_promoted_model_speaks_from_a_frame_on_and_nothing_is_lost(
     check_swap(folder, logs, names)
     sound = np.concatenate(list(read_audio(day)))
     values = features(logs)[2]
-    heard = sound[: len(values) * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
-    np.testing.assert_array_equal(values, DEFAULT.extractor()(heard))
+    recorded = sound[: len(values) * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
+    np.testing.assert_array_equal(values, DEFAULT.extractor()(recorded))
     assert run(capfd, "doctor", logs).returncode == 0
     with chdir(tmp_path):  # the models are looked for in `models`
         result = run(capfd, "replay", logs, "-o", tmp_path / "again")
@@ -199,17 +199,17 @@ def test_a_bad_model_is_refused_once_and_the_old_one_goes_on(folder, tmp_path, d
         wait_for(lambda: count(logs, "label") > 0)
         (folder / "bad.safetensors").write_bytes(b"garbage" * 100)
         put_by_hand(folder, "bad.safetensors")
-        wait_for(lambda: len(said(logs, level=30)) == 1)
+        wait_for(lambda: len(output(logs, level=30)) == 1)
         time.sleep(2.5)  # it is looked at again and again
-        assert len(said(logs, level=30)) == 1
+        assert len(output(logs, level=30)) == 1
         process.send_signal(signal.SIGHUP)
-        wait_for(lambda: len(said(logs, level=30)) == 2)
+        wait_for(lambda: len(output(logs, level=30)) == 2)
         (folder / "champion.safetensors").unlink()
-        wait_for(lambda: len(said(logs, level=30)) == 3)
+        wait_for(lambda: len(output(logs, level=30)) == 3)
         promote(folder, "two")
         wait_for(lambda: count(logs, "info") == 2)
     assert process.returncode == 3
-    refused = said(logs, level=30)
+    refused = output(logs, level=30)
     assert process.errors.splitlines() == [f"hearthlog: {line}" for line in refused]
     assert [line.startswith("model champion refused: ") for line in refused] == [True] * 3
     assert [line.endswith("; going on with one") for line in refused] == [True] * 3
@@ -252,10 +252,10 @@ def test_the_same_model_in_another_file_changes_nothing(folder, monkeypatch):
 
 def test_a_watch_that_is_asked_looks_at_once(folder, monkeypatch):
     monkeypatch.setattr("hearthlog.recorder.labelling.model_watch.LOOK_SECONDS", 3600)
-    asked = SimpleQueue()
-    watch = ModelWatch(folder / "champion.safetensors", asked)
+    requested = SimpleQueue()
+    watch = ModelWatch(folder / "champion.safetensors", requested)
     promote(folder, "two")
-    asked.put(None)
+    requested.put(None)
     assert ready(watch).name == "two"
     watch.close()
 
@@ -336,8 +336,10 @@ def test_a_model_of_which_a_bit_has_changed_is_named_at_the_start_and_labels(
     file.write_bytes(data)
     ModelWatch(file, SimpleQueue(), scenario).close()
     (line,) = capfd.readouterr().err.splitlines()
-    said = rf"{file}: is not as it was written \(digest \w{{12}}, not \w{{12}}\): .* backup.*labell"
-    assert re.search(said, line)
+    output = (
+        rf"{file}: is not as it was written \(digest \w{{12}}, not \w{{12}}\): .* backup.*labell"
+    )
+    assert re.search(output, line)
     assert ("scenario bathroom: " in line) == bool(scenario)
     with pytest.raises(ModelError, match="is not as it was written"):
         load_model(file)
@@ -353,16 +355,16 @@ def test_a_starter_of_which_a_bit_has_changed_is_named(monkeypatch, capfd):
 
 
 def test_a_champion_that_was_replaced_is_named_at_the_start(folder, capfd):
-    def said_at_start():
+    def output_at_start():
         ModelWatch(folder / "champion.safetensors", SimpleQueue()).close()
         return [line for line in capfd.readouterr().err.splitlines() if "was promoted" in line]
 
     insist(folder, load_model(folder / "champion.safetensors").sha256)
-    assert said_at_start() == []
+    assert output_at_start() == []
     file = (folder / "champion.safetensors").resolve()
     shutil.copyfile(starter_file("bathroom"), file)
-    (line,) = said_at_start()
+    (line,) = output_at_start()
     assert line.startswith(f"hearthlog: model {file.stem} is not the file that was promoted")
     for judgement in (folder / "judgements").iterdir():
         judgement.unlink()
-    assert said_at_start() == [], "nothing is known of it"
+    assert output_at_start() == [], "nothing is known of it"

@@ -85,13 +85,13 @@ def sounds():
 @pytest.mark.fast
 def test_events_since_midnight_are_counted_and_only_new_ones_are_told_of(home, broker):
     for minutes_ago in (300, 299.9, 100):  # the second goes on with the first
-        home.heard("coughing", minutes_ago)
-    last = home.heard("coughing", 30, seconds=2.5)
+        home.write_segment("coughing", minutes_ago)
+    last = home.write_segment("coughing", 30, seconds=2.5)
     home.hears("silence")
     with Listener(broker.port) as listener, Bridged(home.folder, broker):
         listener.wait_for(f"{COUGHING}/count_today", "3")
         end = listener.wait_for(f"{COUGHING}/last_heard")
-        start = home.heard("coughing", 0.1)
+        start = home.write_segment("coughing", 0.1)
         listener.wait_for(f"{COUGHING}/count_today", "4")
         event = json.loads(listener.wait_for(f"{ROOT}/mic/event"))
         assert len(listener.payloads(f"{ROOT}/mic/event")) == 1
@@ -120,7 +120,7 @@ def test_a_class_is_on_while_it_is_heard_and_its_event_ends(home, broker):
         listener.wait_for(f"{COUGHING}/on", "ON")
         listener.wait_for(f"{ROOT}/mic/sound", "ON")
         assert listener.values[f"{ROOT}/mic/class/speech/on"] == "OFF"
-        home.heard("coughing", 0.5, seconds=2)
+        home.write_segment("coughing", 0.5, seconds=2)
         home.hears("silence")
         ended = json.loads(listener.wait_for(f"{ROOT}/mic/event_ended"))
     assert ended["event_type"] == "coughing"
@@ -132,8 +132,8 @@ def test_what_is_wrong_is_a_problem_of_the_microphone_that_it_is_about(tmp_path,
         home.hears("silence", microphone)
     with Listener(broker.port) as listener, Bridged(home.folder, broker):
         listener.wait_for(f"{ROOT}/bath/problem", '{"state": "OFF", "text": ""}')
-        home.says("bath", 1, "the microphone clips", level_dbfs="-12.5")
-        home.says("home disk", 2, "full")
+        home.write_status("bath", 1, "the microphone clips", level_dbfs="-12.5")
+        home.write_status("home disk", 2, "full")
         both = '{"state": "ON", "text": "bath: the microphone clips; home disk: full"}'
         listener.wait_for(f"{ROOT}/bath/problem", both)
         listener.wait_for(f"{ROOT}/kitchen/problem", '{"state": "ON", "text": "home disk: full"}')
@@ -295,7 +295,7 @@ def test_home_assistant_is_told_everything_again_when_it_starts(home, broker):
         listener.wait_until(lambda: len(listener.payloads(DISCOVERY)) == before + 1)
         listener.wait_until(lambda: listener.payloads(f"{COUGHING}/on")[-2:] == ["OFF", "OFF"])
     with Listener(broker.port) as listener, Bridged(home.folder, broker, home_assistant=False):
-        home.heard("coughing", 0.1)
+        home.write_segment("coughing", 0.1)
         listener.wait_for(f"{ROOT}/mic/event")
         assert {*listener.payloads(DISCOVERY)[1:]} <= {""}  # what it was told before is cleared
 
@@ -344,7 +344,7 @@ def test_an_output_that_fails_stops_no_other(home, broker):
 
 
 def test_no_event_ends_before_it_begins(home, broker):
-    home.heard("coughing", 0.5)
+    home.write_segment("coughing", 0.5)
     home.hears("silence")
     with Listener(broker.port) as listener, Bridged(home.folder, broker):
         listener.wait_for(f"{ROOT}/mic/event_ended")
@@ -354,7 +354,7 @@ def test_no_event_ends_before_it_begins(home, broker):
 
 @pytest.mark.fast
 def test_a_correction_that_comes_in_is_a_mark_in_the_name_of_its_sender_and_counts(home, broker):
-    start = home.heard("coughing", 20, seconds=3)
+    start = home.write_segment("coughing", 20, seconds=3)
     home.hears("silence")
     with Listener(broker.port) as listener, Bridged(home.folder, broker, commands=True):
         listener.wait_for(f"{COUGHING}/count_today", "1")
@@ -394,8 +394,8 @@ def test_a_class_that_is_switched_off_is_not_told_of_also_after_a_restart(home, 
             listener.wait_for(f"{COUGHING}/on", "OFF")
         with Bridged(home.folder, broker, commands=True):
             home.hears("coughing")
-            home.heard("coughing", 0.1)
-            home.heard("speech", 0.1)
+            home.write_segment("coughing", 0.1)
+            home.write_segment("speech", 0.1)
             listener.wait_for(f"{COUGHING}/count_today", "1")  # the log has it all the same
             event = json.loads(listener.wait_for(f"{ROOT}/mic/event"))
             assert event["event_type"] == "speech"
@@ -416,7 +416,7 @@ def test_what_somebody_left_at_the_broker_silences_nothing_where_no_commands_are
     home, broker
 ):
     home.hears("coughing")
-    start = home.heard("coughing", 0.2)
+    start = home.write_segment("coughing", 0.2)
     last = json.dumps({"id": f"mic-coughing-{start}"})
     left = {f"{ROOT}/told/{label}": "OFF" for label in ("coughing", "%23", "speech")}
     with Listener(broker.port) as listener:
@@ -445,8 +445,8 @@ def test_what_was_switched_off_stays_so_without_commands_and_one_is_told_how_to_
             listener.publish(f"{ROOT}/command", json.dumps(command))
             listener.wait_for(f"{COUGHING}/on", "OFF")
         with Bridged(home.folder, broker) as bridged:
-            home.heard("coughing", 0.1)
-            home.heard("speech", 0.1)
+            home.write_segment("coughing", 0.1)
+            home.write_segment("speech", 0.1)
             assert json.loads(listener.wait_for(f"{ROOT}/mic/event"))["event_type"] == "speech"
         (line,) = bridged.problems
         assert line.startswith("mqtt: not published: coughing; ")
@@ -629,7 +629,7 @@ def test_what_comes_to_a_broker_later_is_not_taken_for_what_a_bridge_left(home, 
         message.payload, message.retain = text.encode(), True
         assert described(Topics("hearthlog", "home"), message.payload)
         bridged.publisher._take(message)
-        home.heard("coughing", 0.1)
+        home.write_segment("coughing", 0.1)
         listener.wait_for(f"{ROOT}/mic/event")
     assert listener.values[f"{ROOT}/hall/level"] == "-3"
     assert "/hall/" not in json.dumps(kept(home))
@@ -701,11 +701,11 @@ def test_a_bridge_that_is_started_again_tells_of_no_event_twice(home, broker):
     home.hears("silence")
     with Listener(broker.port) as listener:
         with Bridged(home.folder, broker):
-            first = home.heard("coughing", 0.3)
+            first = home.write_segment("coughing", 0.3)
             listener.wait_until(lambda: len(listener.payloads(f"{ROOT}/mic/event")) == 1)
-        second = home.heard("speech", 0.2)  # while there is no bridge
+        second = home.write_segment("speech", 0.2)  # while there is no bridge
         with Bridged(home.folder, broker):
-            third = home.heard("laughing", 0.1)
+            third = home.write_segment("laughing", 0.1)
             listener.wait_until(lambda: len(listener.payloads(f"{ROOT}/mic/event")) == 3)
         ids = [json.loads(event)["id"] for event in listener.payloads(f"{ROOT}/mic/event")]
     assert ids == [f"mic-coughing-{first}", f"mic-speech-{second}", f"mic-laughing-{third}"]
@@ -759,7 +759,7 @@ def test_commands_are_not_taken_unless_the_configuration_says_so(home, broker):
     with Listener(broker.port) as listener, Bridged(home.folder, broker):
         listener.wait_for(f"{ROOT}/bridge", "online")
         listener.publish(f"{ROOT}/command", '{"pause_minutes": 30}')
-        home.heard("coughing", 0.1)
+        home.write_segment("coughing", 0.1)
         listener.wait_for(f"{ROOT}/mic/event")
         assert f"{ROOT}/command/answer" not in listener.values
     assert not (home.folder / ".pause").exists()
@@ -768,17 +768,17 @@ def test_commands_are_not_taken_unless_the_configuration_says_so(home, broker):
 def test_a_broker_has_states_and_counts_after_random_kills_as_the_logs_have_them(tmp_path, sounds):
     ending = kill_at_random(tmp_path, sounds, "general", 24, 2, random.Random(3))
     assert any(topic.endswith("/last_heard") for topic in ending.expected)
-    assert ending.wrong == [], ending.said
+    assert ending.wrong == [], ending.output
 
 
 def test_a_recorder_and_a_bridge_that_end_are_said_to_be_away(tmp_path, broker, sounds):
-    config, said = tmp_path / "home.toml", tmp_path / "said"
+    config, output = tmp_path / "home.toml", tmp_path / "said"
     config.write_text(
         f'output = "{tmp_path}/logs"\ntimezone = "{ZONE}"\n'
         f'[bridge.mqtt]\nhost = "127.0.0.1"\nport = {broker.port}\n'
     )
-    recorder = start_recorder(config, sounds, "general", said)
-    bridge = start_bridge(config, said)
+    recorder = start_recorder(config, sounds, "general", output)
+    bridge = start_bridge(config, output)
     with Listener(broker.port) as listener:
         listener.wait_for(f"{ROOT}/mic/listening", "online")
         listener.wait_for(f"{ROOT}/recorder", "online")
@@ -786,7 +786,7 @@ def test_a_recorder_and_a_bridge_that_end_are_said_to_be_away(tmp_path, broker, 
         recorder.wait()
         listener.wait_for(f"{ROOT}/mic/listening", "offline")
         listener.wait_for(f"{ROOT}/recorder", "offline")
-        recorder = start_recorder(config, sounds, "general", said)
+        recorder = start_recorder(config, sounds, "general", output)
         listener.wait_for(f"{ROOT}/mic/listening", "online")
         bridge.send_signal(signal.SIGSTOP)  # for longer than a recorder may be silent
         time.sleep(17)
@@ -820,7 +820,7 @@ def test_a_class_that_is_named_like_a_wildcard_has_topics_of_its_own(tmp_path, b
     hostile = ["silence", "#", "+", "a/b/../c", "%2B", "{{ 1 }}", "$SYS", "é\u0000\n"]
     home = LiveHome(tmp_path / "logs", classes=hostile)
     home.hears("+")
-    home.heard("#", 0.1)
+    home.write_segment("#", 0.1)
     with Listener(broker.port) as listener, Bridged(home.folder, broker) as bridged:
         listener.wait_for(f"{ROOT}/mic/class/%2B/on", "ON")
         listener.wait_for(f"{ROOT}/mic/class/%23/count_today", "1")

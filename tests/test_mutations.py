@@ -17,7 +17,7 @@ def test_a_file_that_was_changed_in_any_way_gives_the_same_or_a_word(files, name
     victim = begin(name, path, tmp_path / name)
     try:
         for mutation in MUTATIONS[:: 2 if name in LABELLED else 1]:
-            said = victim.read(mutation(rng, path.read_bytes()), path.name)
-            assert not said, (mutation.__name__, said)
+            output = victim.read(mutation(rng, path.read_bytes()), path.name)
+            assert not output, (mutation.__name__, output)
     finally:
         victim.close()

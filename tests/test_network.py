@@ -109,17 +109,17 @@ def test_a_source_that_comes_ends_and_comes_back_is_in_one_log_without_its_passw
     logs = tmp_path / "logs"
     address = live_server.address.replace("//", f"//{USER}")
     with recording(Address(address), logs) as process:
-        said = process.stderr.readline()
+        output = process.stderr.readline()
         live_server.condition = "locked"
         wait_for_frames(logs, 60)
         live_server.condition = "ends"
-        said += process.stderr.readline() + process.stderr.readline()
+        output += process.stderr.readline() + process.stderr.readline()
         live_server.condition = "locked"
-        heard = len(features(logs)[0])
-        wait_for_frames(logs, heard + 60)
+        recorded = len(features(logs)[0])
+        wait_for_frames(logs, recorded + 60)
     name = live_server.address
-    assert f"mic: {name} sends no sound of a known format;" in said
-    assert f"mic: {name} has stopped sending" in said
+    assert f"mic: {name} sends no sound of a known format;" in output
+    assert f"mic: {name} has stopped sending" in output
     (log,) = find_logs(logs)
     (gap,) = read(log, "gap")
     assert gap.reason == f"{name} has stopped sending"
@@ -129,7 +129,7 @@ def test_a_source_that_comes_ends_and_comes_back_is_in_one_log_without_its_passw
     assert nanoseconds(gap.header.stamp) + nanoseconds(gap.duration) == stamps[jump + 1]
     assert {info.device for info in read(log, "info")} == {name}
     assert not [line for one in examine(log) for line in one.shown if line.level == "error"]
-    everything = said + process.errors + process.output + contents(log)
+    everything = output + process.errors + process.output + contents(log)
     assert "listener" not in everything
     assert "pass" not in everything.replace("passed", "")
 

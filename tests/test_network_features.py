@@ -65,8 +65,8 @@ def trained(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("model")
     scenario = folder / "few.toml"
     scenario.write_text(_SCENARIO)
-    asked = ["--data", _CLIPS / "manifest.csv", "--scenario", scenario, "--method", "levels"]
-    done = run("train", *asked, "-o", folder / "few.safetensors")
+    requested = ["--data", _CLIPS / "manifest.csv", "--scenario", scenario, "--method", "levels"]
+    done = run("train", *requested, "-o", folder / "few.safetensors")
     assert "macro F1" in done
     return folder / "few.safetensors"
 
@@ -127,10 +127,10 @@ def test_blocks_of_any_size_give_the_same_bits(networks, sizes, hop):
     rng = np.random.default_rng(len(sizes))
     frames = rng.normal(0, 0.1, (sum(sizes), FRAME_SAMPLES)).astype(np.float32)
     extract = feature_set("any").extractor()
-    whole = extract(frames)
+    full = extract(frames)
     extract.restart()
     parts = [extract(part) for part in np.split(frames, np.cumsum(sizes)[:-1])]
-    assert np.concatenate(parts).tobytes() == whole.tobytes()
+    assert np.concatenate(parts).tobytes() == full.tobytes()
 
 
 def test_a_gap_lets_the_network_hear_nothing_of_what_was_before(networks):

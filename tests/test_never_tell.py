@@ -93,16 +93,16 @@ def test_a_rule_of_a_hidden_class_never_notifies(logs, tmp_path, hearthlog):
         for name in ("music", "coughing")
     ]
     home = find_home_logs([logs])
-    heard = read_activity(home, "home", start, end, pytest.fail)
-    for hidden, told in (((), {"music", "coughing"}), (("music",), {"coughing"})):
+    recorded = read_activity(home, "home", start, end, pytest.fail)
+    for hidden, reported in (((), {"music", "coughing"}), (("music",), {"coughing"})):
         folder = tmp_path / f"{len(hidden)}"
         state = BridgeState(folder, "home", pytest.fail)
         box = Outbox(state, ["x"], pytest.fail)
         memory = RuleProgressStore(state, pytest.fail)
         watch = RuleWatch(rules, UTC, box, memory, pytest.fail, start + MINUTE)
         watch.never_tell = frozenset(hidden)
-        rang = watch.evaluate(lambda: heard, pytest.fail, end - MINUTE, end - MINUTE)
-        assert {each.rule for each in rang} == told
+        rang = watch.evaluate(lambda: recorded, pytest.fail, end - MINUTE, end - MINUTE)
+        assert {each.rule for each in rang} == reported
     write_list(logs, ["music"])
     config = tmp_path / "home.toml"
     config.write_text(
@@ -117,8 +117,8 @@ def test_a_rule_of_a_hidden_class_never_notifies(logs, tmp_path, hearthlog):
 
 def test_the_page_hides_a_class_for_all_and_shows_it_again(tmp_path):
     with serving(tmp_path) as served, served.stream() as part:
-        served.log.heard("music", 30)
-        served.log.heard("coughing", 20)
+        served.log.write_segment("music", 30)
+        served.log.write_segment("coughing", 20)
         served.log.hears("music")
 
         def labels(day):

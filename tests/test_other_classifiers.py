@@ -198,9 +198,9 @@ def test_decisions_are_those_of_scikit_learn(name, classes):
     else:
         theirs = of_scikit_learn(name, rounded(inputs), target, unseen(classes))
     ours = method.fit(examples).decide(unseen(classes), classes)
-    told = ~np.isnan(theirs[:, 0])  # it draws among those that are as far as the last neighbour
-    assert told.mean() > 0.98
-    ours, theirs = ours[told], theirs[told]
+    reported = ~np.isnan(theirs[:, 0])  # it draws among those that are as far as the last neighbour
+    assert reported.mean() > 0.98
+    ours, theirs = ours[reported], theirs[reported]
     assert len(np.unique(theirs.argmax(axis=1))) == classes
     if name in {LANDMARKS, "perceptron"}:  # a softmax forgets what is added to all
         ours, theirs = as_probabilities(ours), as_probabilities(theirs)
@@ -212,9 +212,9 @@ def test_decisions_are_those_of_scikit_learn(name, classes):
 @settings(deadline=None, max_examples=15)
 @given(cuts=st.sets(st.integers(1, ROWS - 1), max_size=40))
 def test_a_row_is_judged_the_same_in_any_company(name, cuts):
-    whole = judged(trained(name), unseen())
+    full = judged(trained(name), unseen())
     parts = [judged(trained(name), unseen()[a:b]) for a, b in pairwise(sorted({0, ROWS, *cuts}))]
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    np.testing.assert_array_equal(np.concatenate(parts), full)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -603,8 +603,8 @@ def test_a_method_without_cost_has_none_to_choose():
 
 def test_the_command_learns_one_of_them_and_records_with_it(hearthlog, training_set, day, tmp_path):
     model = tmp_path / "layers.safetensors"
-    asked = ["--data", training_set, "--scenario", "bathroom", "--method", "logistic"]
-    done = hearthlog("train", *asked, "-o", model)
+    requested = ["--data", training_set, "--scenario", "bathroom", "--method", "logistic"]
+    done = hearthlog("train", *requested, "-o", model)
     assert done.returncode == 0, done.stderr
     assert "weights" in done.stdout
     done = hearthlog("record", day, "--model", model, "-o", tmp_path / "logs")

@@ -68,10 +68,10 @@ def test_a_reader_who_has_seen_enough_ends_any_verb_quietly(run, verb):
     reader, writer = os.pipe()
     os.close(reader)
     try:
-        status, says = run(verb, writer)
+        status, states = run(verb, writer)
     finally:
         os.close(writer)
-    assert says == ""
+    assert states == ""
     assert status in {0, run(verb, subprocess.DEVNULL)[0]}  # the latter if all was done by then
 
 

@@ -164,7 +164,7 @@ BOX = ("schemas", "models", "recorder")
 EXTRAS = ("headless", "viewer", "foxglove", "bridge", "cluster")
 
 
-def asked_for(*extras):
+def requested_for(*extras):
     """Name the distributions that hearthlog needs itself, with some extras."""
     texts = list(PROJECT["dependencies"])
     for extra in extras:
@@ -194,5 +194,7 @@ def test_what_is_imported_is_asked_for(folders, extras):
     names = {name.partition(".")[0] for name in imported(folders)}
     names -= sys.stdlib_module_names | {"hearthlog"}
     owners = packages_distributions()
-    asked = asked_for(*extras)
-    assert {name for name in names if not asked & set(map(normal, owners.get(name, [])))} == set()
+    requested = requested_for(*extras)
+    assert {
+        name for name in names if not requested & set(map(normal, owners.get(name, [])))
+    } == set()

@@ -197,8 +197,8 @@ def test_a_new_configuration_is_taken_at_sighup_and_a_wrong_one_is_not(labmic, t
         good = file.read_text()
         file.write_text(good.replace("model", "modell"))
         process.send_signal(signal.SIGHUP)
-        said = process.stderr.readline()
-        assert said == (
+        output = process.stderr.readline()
+        assert output == (
             f"hearthlog: {file}, line 2: unknown key 'modell'; is model meant?; the recorder "
             "keeps its present configuration\n"
         )

@@ -25,11 +25,11 @@ pytestmark = pytest.mark.fast
 @contextmanager
 def watchdog():
     """A watchdog that notes what it is asked for: its address, and the notes."""
-    asked = []
+    requested = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            asked.append(self.path)
+            requested.append(self.path)
             self.send_response(200)
             self.end_headers()
 
@@ -39,7 +39,7 @@ def watchdog():
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         thread = Thread(target=server.serve_forever)
         thread.start()
-        yield f"http://127.0.0.1:{server.server_port}/box", asked
+        yield f"http://127.0.0.1:{server.server_port}/box", requested
         server.shutdown()
         thread.join()
 
@@ -59,63 +59,63 @@ def news(*, is_recording=True, **health):
     return News(state, [], [], today(0, UTC), UTC)
 
 
-def last_asked(pings, asked, what):
+def last_request(pings, requested, what):
     """Return what is asked for last while something goes on."""
-    until, first = time.monotonic() + 60, len(asked)
-    while len(asked) < first + 3 and time.monotonic() < until:
+    until, first = time.monotonic() + 60, len(requested)
+    while len(requested) < first + 3 and time.monotonic() < until:
         pings.update(what)
         time.sleep(0.02)
-    return asked[-1]
+    return requested[-1]
 
 
 def test_a_watchdog_is_asked_while_all_is_well_and_told_of_a_failure(often):
-    with watchdog() as (url, asked):
+    with watchdog() as (url, requested):
         pings = PingOutput(often(url), pytest.fail)
-        assert last_asked(pings, asked, news(mic=0, clock=1)) == "/box"
-        assert last_asked(pings, asked, news(mic=2)) == "/box/fail"
-        assert last_asked(pings, asked, news(is_recording=False)) == "/box/fail"
-        assert last_asked(pings, asked, news(mic=0)) == "/box"
+        assert last_request(pings, requested, news(mic=0, clock=1)) == "/box"
+        assert last_request(pings, requested, news(mic=2)) == "/box/fail"
+        assert last_request(pings, requested, news(is_recording=False)) == "/box/fail"
+        assert last_request(pings, requested, news(mic=0)) == "/box"
         pings.close()
 
 
 def test_a_bridge_that_hangs_asks_no_more(often):
-    with watchdog() as (url, asked):
+    with watchdog() as (url, requested):
         pings = PingOutput(often(url), pytest.fail)
-        last_asked(pings, asked, news(mic=0))
+        last_request(pings, requested, news(mic=0))
         until, count = time.monotonic() + 60, -1
-        while len(asked) > count:
+        while len(requested) > count:
             assert time.monotonic() < until
-            count = len(asked)
+            count = len(requested)
             time.sleep(0.8)
         pings.close()
 
 
 def test_a_watchdog_that_is_away_is_said_to_be(often):
-    said = []
-    pings = PingOutput(often(f"http://127.0.0.1:{free_port()}"), said.append)
+    output = []
+    pings = PingOutput(often(f"http://127.0.0.1:{free_port()}"), output.append)
     until = time.monotonic() + 60
-    while not said and time.monotonic() < until:
+    while not output and time.monotonic() < until:
         pings.update(news())
         time.sleep(0.02)
     pings.close()
-    assert said[0] == "ping: not accepted (Connection refused); trying again"
+    assert output[0] == "ping: not accepted (Connection refused); trying again"
 
 
 @pytest.mark.usefixtures("often")
 def test_the_address_may_be_in_a_file_and_is_in_no_line(tmp_path):
-    file, said = tmp_path / "url", []
-    with watchdog() as (url, asked):
+    file, output = tmp_path / "url", []
+    with watchdog() as (url, requested):
         file.write_text(f"\ufeff{url}/a-secret\r\n")
         settings = PingSettings(url_file=file).model_copy(update={"every_seconds": 0.05})
-        pings = PingOutput(settings, said.append)
-        assert last_asked(pings, asked, news(mic=0)) == "/box/a-secret"
+        pings = PingOutput(settings, output.append)
+        assert last_request(pings, requested, news(mic=0)) == "/box/a-secret"
         pings.close()
     for wrong in ("", "a-secret", "https://", "http://x/a secret", "http://x:y/", "http://[x/"):
         file.write_text(wrong)
         with pytest.raises(HearthlogError, match="has no web address") as error:
-            PingOutput(settings, said.append)
+            PingOutput(settings, output.append)
         assert "secret" not in str(error.value)
-    assert said == []
+    assert output == []
 
 
 def test_of_a_failure_nothing_is_said_that_has_the_address(monkeypatch):

@@ -35,7 +35,7 @@ def frames(day):
     return samples.reshape(-1, FRAME_SAMPLES)[:1200]
 
 
-def said(records):
+def output(records):
     """The lines among some records, decoded, each with its log time."""
     return [(r.log_time, decode(r.data, LOG)) for r in records if r.topic == "/rosout"]
 
@@ -61,9 +61,9 @@ def in_blocks(frames, size, model_file):
 
 @pytest.mark.parametrize("size", [1, 7, 200])
 def test_blocks_of_any_size_give_the_same_records(frames, model_file, size):
-    whole = in_blocks(frames, len(frames), model_file)
-    assert len(said(whole)) > 10
-    assert in_blocks(frames, size, model_file) == whole
+    full = in_blocks(frames, len(frames), model_file)
+    assert len(output(full)) > 10
+    assert in_blocks(frames, size, model_file) == full
 
 
 def test_every_segment_is_a_line_that_follows_it_when_its_end_is_known(frames, model_file):
@@ -75,7 +75,7 @@ def test_every_segment_is_a_line_that_follows_it_when_its_end_is_known(frames, m
     assert len(places) > 5
     for place in places:
         segment = decode(records[place].data, SEGMENT)
-        ((time, line),) = said([records[place + 1]])
+        ((time, line),) = output([records[place + 1]])
         end = nanoseconds(segment.header.stamp) + nanoseconds(segment.duration)
         over = min(sound_end for sound_end in sounds_end if sound_end >= end)
         assert time == records[place].log_time == nanoseconds(line.stamp) == min(end + delay, over)
@@ -86,7 +86,7 @@ def test_every_segment_is_a_line_that_follows_it_when_its_end_is_known(frames, m
 
 def test_a_gap_is_a_warning_at_its_end():
     gap = Gap(START, START + 2_050_000_000, "the recorder was too slow", 41)
-    ((time, line),) = said(Pipeline("mic", DEFAULT).push(gap))
+    ((time, line),) = output(Pipeline("mic", DEFAULT).push(gap))
     assert time == nanoseconds(line.stamp) == gap.end
     assert line.level == line.WARN
     assert line.msg == "gap of 2.05 s: the recorder was too slow"
@@ -100,7 +100,7 @@ def test_only_a_change_of_health_is_a_line():
         stamp = START + second * 10**9
         records += pipeline.push(SourceHealth(stamp, level, f"state {level}"))
     assert sum(record.topic == "/diagnostics" for record in records) == len(levels)
-    found = [(time, line.level, line.msg) for time, line in said(records)]
+    found = [(time, line.level, line.msg) for time, line in output(records)]
     assert found == [
         (START + 2 * 10**9, 40, "state 2"),
         (START + 4 * 10**9, 30, "state 1"),
@@ -126,7 +126,7 @@ def test_the_first_line_names_the_device_and_the_model():
     records = opening_messages(info)
     assert [record.topic for record in records] == ["/mic/info", "/rosout"]
     assert decode(records[0].data, STREAM_INFO).device == "Küche"
-    ((time, line),) = said(records)
+    ((time, line),) = output(records)
     assert time == nanoseconds(line.stamp) == START
     assert line.msg == "recording Küche: 2 labels by general (0123456789ab)"
 
@@ -225,13 +225,13 @@ def test_a_microphone_that_clips_is_said_for_a_minute_and_a_loud_clap_is_not():
     sound[0:10] *= 0.01
     sound[30:] *= 0.01
     stamps = START + np.arange(3600) * FRAME_NANOSECONDS
-    pipeline, said = Pipeline("mic", DEFAULT), []
+    pipeline, output = Pipeline("mic", DEFAULT), []
     for first in range(0, 3600, 200):
         block = slice(first, first + 200)
         pipeline.push(Frames(first, sound[block], stamps[block]))
-        said.append(health_after(pipeline, stamps[first]))
+        output.append(health_after(pipeline, stamps[first]))
     clipping = (1, "the microphone clips: turn its volume down")
-    assert said == [clipping] * 6 + [(0, "listening")] * 12
+    assert output == [clipping] * 6 + [(0, "listening")] * 12
     assert health_after(pipeline, stamps[-1], 2) == (2, "listening")
 
 
@@ -248,9 +248,9 @@ def test_a_room_as_loud_as_sounds_are_is_said_after_ten_minutes(level, loud):
     rng = np.random.default_rng(0)
     noise = (10 ** (level / 20) * rng.standard_normal((400, FRAME_SAMPLES))).astype(np.float32)
     features = np.tile(DEFAULT.extractor()(noise), (31, 1))
-    pipeline, said = Pipeline("mic", DEFAULT), []
+    pipeline, output = Pipeline("mic", DEFAULT), []
     for first in range(0, len(features), 400):
         stamps = START + np.arange(first, first + 400) * FRAME_NANOSECONDS
         pipeline.push_features(features[first : first + 400], first, stamps)
-        said.append(health_after(pipeline, stamps[-1])[0])
-    assert said == ([0] * 30 + [1] if loud else [0] * 31)
+        output.append(health_after(pipeline, stamps[-1])[0])
+    assert output == ([0] * 30 + [1] if loud else [0] * 31)

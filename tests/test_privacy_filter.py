@@ -36,21 +36,21 @@ CLASSES = ("silence", "speech")
 WINDOW, BEHIND = 20, 12
 
 
-def labels_of(said):
-    probabilities = np.stack([1 - said, said], axis=1)
-    times = np.arange(len(said))
+def labels_of(output):
+    probabilities = np.stack([1 - output, output], axis=1)
+    times = np.arange(len(output))
     return FrameLabels(
         CLASSES, times, times, times, probabilities, probabilities, times * 0.0, False
     )
 
 
-def veiled(first, said, features, blocks):
+def veiled(first, output, features, blocks):
     """Push frames, one for each probability of speech; return what is logged of them."""
     veil, sizes, parts, start = PrivacyFilter(["speech"], 2, WINDOW), itertools.cycle(blocks), [], 0
-    while start < len(said):
-        end = min(start + next(sizes), len(said))
+    while start < len(output):
+        end = min(start + next(sizes), len(output))
         stamps = START + np.arange(first + start, first + end) * FRAME_NANOSECONDS
-        part = features[start:end], first + start, stamps, labels_of(said[start:end])
+        part = features[start:end], first + start, stamps, labels_of(output[start:end])
         parts.append(veil.push(*part))
         start = end
     return [*parts, veil.close()]
@@ -66,15 +66,15 @@ def veiled(first, said, features, blocks):
 def test_frames_near_speech_have_the_mean_of_their_second_and_all_others_their_own(
     first, loud, count, blocks
 ):
-    said = np.float32([0.5 if frame in loud else 0.0 for frame in range(count)])
+    output = np.float32([0.5 if frame in loud else 0.0 for frame in range(count)])
     features = np.random.default_rng(0).standard_normal((count, 2)).astype(np.float32)
-    parts = veiled(first, said, features, blocks)
+    parts = veiled(first, output, features, blocks)
     np.testing.assert_array_equal(
         np.concatenate([part.stamps for part in parts]),
         START + np.arange(first, first + count) * FRAME_NANOSECONDS,
     )
     shown = np.concatenate([part.features for part in parts])
-    padded = np.concatenate([np.ones(BEHIND), said, np.ones(WINDOW - 1)])  # beside: unlabelled
+    padded = np.concatenate([np.ones(BEHIND), output, np.ones(WINDOW - 1)])  # beside: unlabelled
     private = np.array(
         [(padded[frame : frame + BEHIND + WINDOW] >= PRIVATE_LIMIT).any() for frame in range(count)]
     )

@@ -46,20 +46,20 @@ def place_of(home):
 @contextmanager
 def bridged(home, folder, **settings):
     """A bridge in a thread that gives figures, with a token."""
-    since, said = time.time_ns() - 24 * HOUR, []
+    since, printed = time.time_ns() - 24 * HOUR, []
     token = folder / "token"
     token.write_text(f"{TOKEN}\n")
     settings = {"token_file": token, "readable_by": "all", **settings}
     place = place_of(home)
     output = PrometheusOutput(
-        PrometheusSettings(**settings), place, state_in(folder), since, said.append
+        PrometheusSettings(**settings), place, state_in(folder), since, printed.append
     )
-    with following(place, {"prometheus": output}, said):
+    with following(place, {"prometheus": output}, printed):
         yield
-    assert said == []
+    assert printed == []
 
 
-def ask(port, path="/metrics", **fields):
+def query(port, path="/metrics", **fields):
     fields = {"Authorization": f"Bearer {TOKEN}", **fields}
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
     connection.putrequest("GET", path, skip_host="Host" in fields)
@@ -92,7 +92,7 @@ def wait_for(text_of):
 
 def known(port):
     """The text of the figures; empty while there are none."""
-    status, text = ask(port)
+    status, text = query(port)
     return text if status == 200 else ""
 
 
@@ -104,10 +104,10 @@ def opened(port):
 
 
 def test_a_port_of_loopback_has_what_the_log_says(home, tmp_path):
-    home.heard("coughing", 30, seconds=2)
-    home.heard("coughing", 20, seconds=3)
+    home.write_segment("coughing", 30, seconds=2)
+    home.write_segment("coughing", 20, seconds=3)
     home.hears("silence")
-    home.says("mic", 1, "the microphone clips", level_dbfs="-40.5")
+    home.write_status("mic", 1, "the microphone clips", level_dbfs="-40.5")
     port = free_port()
     with bridged(home, tmp_path, port=port):
         found = wait_for(lambda: known(port))
@@ -131,7 +131,7 @@ def test_a_class_counts_from_0_so_that_its_first_event_is_an_increase(home, tmp_
 
 def test_a_microphone_that_is_away_has_no_level(home, tmp_path, monkeypatch):
     home.hears("silence")
-    home.says("mic", 0, "well", level_dbfs="-40.5")
+    home.write_status("mic", 0, "well", level_dbfs="-40.5")
     monkeypatch.setattr(home_state, "_AWAY_SECONDS", -1.0)
     port = free_port()
     with bridged(home, tmp_path, port=port):
@@ -162,7 +162,7 @@ def test_the_port_answers_who_has_the_token_and_asks_for_an_address_in_digits(
     port = free_port()
     with bridged(home, tmp_path, port=port):
         wait_for(lambda: known(port))
-        assert ask(port, path, **fields)[0] == status
+        assert query(port, path, **fields)[0] == status
 
 
 def test_figures_that_are_old_are_not_given(home, tmp_path, monkeypatch):
@@ -171,7 +171,7 @@ def test_figures_that_are_old_are_not_given(home, tmp_path, monkeypatch):
     with bridged(home, tmp_path, port=port):
         wait_for(lambda: known(port))
         monkeypatch.setattr(prometheus, "_STALE_SECONDS", -1.0)
-        assert ask(port)[0] == 503
+        assert query(port)[0] == 503
 
 
 def test_the_port_is_of_loopback_alone(home, tmp_path):
@@ -203,7 +203,7 @@ def test_a_port_without_a_token_stays_closed(home, tmp_path):
 def test_a_port_that_stays_closed_takes_no_text_file_with_it(home, tmp_path, monkeypatch, lacking):
     monkeypatch.setattr(prometheus, "_EVERY_SECONDS", 0.0)
     home.hears("silence")
-    token, text, said = tmp_path / "token", tmp_path / "home.prom", []
+    token, text, printed = tmp_path / "token", tmp_path / "home.prom", []
     place, port = place_of(home), free_port()
     if lacking == "no token":
         token.touch()
@@ -217,33 +217,35 @@ def test_a_port_that_stays_closed_takes_no_text_file_with_it(home, tmp_path, mon
         if lacking == "no port":
             token.write_text(f"{TOKEN}\n")
             held.enter_context(listen(port=port))
-        output = PrometheusOutput(settings, place, state_in(tmp_path), time.time_ns(), said.append)
-        with following(place, {"prometheus": output}, said):
+        output = PrometheusOutput(
+            settings, place, state_in(tmp_path), time.time_ns(), printed.append
+        )
+        with following(place, {"prometheus": output}, printed):
             wait_for(lambda: text.read_text() if text.exists() else "")
             held.close()
             token.write_text(f"{TOKEN}\n")
             if lacking != "no token_file":
                 assert wait_for(lambda: opened(port))
-    assert all(line.endswith(f"; {text} is written all the same") for line in said)
-    assert said
+    assert all(line.endswith(f"; {text} is written all the same") for line in printed)
+    assert printed
 
 
 def test_a_text_file_that_node_exporter_does_not_read_is_said_to_be_none(home, tmp_path):
-    said = []
+    printed = []
     path = tmp_path / "hearthlog.txt"
     settings = PrometheusSettings(text_file=path, readable_by="owner")
-    PrometheusOutput(settings, place_of(home), state_in(tmp_path), 0, said.append).close()
-    (line,) = said
+    PrometheusOutput(settings, place_of(home), state_in(tmp_path), 0, printed.append).close()
+    (line,) = printed
     assert line.startswith(f"bridge.prometheus: text_file: {path} does not end in .prom")
     assert line.endswith(f'write "{tmp_path}/hearthlog.prom"')
 
 
 def test_a_text_file_that_everybody_may_read_is_said_to_be(home, tmp_path):
-    said = []
+    printed = []
     path = tmp_path / "hearthlog.prom"
     settings = PrometheusSettings(text_file=path)
-    PrometheusOutput(settings, place_of(home), state_in(tmp_path), 0, said.append).close()
-    (line,) = said
+    PrometheusOutput(settings, place_of(home), state_in(tmp_path), 0, printed.append).close()
+    (line,) = printed
     assert line.startswith(
         f"bridge.prometheus: every account of this machine may read {path}; write readable_by"
     )
@@ -260,7 +262,7 @@ def test_who_asks_slowly_holds_up_neither_the_others_nor_the_end(home, tmp_path,
                 own = slow.enter_context(socket.create_connection(("127.0.0.1", port)))
                 own.sendall(request_so_far)
             for _ in range(3):
-                assert ask(port)[0] == 200
+                assert query(port)[0] == 200
             ending = time.monotonic()
         assert time.monotonic() - ending < 5  # though they are still there
 
@@ -292,7 +294,7 @@ def test_a_text_file_is_for_whom_the_configuration_says(home, tmp_path, who, mod
 
 
 def test_a_text_file_is_there_while_the_bridge_is(home, tmp_path):
-    home.heard("coughing", 30)
+    home.write_segment("coughing", 30)
     home.hears("silence")
     path = tmp_path / "hearthlog.prom"
     with bridged(home, tmp_path, text_file=path):

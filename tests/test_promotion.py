@@ -428,12 +428,12 @@ def test_a_home_that_is_mostly_quiet_is_heard_where_it_is_not():
     chosen = choose(parts, sounding)
     lengths = np.array([part.end - part.start for part in chosen])
     weights = np.array([part.weight for part in chosen])
-    heard = [common(Spans(np.array([part.start]), np.array([part.end])), sounding).length
+    recorded = [common(Spans(np.array([part.start]), np.array([part.end])), sounding).length
              for part in chosen]  # fmt: skip
     assert lengths.sum() < 1.4 * hour
-    assert sum(heard) > 1500 * SECOND
+    assert sum(recorded) > 1500 * SECOND
     assert (lengths * weights).sum() == pytest.approx(14 * 24 * hour)
-    assert np.array(heard) @ weights == pytest.approx(sounding.length, rel=0.1)
+    assert np.array(recorded) @ weights == pytest.approx(sounding.length, rel=0.1)
 
 
 def test_what_is_told_is_of_a_mean_day_if_a_day_is_recorded_and_else_of_all():
@@ -499,8 +499,8 @@ def test_how_much_more_has_to_be_recorded_is_said(minutes, more):
 
 def test_a_model_that_changes_much_has_to_be_right_about_more():
     much = [[1300, 0, 0], [0, 70, 30], [0, 0, 40]]
-    (said,) = damages(evidence(much, PairedAccuracy(40, 30, 30, 3, 3)), "one")
-    assert "it is right about 30, one about 30, and 30 min a day would change: " in said
+    (output,) = damages(evidence(much, PairedAccuracy(40, 30, 30, 3, 3)), "one")
+    assert "it is right about 30, one about 30, and 30 min a day would change: " in output
     assert damages(evidence(much, PairedAccuracy(40, 30, 33, 6, 3)), "one") == []
     assert damages(evidence(much), "one") == []  # nothing was drawn at random
     little = [[1300, 0, 0], [0, 80, 20], [0, 0, 40]]
@@ -509,9 +509,11 @@ def test_a_model_that_changes_much_has_to_be_right_about_more():
 
 def test_marks_that_agree_with_the_champion_less_than_by_chance_are_said_to_be_wrong():
     better = evidence([[1300, 0, 0], [0, 20, 80], [0, 0, 40]], PairedAccuracy(55, 3, 50, 48, 1))
-    (said,) = damages(replace(better, named=NamedSounds(55, 3, 5)), "one")
-    assert said.startswith("of 55 sounds of the minutes that were drawn at random, one gives 3 the")
-    assert "the marks are wrong" in said
+    (output,) = damages(replace(better, named=NamedSounds(55, 3, 5)), "one")
+    assert output.startswith(
+        "of 55 sounds of the minutes that were drawn at random, one gives 3 the"
+    )
+    assert "the marks are wrong" in output
     for few in (NamedSounds(19, 0, 5), NamedSounds(55, 3, 2), NamedSounds(55, 6, 5), NamedSounds()):
         assert damages(replace(better, named=few), "one") == []
 
@@ -606,26 +608,28 @@ def test_a_new_class_that_swallows_what_was_right_or_silence_or_the_day_is_refus
 
     marks = {("hum", "silence", "hum"): 9, ("hum", "speech", "hum"): 9}
     assert reasons(marks | {("music", "music", "music"): 12, ("music", "music", "hum"): 4}) == []
-    (said,) = reasons(marks | {("music", "music", "music"): 8, ("music", "music", "hum"): 4})
-    assert said.startswith("hum takes 4 of 12 sounds of other classes that one had right: hear its")
+    (output,) = reasons(marks | {("music", "music", "music"): 8, ("music", "music", "hum"): 4})
+    assert output.startswith(
+        "hum takes 4 of 12 sounds of other classes that one had right: hear its"
+    )
     assert reasons(marks | {("music", "speech", "hum"): 40}) == [], "which were wrong before, too"
     many = {("music", "music", "music"): 40, ("speech", "speech", "hum"): 3}
-    (said,) = reasons(marks | many)
-    assert said.startswith("hum takes 3 of 3 sounds of talking that one had right")
+    (output,) = reasons(marks | many)
+    assert output.startswith("hum takes 3 of 3 sounds of talking that one had right")
     unsure = {("unknown", "unknown", "unknown"): 6, ("unknown", "unknown", "hum"): 4}
     assert reasons(marks | unsure) == [], "what nobody was sure of was not right"
-    (said,) = reasons(marks | {("silence", "silence", "hum"): 3})
-    assert said.startswith("hum takes 3 of 3 silences that one had right")
+    (output,) = reasons(marks | {("silence", "silence", "hum"): 3})
+    assert output.startswith("hum takes 3 of 3 silences that one had right")
 
-    (said,) = reasons(marks, (30, 0, 9, 0))
-    assert said.startswith("30 min a day of hum is silence for one: if that is the sound of the")
+    (output,) = reasons(marks, (30, 0, 9, 0))
+    assert output.startswith("30 min a day of hum is silence for one: if that is the sound of the")
     stays = {("silence", "silence", "silence"): 9}
     assert reasons(marks | stays, (30, 0, 9, 0)) == [], "a faint sound that a person marked"
     assert reasons(stays, (30, 0, 9, 0)) != [], "no mark says that silence was wrong"
     assert reasons({}, (9, 0, 1, 0)) == [], "hardly anything"
     assert reasons(marks, (100, 500, 100, 0)) == [], "a television for hours"
-    (said,) = reasons(marks, (100, 900, 600, 0))
-    assert said.startswith("hum is 26 h 40 min a day, more than half of the time")
+    (output,) = reasons(marks, (100, 900, 600, 0))
+    assert output.startswith("hum is 26 h 40 min a day, more than half of the time")
     assert reasons(marks, (100, 900, 600, 0), each="") == [], "half an hour is no day"
 
 
@@ -680,8 +684,8 @@ def test_fewer_right_by_chance_is_no_damage():
     same = [[1300, 0, 0], [0, 100, 0], [0, 0, 40]]
     assert damages(evidence(same, PairedAccuracy(40, 30, 29, 4, 5)), "one") == []
     assert damages(evidence(same, PairedAccuracy(40, 30, 25, 2, 7)), "one") != []
-    heard = replace(evidence(same), quiet=PairedAccuracy(9, 9, 3, 0, 6))
-    assert damages(heard, "one") == [
+    recorded = replace(evidence(same), quiet=PairedAccuracy(9, 9, 3, 0, 6))
+    assert damages(recorded, "one") == [
         "of 9 silences of the minutes that were drawn at random it leaves 3 silent, one 9"
     ]
 
@@ -700,8 +704,8 @@ def test_sound_that_vanishes_and_a_class_that_multiplies_are_damage_unless_rando
 
 def test_what_the_champion_is_sure_of_stays():
     table = [[1300, 0, 0], [0, 85, 15], [0, 0, 40]]
-    (said,) = damages(evidence(table, sure=[[900, 0, 0], [0, 5, 10], [0, 0, 0]]), "one")
-    assert said == (
+    (output,) = damages(evidence(table, sure=[[900, 0, 0], [0, 5, 10], [0, 0, 0]]), "one")
+    assert output == (
         "of 15 min a day of talking of which one is sure 5.0 min are left, most becomes music"
     )
     assert damages(evidence(table, sure=[[900, 0, 0], [0, 9, 3], [0, 0, 0]]), "one") == []
@@ -711,7 +715,7 @@ def test_what_the_champion_is_sure_of_stays():
 # What would change, as spans to look at
 
 
-def asked_of(model, count=10, limits=(None, None)):
+def requested_of(model, count=10, limits=(None, None)):
     """Return the spans that are asked of what a model would change."""
     return queue_spans(model, find_labellings(Path("logs")), ("mic", "live"), limits, count)
 
@@ -728,14 +732,14 @@ def most_of(labelling, span):
 @pytest.mark.usefixtures("place")
 def test_what_a_model_would_change_is_asked_where_it_says_something_else_than_the_recorder(capfd):
     keep_swapped("speech", "music")
-    asked = asked_of("swapped")
-    assert len(asked) == 10
+    requested = requested_of("swapped")
+    assert len(requested) == 10
     assert run(capfd, "relabel", "logs", "--model", "models/swapped.safetensors").returncode == 0
-    for span in asked:
+    for span in requested:
         assert SECOND // 2 <= span.end - span.start <= 10 * SECOND
         assert most_of("live", span) == span.label_a
         assert most_of("relabel/swapped", span) == span.label_b != span.label_a
-    assert sorted(asked_of("models/swapped")) == sorted(asked)
+    assert sorted(requested_of("models/swapped")) == sorted(requested)
 
 
 @pytest.mark.usefixtures("place")
@@ -745,25 +749,25 @@ def test_the_largest_changes_are_asked_first_and_others_too():
     after = dict(zip(sounds, [*sounds[1:], sounds[0]], strict=True)) | {"silence": "silence"}
     new = keep("turned", classes=[after[name] for name in one.classes])
     changes = gather_evidence(one, new, recent_logs([Path("logs")])).changes.pairs()
-    spans = asked_of("turned")
-    asked = [(span.label_a, span.label_b) for span in spans]
-    for each in set(asked):
-        same = [b.end - b.start for b, pair in zip(spans, asked, strict=True) if pair == each]
+    spans = requested_of("turned")
+    requested = [(span.label_a, span.label_b) for span in spans]
+    for each in set(requested):
+        same = [b.end - b.start for b, pair in zip(spans, requested, strict=True) if pair == each]
         assert same == sorted(same, reverse=True)
-    assert asked[0] == changes[0][:2]
-    assert set(asked) >= {change[:2] for change in changes[:3]}
-    assert all(after[before] == other for before, other in asked)
+    assert requested[0] == changes[0][:2]
+    assert set(requested) >= {change[:2] for change in changes[:3]}
+    assert all(after[before] == other for before, other in requested)
 
 
 @pytest.mark.usefixtures("place")
 def test_what_was_looked_at_or_lies_elsewhere_is_not_asked_though_a_model_would_change_it(lived):
     keep_swapped("speech", "music")
     review(lived, RANDOM, count=6)
-    asked = asked_of("swapped", count=100)
-    assert asked
-    assert all(span.start >= START + 6 * MINUTE for span in asked)
+    requested = requested_of("swapped", count=100)
+    assert requested
+    assert all(span.start >= START + 6 * MINUTE for span in requested)
     later = START + 9 * MINUTE
-    assert all(span.start >= later for span in asked_of("swapped", limits=(later, None)))
+    assert all(span.start >= later for span in requested_of("swapped", limits=(later, None)))
 
 
 @pytest.mark.usefixtures("place")
@@ -771,7 +775,7 @@ def test_when_all_that_a_model_would_change_was_looked_at_that_is_said(lived):
     keep_swapped("speech", "music")
     review(lived, RANDOM, count=MINUTES)
     with pytest.raises(DataError, match="swapped: no span is left in which it differs from"):
-        asked_of("swapped")
+        requested_of("swapped")
 
 
 @pytest.mark.usefixtures("place")
@@ -780,7 +784,7 @@ def test_where_the_recorder_says_something_else_than_the_champion_by_now_nothing
     Path("models/champion.safetensors").unlink()
     Path("models/champion.safetensors").symlink_to("swapped.safetensors")
     with pytest.raises(DataError, match="one: no span is left in which it differs from"):
-        asked_of("one")
+        requested_of("one")
 
 
 @pytest.mark.usefixtures("place")
@@ -791,7 +795,7 @@ def test_who_reads_what_would_change_is_told_how_to_hear_it(capfd, tmp_path):
     saved = run(capfd, "review", "logs", "--queue", "swapped", "--save", tmp_path / "ten.csv")
     assert saved.returncode == 0, saved.stderr
     listed = read_list(tmp_path / "ten.queue.csv")
-    assert sorted(listed) == sorted(asked_of("swapped"))
+    assert sorted(listed) == sorted(requested_of("swapped"))
     (again,) = review_items(listed[:1])
     assert re.fullmatch("swapped says (talking|music), the recorder (talking|music)", again.text)
     keep_alike()
@@ -811,9 +815,9 @@ def test_a_model_whose_changes_cannot_be_told_is_said_in_a_line():
     with pytest.raises(
         DataError, match=r"or a model \(models/none.safetensors: no such model file"
     ):
-        asked_of("none")
+        requested_of("none")
     with pytest.raises(DataError, match="one labels here already"):
-        asked_of("champion")
+        requested_of("champion")
     shutil.copy(OLD_MODEL, "models/old.safetensors")
     with pytest.raises(DataError, match="old: it is for feature set auros21, and one"):
-        asked_of("old")
+        requested_of("old")

@@ -18,7 +18,7 @@ from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.logs.spans import NONE, cut, joined, one, pieces
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, read_marks, read_reviewed
-from hearthlog.analyzer.review import review_list as asked
+from hearthlog.analyzer.review import review_list as requested
 from hearthlog.analyzer.review.candidates import (
     MINUTE,
     RecordedMinutes,
@@ -66,7 +66,7 @@ def home(recorded, tmp_path):
 
 
 @pytest.fixture
-def heard(recorded, tmp_path):
+def captured(recorded, tmp_path):
     """With the sound of the first half, which was kept."""
     home = shutil.copytree(recorded, tmp_path / "heard")
     (log,) = find_logs(home)
@@ -92,11 +92,11 @@ def marking(home):
     return Marking("mic", find_coverage(home)["mic"], "Ann", "live", no_spans())
 
 
-def test_the_queue_of_a_window_begins_with_what_can_be_heard(heard, display):
-    (layer,) = heard.rglob("*.audio.mcap")
+def test_the_queue_of_a_window_begins_with_what_can_be_heard(captured, display):
+    (layer,) = captured.rglob("*.audio.mcap")
     kept = kept_time([layer], "/mic/audio", START, START + LENGTH * MINUTE)
     options = ("--queue", "--port", free_port(), "--spans", "10", "--timezone", "UTC")
-    with reviewing(heard, *options, DISPLAY=display) as review:
+    with reviewing(captured, *options, DISPLAY=display) as review:
         for number in range(1, 11):
             review.wait_for(f"{number} of 10: ")
             review.press("n")
@@ -204,9 +204,9 @@ def test_a_span_of_a_rare_class_weighs_more_and_all_of_a_common_class_too():
 
 def test_alike_sounds_are_near_with_the_model_and_without_it(recorded):
     sources = find_labellings(recorded)
-    said = sources.read(*LIVE).labelling
-    long = np.flatnonzero((said.ends - said.starts) > 3 * NANOSECONDS)
-    middles = (said.starts[long] + said.ends[long]) // 2
+    output = sources.read(*LIVE).labelling
+    long = np.flatnonzero((output.ends - output.starts) > 3 * NANOSECONDS)
+    middles = (output.starts[long] + output.ends[long]) // 2
     halves = np.sort(np.concatenate([middles - NANOSECONDS, middles]))
     numbers = np.arange(len(halves))
     spans = JudgeableSpans(halves, halves + NANOSECONDS, numbers, numbers)
@@ -285,8 +285,8 @@ def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_
     assert done.returncode == 0, done.stderr
     assert "no sound of these lines is kept" in done.stderr
     assert not (tmp_path / "ten").exists()
-    asked = items(home)
-    cannot_judge = asked[0]
+    requested = items(home)
+    cannot_judge = requested[0]
 
     def keep(line):
         return not cannot_judge.start <= read_time(line.split("\t")[0]) < cannot_judge.end
@@ -299,17 +299,17 @@ def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_
     assert "7 spans of the queue, 2 minutes drawn at random" in done.stderr
     looked = written(home, read_reviewed)
     assert {(span.start, span.end, span.chosen) for span in looked} == {
-        (item.start, item.end, item.chosen) for item in asked[1:]
+        (item.start, item.end, item.chosen) for item in requested[1:]
     }
     assert {(span.corrects, bool(span.reviewer), bool(span.made)) for span in looked} == {
         ("live", True, True)
     }
-    said = find_labellings(home).read(*LIVE).labelling
-    for item in asked:
+    output = find_labellings(home).read(*LIVE).labelling
+    for item in requested:
         if item.chosen == RANDOM:
-            parts, rows, _ = pieces(said, one(item.start, item.end))
+            parts, rows, _ = pieces(output, one(item.start, item.end))
             marks = [m for m in written(home, read_marks) if item.start <= m.start < item.end]
-            assert [mark.label for mark in marks] == said.labels[rows].tolist()
+            assert [mark.label for mark in marks] == output.labels[rows].tolist()
             assert [mark.start for mark in marks] == pytest.approx(parts.starts.tolist(), abs=1e6)
     before = written(home, read_reviewed)
     again = run(capfd, "annotate", "import", home, path)
@@ -317,13 +317,15 @@ def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_
 
 
 def test_beside_the_label_file_of_a_queue_lies_the_sound_that_was_kept_line_by_line(
-    heard, tmp_path, capfd, monkeypatch
+    captured, tmp_path, capfd, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    done = run(capfd, "review", heard, "--queue", "--save", "ten.txt", "--timezone", "Asia/Tokyo")
+    done = run(
+        capfd, "review", captured, "--queue", "--save", "ten.txt", "--timezone", "Asia/Tokyo"
+    )
     assert done.returncode == 0, done.stderr
     lines = [line.split("\t") for line in Path("ten.txt").read_text().splitlines()]
-    (layer,) = heard.rglob("*.audio.mcap")
+    (layer,) = captured.rglob("*.audio.mcap")
     kept = kept_time([layer], "/mic/audio", START, START + LENGTH * MINUTE)
     folder = Path("ten")
     assert oct(folder.stat().st_mode)[-3:] == "700"
@@ -345,28 +347,28 @@ def test_beside_the_label_file_of_a_queue_lies_the_sound_that_was_kept_line_by_l
     assert [int(row.split()[0]) for row in table] == begins
     for first in begins:
         start = read_time(lines[first - 1][0])
-        heard_of_it = cut(kept, start, start + MINUTE).length > 0
-        assert bool(list(folder.glob(f"{first:02}-*.wav"))) == heard_of_it
+        reported_of_it = cut(kept, start, start + MINUTE).length > 0
+        assert bool(list(folder.glob(f"{first:02}-*.wav"))) == reported_of_it
     spans = [line for line in read_list(Path("ten.queue.csv")) if line.reason != RANDOM]
-    asked = [cut(kept, span.start, span.end).length / (span.end - span.start) for span in spans]
-    assert sum(share > 0.5 for share in asked) == len(spans)
-    assert run(capfd, "annotate", "import", heard, "ten.txt").returncode == 0
-    marks = {(m.start, m.end, m.label) for m in written(heard, read_marks)}
+    requested = [cut(kept, span.start, span.end).length / (span.end - span.start) for span in spans]
+    assert sum(share > 0.5 for share in requested) == len(spans)
+    assert run(capfd, "annotate", "import", captured, "ten.txt").returncode == 0
+    marks = {(m.start, m.end, m.label) for m in written(captured, read_marks)}
     assert marks == {(read_time(a), read_time(b), c) for a, b, c, *_ in lines}
-    again = run(capfd, "review", heard, "--queue", "--save", "ten.csv")
+    again = run(capfd, "review", captured, "--queue", "--save", "ten.csv")
     assert (again.returncode, Path("ten.csv").exists()) == (1, False)
 
 
-def test_the_sound_of_the_hour_that_is_being_recorded_is_found(heard, tmp_path):
-    (layer,) = heard.rglob("*.audio.mcap")
-    before = asked.find_kept_sound(heard, "mic", EVER, [])
+def test_the_sound_of_the_hour_that_is_being_recorded_is_found(captured, tmp_path):
+    (layer,) = captured.rglob("*.audio.mcap")
+    before = requested.find_kept_sound(captured, "mic", EVER, [])
     active = layer.rename(active_path(layer))
     with active.open("r+b") as stream:
         stream.truncate(active.stat().st_size - 8)  # without its end
-    after = asked.find_kept_sound(heard, "mic", EVER, [])
+    after = requested.find_kept_sound(captured, "mic", EVER, [])
     assert (list(after.layers), after.time.length) == ([active], before.time.length)
-    file = asked.SoundFile(1, 1, START, START + NANOSECONDS)
-    asked.write_sounds(tmp_path / "ten", [file], 1, after)
+    file = requested.SoundFile(1, 1, START, START + NANOSECONDS)
+    requested.write_sounds(tmp_path / "ten", [file], 1, after)
     assert len(soundfile.read(tmp_path / "ten/01.wav")[0]) == 16_000
 
 
@@ -375,10 +377,10 @@ def test_a_minute_whose_log_is_gone_has_no_lines():
     minutes = [(START, end), (end, end + MINUTE)]
     spans = [ReviewSpan("mic", *each, "live", "", "", "", None, RANDOM) for each in minutes]
     marks = [Mark("mic", START, middle, "speech"), Mark("mic", middle, end, "music")]
-    kept = asked.KeptSoundLayers({}, "/mic/audio", one(START, end + MINUTE))
-    files = asked.sound_files(marks, spans, kept)
+    kept = requested.KeptSoundLayers({}, "/mic/audio", one(START, end + MINUTE))
+    files = requested.sound_files(marks, spans, kept)
     assert [(file.first, file.last) for file in files] == [(1, 1), (2, 2), (1, 2)]
-    lines = asked.label_lines(marks, spans, files, "ten", UTC).splitlines()
+    lines = requested.label_lines(marks, spans, files, "ten", UTC).splitlines()
     assert [line.count("a minute drawn at random, to line 2") for line in lines] == [1, 0]
 
 

@@ -59,21 +59,21 @@ def view(timeline):
         pytest.skip(str(error))
 
 
-def ask(view, logs, start, end):
+def query(view, logs, start, end):
     """Go to a span, as a queue does."""
     view.draw_close_up(read_timeline([logs], start - MARGIN, end + MARGIN))
     view.ask(start, end, Question("Music?", "1 of 10", [Key("a", "yes")]))
     view.show(start, end, MARGIN)
 
 
-def is_asked(picture, start, end, beyond=4):
+def is_requested(picture, start, end, beyond=4):
     """Whether a light band lies from the start of a span to its end, and ends there."""
     left = _LEFT
     scale = (picture.shape[1] - left) / (end - start + 2 * MARGIN)
     first, last = (left + round(edge * scale) for edge in (MARGIN, MARGIN + end - start))
     inside = picture[:, first + 3 : last - 3].min(axis=2) > 150
-    beside = picture[:, [first - beyond, last + beyond]].min(axis=2) < 100
-    return (inside.all(axis=1) & beside.all(axis=1)).sum() >= 10
+    neighbour = picture[:, [first - beyond, last + beyond]].min(axis=2) < 100
+    return (inside.all(axis=1) & neighbour.all(axis=1)).sum() >= 10
 
 
 def rows_of_classes(picture, names):
@@ -122,12 +122,12 @@ def test_close_ups_are_right_and_the_span_is_marked_also_when_the_queue_jumps_ba
     for second in (150, 30, 61, 45):
         start = timeline.grid.start + second * SECOND
         end = start + 3 * SECOND
-        ask(view, logs, start, end)
+        query(view, logs, start, end)
 
         def is_right(png, start=start, end=end):
             picture = pixels(png)
             right = right_columns(picture, timeline, start - MARGIN, end + MARGIN)
-            return right > 0.85 and is_asked(picture, start, end)
+            return right > 0.85 and is_requested(picture, start, end)
 
         patiently(view.picture, is_right)
     assert view.state().errors == []
@@ -138,7 +138,7 @@ def test_a_drag_in_a_queue_is_seen_on_the_requested_span_until_both_are_the_same
 ):
     start = timeline.grid.start + 60 * SECOND
     first, dragged = (start, start + 6 * SECOND), (start + 2 * SECOND, start + 12 * SECOND)
-    ask(view, logs, *first)
+    query(view, logs, *first)
     for span in (dragged, first, dragged):
         view.show(*span, MARGIN)
 
@@ -150,7 +150,7 @@ def test_a_drag_in_a_queue_is_seen_on_the_requested_span_until_both_are_the_same
             grey = np.ptp(picture[:, only_first], axis=1) < 20
             grey &= np.abs(picture[:, only_first].mean(axis=1) - 90) < 12
             is_behind = grey.sum() >= 20
-            return is_asked(picture, *span, beyond=6) and is_behind == (span == dragged)
+            return is_requested(picture, *span, beyond=6) and is_behind == (span == dragged)
 
         patiently(view.picture, is_right)
 
@@ -265,7 +265,7 @@ def test_the_viewer_hardly_grows_with_the_spans_that_it_showed(view, logs, timel
     memory = []
     for number in range(20):  # the memory of a viewer goes up and down by tens of megabytes
         start = timeline.grid.start + (30 + 37 * number % 120) * SECOND
-        ask(view, logs, start, start + 3 * SECOND)
+        query(view, logs, start, start + 3 * SECOND)
         patiently(view.picture)
         memory.append(viewer.memory_info().rss)
     assert memory[-1] - memory[3] < 16 * 8_000_000

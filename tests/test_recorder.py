@@ -65,9 +65,9 @@ def test_a_file_gives_features_at_every_frame_and_labels_where_there_is_a_window
     np.testing.assert_array_equal(frames, np.arange(len(values)))
     np.testing.assert_array_equal(stamps, START + frames * FRAME_NANOSECONDS)
     labels = list(LogReader(next(logs.rglob("*.mcap"))).messages(["/mic/label"]))
-    said = [item.decode() for item in labels]
-    assert [m.frame for m in said] == frames[7 + 7 - 3 : -3].tolist()
-    assert [nanoseconds(m.header.stamp) for m in said] == stamps[11:-3].tolist()
+    output = [item.decode() for item in labels]
+    assert [m.frame for m in output] == frames[7 + 7 - 3 : -3].tolist()
+    assert [nanoseconds(m.header.stamp) for m in output] == stamps[11:-3].tolist()
     assert [item.log_time for item in labels] == stamps[14:].tolist()
 
 
@@ -287,11 +287,11 @@ def test_killed_at_any_moment_at_most_a_second_is_lost_and_the_next_start_comple
     process = start_realtime(tmp_path / "noise.wav", logs)
     began = wait_for_log(logs, seconds)
     process.kill()
-    heard = time.time() - began
+    labelled = time.time() - began
     process.wait()
     (left,) = logs.rglob("*.mcap.active")
     kept = features(left)[2]
-    assert len(kept) * 0.05 > heard - 1.0
+    assert len(kept) * 0.05 > labelled - 1.0
     content = [(m.topic, m.log_time, m.data) for m in LogReader(left).messages()]
     other = tmp_path / "other.wav"
     soundfile.write(other, noise(2), 16_000)

@@ -194,11 +194,11 @@ def test_promotion_and_rollback_say_what_was_done(folder, capfd):
     short = load(folder, "two").sha256[:12]
     assert run(capfd, *command).stdout == f"two ({short}) is the champion, after one\n"
     assert run(capfd, *command).stdout == "two is the champion already\n"
-    said = run(capfd, "models", "rollback", "--folder", folder).stdout
-    assert said == f"one ({load(folder, 'one').sha256[:12]}) is champion again, after two\n"
-    said = run(capfd, "models", "rollback", "--folder", folder).stdout
-    assert said.startswith("general (")
-    assert said.endswith(") is champion again, after one\n")
+    output = run(capfd, "models", "rollback", "--folder", folder).stdout
+    assert output == f"one ({load(folder, 'one').sha256[:12]}) is champion again, after two\n"
+    output = run(capfd, "models", "rollback", "--folder", folder).stdout
+    assert output.startswith("general (")
+    assert output.endswith(") is champion again, after one\n")
     result = run(capfd, "models", "rollback", "--folder", folder)
     assert (result.returncode, result.stderr.count("\n")) == (1, 1)
 

@@ -170,14 +170,14 @@ def test_a_silence_over_many_logs_is_one_segment(model, night, tmp_path):
 
 
 def test_logs_that_come_late_change_what_was_open_in_all_behind_them(model, night, tmp_path):
-    whole, late = (Path(shutil.copytree(night, tmp_path / name)) for name in "ab")
-    relabelled(model, whole)
+    full, late = (Path(shutil.copytree(night, tmp_path / name)) for name in "ab")
+    relabelled(model, full)
     first = recorded_logs(late)[0]
     first.rename(tmp_path / "first")
     relabelled(model, late)
     (tmp_path / "first").rename(first)
     relabelled(model, late)
-    assert written(late) == written(whole)
+    assert written(late) == written(full)
 
 
 @of_one_kind
@@ -359,10 +359,12 @@ def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, tmp_path, capf
     assert log.read_bytes() == data
     (tmp_path / "saved").mkdir()
     recover_log(log, tmp_path / "saved" / log.name, log.name)
-    heard = np.concatenate([features(recorded_logs(logs)[0])[0], features(tmp_path / "saved")[0]])
-    whole = labelled_frames(heard, label_timing(load_model(model).description))
+    recorded = np.concatenate(
+        [features(recorded_logs(logs)[0])[0], features(tmp_path / "saved")[0]]
+    )
+    full = labelled_frames(recorded, label_timing(load_model(model).description))
     frames = frames_of_layer(log, model)
-    assert frames.tolist() == whole[-len(frames) :].tolist()
+    assert frames.tolist() == full[-len(frames) :].tolist()
     assert 200 < len(frames) < 1200 - 19
     again = run(capfd, "relabel", logs, "--model", model, "--workers", 1)
     assert again.returncode == 3
@@ -471,13 +473,13 @@ def test_a_layer_is_no_log_to_label(model, logs, capfd):
 def test_where_a_layer_cannot_be_made_those_behind_it_are_as_ever(model, logs, night):
     name = load_model(model).name
     for folder in (logs, Path(shutil.copytree(night, logs.parent / "night"))):
-        whole = Path(shutil.copytree(folder, folder.parent / f"{folder.name}-whole"))
-        relabelled(model, whole)
+        full = Path(shutil.copytree(folder, folder.parent / f"{folder.name}-whole"))
+        relabelled(model, full)
         bad = relabel_path(recorded_logs(folder)[1], name)
         bad.write_bytes(b"no layer")
         found = relabelled(model, folder, workers=2)
         assert len(found.failed) == 1
-        assert written(folder) == written(whole) | {bad.name: b"no layer"}
+        assert written(folder) == written(full) | {bad.name: b"no layer"}
 
 
 @of_one_kind
@@ -640,13 +642,13 @@ class DeadlyWorkers(InlineWorkers):
 
 def test_a_log_that_kills_its_worker_costs_nothing_but_its_own_layer(model, night, tmp_path):
     logs = Path(shutil.copytree(night, tmp_path / "night"))
-    whole = Path(shutil.copytree(night, tmp_path / "whole"))
-    relabelled(model, whole)
+    full = Path(shutil.copytree(night, tmp_path / "whole"))
+    relabelled(model, full)
     victim = recorded_logs(logs)[2]
     done = relabel([logs], load_model(model), model, DeadlyWorkers(victim))
     assert done.failed == {victim: "the task lost its worker 3 times"}
     layer = relabel_path(victim, load_model(model).name).name
-    assert written(logs) == {k: v for k, v in written(whole).items() if k != layer}
+    assert written(logs) == {k: v for k, v in written(full).items() if k != layer}
 
 
 @of_one_kind
@@ -742,10 +744,10 @@ def test_after_the_scheduler_went_away_a_run_completes_what_is_left(model, logs,
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
             wait_for(lambda: begun(logs) or complete(logs, layers))
             scheduler.kill()
-            _, said = process.communicate(timeout=60)
+            _, output = process.communicate(timeout=60)
         assert process.returncode in {1, 3}
-        assert "Traceback" not in said
-        assert f"the Dask scheduler at {address} is gone" in said
+        assert "Traceback" not in output
+        assert f"the Dask scheduler at {address} is gone" in output
     wait_for(lambda: not busy(logs))
     for layer in (path for path in find_logs(logs) if is_layer(path)):
         layer.unlink()

@@ -62,9 +62,9 @@ LOST = {5: 7, 12: 150}  # frames, before blocks of ten seconds
 
 def record_day(folder, day, model, **settings):
     """Record three minutes with gaps, stop, and go on two minutes later; a file a minute."""
-    asked = Settings(output=folder, model=model, max_bag_duration=60, **settings)
-    record(asked, LossySource(FileSource([day], START), LOST), Flag())
-    record(asked, FileSource([day], START + 300 * SECOND), Flag())
+    requested = Settings(output=folder, model=model, max_bag_duration=60, **settings)
+    record(requested, LossySource(FileSource([day], START), LOST), Flag())
+    record(requested, FileSource([day], START + 300 * SECOND), Flag())
     return folder
 
 
@@ -148,10 +148,10 @@ def test_so_does_each_microphone_of_a_log_with_its_own_model(
             "replay", recorded, "--microphone", name, "--model", model, "-o", tmp_path / name
         )
         assert done.returncode == 0
-        again, whole = by_topic(tmp_path / name), by_topic(recorded)
+        again, full = by_topic(tmp_path / name), by_topic(recorded)
         for kind in ("features", "statistics", "label", "segment"):
             assert again[f"/{name}/{kind}"]
-            assert again[f"/{name}/{kind}"] == whole[f"/{name}/{kind}"]
+            assert again[f"/{name}/{kind}"] == full[f"/{name}/{kind}"]
         (other,) = set(models) - {name}
         assert not any(topic.startswith(f"/{other}/") for topic in again)
         about = LogReader(find_logs(tmp_path / name)[0])
@@ -394,14 +394,14 @@ def test_a_recording_that_was_killed_comes_out_with_the_segment_that_was_open(
 
 
 def test_an_unfinished_log_is_replayed_up_to_its_end(folder, model_file, hearthlog, tmp_path):
-    whole = find_logs(folder)[0]
-    cut = tmp_path / (whole.name + ".active")
-    cut.write_bytes(whole.read_bytes()[:100_000])
+    full = find_logs(folder)[0]
+    cut = tmp_path / (full.name + ".active")
+    cut.write_bytes(full.read_bytes()[:100_000])
     result = hearthlog("replay", cut, "--model", model_file, "-o", tmp_path / "again")
     assert result.returncode == 3
     assert f"unfinished, replayed up to the last whole chunk: {cut}" in result.stderr
     assert "bit for bit" in result.stderr
-    again, recorded = features(tmp_path / "again"), features(whole)
+    again, recorded = features(tmp_path / "again"), features(full)
     assert 0 < len(again[0]) < len(recorded[0])
     np.testing.assert_array_equal(again[2], recorded[2][: len(again[2])])
 
@@ -409,9 +409,9 @@ def test_an_unfinished_log_is_replayed_up_to_its_end(folder, model_file, hearthl
 def test_without_an_output_what_came_of_it_is_told(folder, model_file, hearthlog):
     result = hearthlog("replay", folder, "--model", model_file)
     assert (result.returncode, result.stderr) == (0, "")
-    heard, labels, segments, gaps = result.stdout.splitlines()
+    labelled, labels, segments, gaps = result.stdout.splitlines()
     count = len(read(folder, "label"))
-    assert heard.startswith("360.0 s of sound in ")
+    assert labelled.startswith("360.0 s of sound in ")
     assert labels == (
         f"{count} labels, {count} of the {count} recorded ones again (100.00%); bit for bit"
     )
@@ -602,12 +602,12 @@ def test_clips_of_a_sound_card_that_runs_slow_are_one_sound_on_their_clock(tmp_p
 def test_a_part_of_clips_is_as_in_the_whole(real_frames, model_file, tmp_path):
     sound = (real_frames.ravel()[: 30 * 16_000] * 32767).astype(np.int16)[:, np.newaxis]
     clips = write_clips(tmp_path / "clips.mcap", pieces(sound, 16_000, [70_001] * 8))
-    whole, part = tmp_path / "whole", tmp_path / "part"
-    replay(clips, whole, model_file, kind="audio")
+    full, part = tmp_path / "whole", tmp_path / "part"
+    replay(clips, full, model_file, kind="audio")
     replay(clips, part, model_file, kind="audio", start_offset=7.0, duration=9.5)
     inside = [
         m
-        for m in payloads(whole, "features", "statistics", "label")
+        for m in payloads(full, "features", "statistics", "label")
         if START + 7 * SECOND <= m[1] < START + 16.5 * SECOND
     ]
     assert payloads(part, "features", "statistics", "label") == inside
@@ -717,8 +717,8 @@ def test_layers_are_no_part_of_a_recording(folder, model_file, tmp_path):
 
 def test_logs_of_two_recorders_are_not_mixed(folder, day, hearthlog, tmp_path):
     shutil.copytree(folder, tmp_path / "recorded")
-    asked = Settings(output=tmp_path / "recorded", node="flat")
-    record(asked, FileSource([day], START), Flag())
+    requested = Settings(output=tmp_path / "recorded", node="flat")
+    record(requested, FileSource([day], START), Flag())
     result = hearthlog("replay", tmp_path / "recorded")
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
@@ -806,8 +806,8 @@ def test_what_cannot_be_done_is_refused_in_one_line(folder, tmp_path, capsys, op
     with pytest.raises((typer.Exit, HearthlogError)) as refusal:
         verb(folder, **options)
     assert getattr(refusal.value, "exit_code", 1) == status
-    said = capsys.readouterr().err if status == 2 else str(refusal.value)
-    assert len(said.splitlines()) == 1
+    printed = capsys.readouterr().err if status == 2 else str(refusal.value)
+    assert len(printed.splitlines()) == 1
     assert (tmp_path / "there.rrd").read_text() == "kept"
     assert list(tmp_path.iterdir()) == [tmp_path / "there.rrd"]
     assert sorted(folder.rglob("*")) == before

@@ -154,8 +154,8 @@ def test_what_two_microphones_hear_at_one_time_counts_once(tmp_path):
 def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give():
     assert exactly(3).text == "3"
     assert Count(7, 0, Strata(100, 20, 7)).text == "7"
-    said = np.array([1, 1, 1, 1, 0, 0, 2, 1])
-    rates = checked_rates(said, np.minimum(said, 1), said > 0, 0.5)
+    printed = np.array([1, 1, 1, 1, 0, 0, 2, 1])
+    rates = checked_rates(printed, np.minimum(printed, 1), printed > 0, 0.5)
     count = Count(27, 2, Strata(100, 20, 25), rates)
     low, high = count.range
     assert 2 <= low < 25 < high
@@ -222,12 +222,12 @@ def test_the_zone_is_that_of_the_option_or_the_logs_or_utc(tmp_path):
 
 
 def test_minutes_and_events_are_those_of_the_segments_that_a_recorder_wrote(recorded, tmp_path):
-    said = read(recorded, "segment")
-    first = nanoseconds(said[0].header.stamp)
+    printed = read(recorded, "segment")
+    first = nanoseconds(printed[0].header.stamp)
     start = local_time(first, UTC).date()
     day = look(recorded, start)
     for name in day.home.classes:
-        own = [segment for segment in said if segment.label == name]
+        own = [segment for segment in printed if segment.label == name]
         length = sum(nanoseconds(segment.duration) for segment in own)
         if not own:  # of a few minutes of a day nobody knows what was not in it
             assert day.minutes(name) is day.count(name) is None
@@ -304,8 +304,8 @@ def test_a_0_is_said_where_three_quarters_of_the_time_were_heard(tmp_path, last,
 def test_a_lively_time_is_the_first_where_it_was_listened_to_before(tmp_path):
     events = [(at(f"{hour}:00"), 120, "speech", 1.0) for hour in ("08", "20")]
     write_day(tmp_path, DAY, events)
-    whole = look(tmp_path)
-    assert (whole.first.text, whole.last.text) == ("08:00", "20:09")
+    full = look(tmp_path)
+    assert (full.first.text, full.last.text) == ("08:00", "20:09")
     write_day(tmp_path / "late", DAY, events, hours=range(8, 24))
     late = look(tmp_path / "late")
     assert late.first is None

@@ -238,10 +238,12 @@ def test_a_dry_run_says_what_would_go_and_why_and_deletes_nothing(logs, hearthlo
     command = ["retain", "-o", folder, "--retention-days", 4, "--min-free-space", 0]
     result = hearthlog(*command, "--dry-run")
     assert result.returncode == 0
-    said = result.stdout.splitlines()
-    assert [line.partition(":")[0] for line in said] == [str(log) for log in (*logs[1:3], logs[0])]
-    assert all("4 days were recorded since" in line for line in said[:2])
-    assert said[2].endswith("is kept: reviewed")
+    output = result.stdout.splitlines()
+    assert [line.partition(":")[0] for line in output] == [
+        str(log) for log in (*logs[1:3], logs[0])
+    ]
+    assert all("4 days were recorded since" in line for line in output[:2])
+    assert output[2].endswith("is kept: reviewed")
     assert "2 logs would be deleted" in result.stderr
     assert left(logs) == logs
     parsed = json.loads(hearthlog(*command, "--json").stdout)
@@ -268,15 +270,15 @@ def test_a_recorder_deletes_at_its_start_and_says_so_in_its_log(logs):
     folder = logs[0].parents[3]
     about = Settings(output=folder, model="none", max_bag_files=12)
 
-    def said():  # of the log that is written: the others may go at any moment
+    def output():  # of the log that is written: the others may go at any moment
         newest = find_logs(folder)[-1]
         return [item.msg for item in read(newest, "rosout") if "deleted" in item.msg]
 
     begin = START + 5 * DAY
-    new = record(about, Sound(begin, said), Flag()).logs
+    new = record(about, Sound(begin, output), Flag()).logs
     assert left(logs) == logs[3:]
     assert find_logs(folder) == [*logs[3:], *new]
-    (line,) = said()
+    (line,) = output()
     assert line.startswith("3 logs deleted")
     (status,) = [
         status

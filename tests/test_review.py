@@ -126,7 +126,7 @@ def test_marks_are_what_was_said_last_and_undone_they_are_as_before(shared_home,
     for log, start, end in ((0, edge - SECOND, edge), (1, edge + SECOND, edge + 2 * SECOND)):
         write_marks(marking.coverage.logs[log], [Mark("mic", start, end, "music", *OLD)])
     before = layers(shared_home)
-    said = np.array(cells_of(marking.labelled))
+    output = np.array(cells_of(marking.labelled))
     history = [cells_of(marking.marks())]
     last = int((marking.coverage.ends[-1] - START) // CELL)
     for kind, first, length, label in done:
@@ -138,7 +138,7 @@ def test_marks_are_what_was_said_last_and_undone_they_are_as_before(shared_home,
             history = history[:-1] or history
             now = history[-1]
         else:
-            extent = {"mark": label, "confirm": said[cells], "delete": None}[kind]
+            extent = {"mark": label, "confirm": output[cells], "delete": None}[kind]
             arguments = (start, end, label) if kind == "mark" else (start, end)
             try:
                 getattr(marking, kind)(*arguments)
@@ -185,11 +185,11 @@ def test_a_span_across_logs_is_a_mark_in_each_of_them(home):
 
 
 def test_what_was_not_recorded_cannot_be_marked_and_nothing_changes(home):
-    whole = marking_of(home)
+    full = marking_of(home)
     hole = Coverage(
-        *(list(column[:1]) + list(column[2:]) for column in vars(whole.coverage).values())
+        *(list(column[:1]) + list(column[2:]) for column in vars(full.coverage).values())
     )
-    marking = Marking("mic", hole, "Ann", "live", whole.labelled)
+    marking = Marking("mic", hole, "Ann", "live", full.labelled)
     for start, end in (
         (hole.ends[0] - SECOND, hole.starts[1] + SECOND),
         (hole.ends[0] + SECOND, hole.ends[0] + 2 * SECOND),
@@ -246,7 +246,7 @@ class Screen:
         self.at = None
         self.answers = self.draws = True
         self.shown = []
-        self.asked = []
+        self.requested = []
         self.played = []
         self.refreshed = 0
         self.lane = None
@@ -270,7 +270,7 @@ class Screen:
         self.refreshed += 1
 
     def ask(self, start, end, question):
-        self.asked.append((start, end, question))
+        self.requested.append((start, end, question))
 
     def play(self, start):
         self.played.append(start)
@@ -287,9 +287,9 @@ class Sitting:
 
     def __init__(self, home, items=()):
         self.screen = Screen()
-        self.said = []
+        self.output = []
         self.closely = []
-        self.heard = []
+        self.played = []
         self.seconds = 3.0  # of each sound
         marking = marking_of(home)
         self.labelled = marking.labelled
@@ -298,10 +298,10 @@ class Sitting:
             marking,
             ["silence", "speech", "coughing"],
             UTC,
-            self.said.append,
+            self.output.append,
             lambda start, end: self.closely.append((start, end)),
-            lambda start, end: self.heard.append((start, end)) or (self.seconds, "playing"),
-            lambda: self.said.append("silence"),
+            lambda start, end: self.played.append((start, end)) or (self.seconds, "playing"),
+            lambda: self.output.append("silence"),
             items,
         )
 
@@ -326,15 +326,15 @@ def test_a_key_names_the_span_that_is_marked_with_the_mouse(home):
     assert sitting.run("2") == 1
     assert [(m.start, m.end, m.label) for m in layers(home)] == [(*span, "speech")]
     assert sitting.screen.lane == [(*span, "speech")]
-    assert sitting.said[1].startswith("marked as talking: ")
-    assert sitting.said[-1].startswith("1 span reviewed in")
+    assert sitting.output[1].startswith("marked as talking: ")
+    assert sitting.output[-1].startswith("1 span reviewed in")
 
 
 def test_correct_is_what_the_recorder_said_in_the_span(home):
     sitting = Sitting(home)
     sitting.screen.marked = start, end = (START + 10 * SECOND, START + 40 * SECOND)
     sitting.run("c")
-    said = [
+    output = [
         (max(a, start), min(b, end), text)
         for a, b, text in as_rows(sitting.labelled)
         if a < end and b > start
@@ -342,7 +342,7 @@ def test_correct_is_what_the_recorder_said_in_the_span(home):
     edge = marking_of(home).coverage.starts[1]
     found = [(m.start, m.end, m.label) for m in layers(home)]
     assert len({label for *_, label in found}) > 1
-    assert [m for m in found if edge not in m[:2]] == [m for m in said if not m[0] < edge < m[1]]
+    assert [m for m in found if edge not in m[:2]] == [m for m in output if not m[0] < edge < m[1]]
 
 
 def test_unknown_delete_and_undo(home):
@@ -356,7 +356,7 @@ def test_unknown_delete_and_undo(home):
     assert [m.label for m in layers(home)] == ["unknown"]
     assert sitting.run("zz") == 0
     assert layers(home) == []
-    assert "nothing to undo" in sitting.said
+    assert "nothing to undo" in sitting.output
 
 
 def test_the_ends_of_a_span_are_set_at_the_cursor(home):
@@ -374,11 +374,11 @@ def test_the_ends_of_a_span_are_set_at_the_cursor(home):
     sitting.session.press("[")
     sitting.screen.at = START + 8 * SECOND
     sitting.session.press("]")
-    assert sitting.said[-1].startswith("put the time cursor on the start and press [")
+    assert sitting.output[-1].startswith("put the time cursor on the start and press [")
 
 
 @pytest.mark.parametrize(
-    ("key", "said"),
+    ("key", "output"),
     [
         ("2", "no span is selected: drag a span on the time ruler"),
         ("c", "no span is selected"),
@@ -390,10 +390,10 @@ def test_the_ends_of_a_span_are_set_at_the_cursor(home):
         ("n", "'n' does nothing"),
     ],
 )
-def test_a_key_that_does_not_fit_is_explained_and_changes_nothing(home, key, said):
+def test_a_key_that_does_not_fit_is_explained_and_changes_nothing(home, key, output):
     sitting = Sitting(home)
     sitting.session.press(key)
-    assert said in sitting.said[-1]
+    assert output in sitting.output[-1]
     assert layers(home) == []
 
 
@@ -401,7 +401,7 @@ def test_a_span_that_was_not_recorded_is_explained_and_the_session_goes_on(home)
     sitting = Sitting(home)
     sitting.screen.marked = (START - 9 * SECOND, START - 5 * SECOND)
     sitting.session.press("2")
-    assert "part of this span was not recorded" in sitting.said[-1]
+    assert "part of this span was not recorded" in sitting.output[-1]
     sitting.screen.marked = (START + 5 * SECOND, START + 9 * SECOND)
     sitting.session.press("2")
     assert len(layers(home)) == 1
@@ -412,7 +412,7 @@ def test_a_viewer_that_does_not_answer_costs_no_mark(home):
     sitting.screen.marked = (START + 5 * SECOND, START + 9 * SECOND)
     sitting.screen.answers = False
     sitting.session.press("2")
-    assert "did not answer" in sitting.said[-1]
+    assert "did not answer" in sitting.output[-1]
     sitting.screen.answers = True
     sitting.session.press("2")
     assert len(layers(home)) == 1
@@ -425,9 +425,9 @@ def test_a_mark_that_cannot_be_shown_is_made_once_and_undone_once(home):
     sitting.screen.marked = (START + 15 * SECOND, START + 19 * SECOND)
     sitting.screen.draws = False
     sitting.session.press("3")
-    assert "saved, but not shown" in sitting.said[-1]
+    assert "saved, but not shown" in sitting.output[-1]
     sitting.session.press("z")
-    assert "saved, but not shown" in sitting.said[-1]
+    assert "saved, but not shown" in sitting.output[-1]
     assert [mark.label for mark in layers(home)] == ["speech"]
 
 
@@ -443,7 +443,7 @@ def test_a_queue_goes_on_by_itself_and_ends_after_the_last_span(home):
         (*item[:2], label)
         for item, label in zip(items, ["speech", "coughing", "unknown"], strict=True)
     ]
-    found = [line[:6] for line in sitting.said if line[1:5] == " of "]
+    found = [line[:6] for line in sitting.output if line[1:5] == " of "]
     assert found == ["1 of 3", "2 of 3", "3 of 3"]
     assert all(
         a < item.start and b > item.end for (a, b), item in zip(sitting.closely, items, strict=True)
@@ -469,8 +469,8 @@ def test_the_ends_of_a_mark_are_moved_by_a_drag_over_it_and_undone(home):
     sitting.session.press("m")
     assert seconds_of(home) == [(9.5, 14.5, "speech"), (14.5, 16, "coughing")]
     assert sitting.screen.lane == [(m.start, m.end, m.label) for m in layers(home)]
-    assert sitting.said[-1].startswith("mark moved: talking: ")
-    assert sitting.said[-1].endswith(", 5.0 s")
+    assert sitting.output[-1].startswith("mark moved: talking: ")
+    assert sitting.output[-1].endswith(", 5.0 s")
     sitting.session.press("z")
     assert layers(home) == before
     assert sitting.screen.lane == [(m.start, m.end, m.label) for m in before]
@@ -481,10 +481,10 @@ def test_the_last_mark_is_moved_to_a_span_without_a_mark_but_an_older_one_is_not
     sitting = Sitting(home)
     select(sitting, 20, 21)
     sitting.session.press("m")
-    assert "no mark in the selection" in sitting.said[-1]
+    assert "no mark in the selection" in sitting.output[-1]
     sitting.session.press("2")
     sitting.session.press("m")
-    assert "the mark has these ends" in sitting.said[-1]
+    assert "the mark has these ends" in sitting.output[-1]
     select(sitting, 22, 22.5)
     sitting.session.press("m")
     assert seconds_of(home) == [(22, 22.5, "speech"), (60, 61, "music")]
@@ -545,7 +545,7 @@ def test_in_a_queue_what_is_reviewed_follows_the_mark_and_nothing_moves_without_
     sitting = Sitting(home, items)
     sitting.run("2")
     sitting.session.press("m")  # the next item is selected by the queue, by nobody's hand
-    assert sitting.said[-1].startswith("drag the new span of the mark first")
+    assert sitting.output[-1].startswith("drag the new span of the mark first")
     select(sitting, 1, 3)
     sitting.session.press("m")
     assert seconds_of(home) == [(1, 3, "speech")]
@@ -577,7 +577,7 @@ def test_in_a_queue_one_may_skip_go_back_and_accept(home):
         (*items[0][:2], "silence"),
         (*items[1][:2], "music"),
     ]
-    assert sitting.heard == [items[1][:2]]
+    assert sitting.played == [items[1][:2]]
     assert sitting.screen.played == [items[1].start]
 
 
@@ -599,7 +599,7 @@ def test_undo_in_a_queue_goes_back_to_the_span_that_was_undone(home):
         (items[0].start, "speech"),
         (items[2].start, "silence"),
     ]
-    start, end, question = sitting.screen.asked[-2]
+    start, end, question = sitting.screen.requested[-2]
     assert ((start, end), question.text) == (items[2][:2], "Music?")
 
 
@@ -638,10 +638,10 @@ def test_in_a_minute_a_key_without_a_drag_names_nothing(home, key):
     sitting.run("")
     assert sitting.screen.marked is None
     sitting.session.press(key)
-    assert sitting.said[-1].startswith("drag over the sound first; Enter confirms the rest")
+    assert sitting.output[-1].startswith("drag over the sound first; Enter confirms the rest")
     assert (reviewed(home), layers(home)) == ([], [])
     sitting.session.press(" ")  # all of it is played
-    assert sitting.heard == [(START + 30 * SECOND, START + 90 * SECOND)]
+    assert sitting.played == [(START + 30 * SECOND, START + 90 * SECOND)]
 
 
 def test_space_plays_and_stops(home):
@@ -649,12 +649,12 @@ def test_space_plays_and_stops(home):
     sitting.run("")
     for _ in range(3):
         sitting.session.press(" ")
-    assert sitting.heard == [items_of(1)[0][:2]] * 2
-    assert sitting.said[-4:] == ["playing", "silence", "stopped", "playing"]
+    assert sitting.played == [items_of(1)[0][:2]] * 2
+    assert sitting.output[-4:] == ["playing", "silence", "stopped", "playing"]
     sitting.seconds = 0.0  # nothing was kept
     sitting.session.press("p")
     sitting.session.press("p")
-    assert len(sitting.heard) == 3
+    assert len(sitting.played) == 3
     assert len(sitting.screen.played) == 2
 
 
@@ -720,10 +720,10 @@ def test_a_reviewer_reads_the_names_that_the_lanes_have_and_one_key_means_not_su
     ]
     assert classes == ["quiet", "shouting", "telephone ringing", "not sure"]
     sitting.run("3")
-    ((*span, question),) = sitting.screen.asked
+    ((*span, question),) = sitting.screen.requested
     assert (tuple(span), question.text) == (item[:2], "Shouting?")
     assert [one.cap for one in question.keys] == [*"a13tun", "Space", "z"]  # 2 is what is asked
-    assert sitting.said[2].startswith("marked as telephone ringing: ")
+    assert sitting.output[2].startswith("marked as telephone ringing: ")
     assert [mark.label for mark in layers(home)] == ["phone_ring"]
 
 
@@ -1042,11 +1042,11 @@ def test_the_page_shows_the_line_before_and_the_last_one_whole_above_the_buttons
             )  # fmt: skip
             review.wait_for("1 of ")
             review.press("u")
-            asked = review.wait_for("2 of ")
-            patiently(page.text, lambda text: text == asked)
-            (done, is_whole), (last, also) = page.evaluate(lines)
+            requested = review.wait_for("2 of ")
+            patiently(page.text, lambda text: text == requested)
+            (done, is_complete), (last, also) = page.evaluate(lines)
             assert done.startswith("marked as not sure: ")
-            assert (last, is_whole, also) == (asked, True, True)
+            assert (last, is_complete, also) == (requested, True, True)
             assert min(page.evaluate(tops)) >= 0
 
 
@@ -1082,8 +1082,8 @@ def test_the_page_plays_the_kept_sound_of_the_span_and_nobody_else_gets_it(home,
             assert (status, kind) == (200, "audio/wav")
             with wave.open(io.BytesIO(content)) as file:
                 assert (file.getframerate(), file.getnframes()) == (16_000, 32_000)
-                heard = np.frombuffer(file.readframes(32_000), "<i2")
-            assert np.abs(heard - tone[16_000:48_000]).max() <= 1
+                recorded = np.frombuffer(file.readframes(32_000), "<i2")
+            assert np.abs(recorded - tone[16_000:48_000]).max() <= 1
             for path, headers in (
                 ("/sound", {}),
                 (f"/{'x' * 22}/sound", {}),

@@ -52,7 +52,7 @@ def plain(monkeypatch):
     monkeypatch.setattr(rooms, "_FLOOR_ERROR_DB", 0.0)
 
 
-def asked(monkeypatch, **values):
+def requested(monkeypatch, **values):
     for name, value in values.items():
         monkeypatch.setattr(rooms, name, (value, value))
 
@@ -77,7 +77,7 @@ def test_its_spectrum_falls_by_some_decibels_an_octave(monkeypatch, slope, decib
 @pytest.mark.usefixtures("plain")
 @pytest.mark.parametrize("ratio", [5.0, 15.0, 30.0])
 def test_a_copy_in_a_room_has_the_noise_that_was_asked_for(monkeypatch, ratio):
-    asked(monkeypatch, _SIGNAL_TO_NOISE_DB=ratio, _GAIN_DB=0.0)
+    requested(monkeypatch, _SIGNAL_TO_NOISE_DB=ratio, _GAIN_DB=0.0)
     frames = speech_like(5, -25.0)
     features, floor = in_room(frames, DEFAULT, np.random.default_rng(0), silence=False)
     assert features.shape == (len(frames), DEFAULT.width)
@@ -89,14 +89,14 @@ def test_a_copy_in_a_room_has_the_noise_that_was_asked_for(monkeypatch, ratio):
 @pytest.mark.usefixtures("plain")
 @pytest.mark.parametrize("gain", [-20.0, 0.0, 12.0])
 def test_and_the_gain(monkeypatch, gain):
-    asked(monkeypatch, _SIGNAL_TO_NOISE_DB=30.0, _GAIN_DB=gain)
+    requested(monkeypatch, _SIGNAL_TO_NOISE_DB=30.0, _GAIN_DB=gain)
     features, _ = in_room(speech_like(5, -40.0), DEFAULT, np.random.default_rng(0), silence=False)
     assert level_of(DEFAULT.power(features)) == pytest.approx(-40 + gain, abs=0.2)
 
 
 @pytest.mark.usefixtures("plain")
 def test_what_is_too_loud_for_a_microphone_is_cut_off(monkeypatch):
-    asked(monkeypatch, _GAIN_DB=20.0)
+    requested(monkeypatch, _GAIN_DB=20.0)
     features, _ = in_room(speech_like(2, -3.0), DEFAULT, np.random.default_rng(0), silence=False)
     assert DEFAULT.power(features).max() <= 1.0
 
@@ -104,7 +104,7 @@ def test_what_is_too_loud_for_a_microphone_is_cut_off(monkeypatch):
 @pytest.mark.usefixtures("plain")
 @pytest.mark.parametrize("noise", [-85.0, -60.0, -40.0])
 def test_silence_has_noise_of_any_level_and_is_its_own_floor(monkeypatch, noise):
-    asked(monkeypatch, _SILENCE_DBFS=noise, _GAIN_DB=0.0)
+    requested(monkeypatch, _SILENCE_DBFS=noise, _GAIN_DB=0.0)
     frames = np.zeros((100, FRAME_SAMPLES), np.float32)
     features, floor = in_room(frames, DEFAULT, np.random.default_rng(0), silence=True)
     assert level_of(DEFAULT.power(features)) == pytest.approx(noise, abs=0.3)
@@ -162,9 +162,9 @@ def test_the_same_clips_give_the_same_copies_and_no_two_are_alike(tmp_path):
 
 def test_a_clip_has_the_same_copies_whatever_comes_behind_it(tmp_path):
     clips = clips_in(tmp_path)
-    whole = list(clip_recordings(clips, SCENARIO, ignore_progress, rooms=2))
+    full = list(clip_recordings(clips, SCENARIO, ignore_progress, rooms=2))
     part = list(clip_recordings(clips[:3], SCENARIO, ignore_progress, rooms=2))
-    for one, other in zip(whole, part, strict=False):
+    for one, other in zip(full, part, strict=False):
         for copy, again in zip(one.copies, other.copies, strict=True):
             assert np.array_equal(copy.features, again.features)
             assert np.array_equal(copy.floor, again.floor)

@@ -109,9 +109,9 @@ def test_a_node_ends_in_order_whenever_it_is_asked_to(ros, number, labmic, tmp_p
             with ros.node("live", folder=tmp_path / "logs", delay=0.0) as node:
                 wait_until_handled(node)
                 time.sleep(seconds)
-                said = end(node, number)
-                assert node.returncode == 0, said
-                assert "Traceback" not in said
+                printed = end(node, number)
+                assert node.returncode == 0, printed
+                assert "Traceback" not in printed
 
 
 @pytest.mark.parametrize(
@@ -127,10 +127,10 @@ def test_a_node_ends_in_order_whenever_it_is_asked_to(ros, number, labmic, tmp_p
 )
 def test_what_is_wrong_is_said_in_one_line(ros, executable, parameters, environment, line):
     with ros.node(executable, env=environment, **parameters) as node:
-        said = node.communicate(timeout=120)[0]
-    assert said.startswith("hearthlog_ros: ")
-    assert line in said
-    assert said.count("\n") == 1
+        printed = node.communicate(timeout=120)[0]
+    assert printed.startswith("hearthlog_ros: ")
+    assert line in printed
+    assert printed.count("\n") == 1
     assert node.returncode == 1
 
 
@@ -148,11 +148,11 @@ def test_features_of_another_set_are_not_labelled(ros, labmic, tmp_path):
         ros.node("live", folder=tmp_path / "logs") as live,
         ros.node("label", model="general") as label,
     ):
-        said = label.communicate(timeout=120)[0]
+        printed = label.communicate(timeout=120)[0]
         end(live)
     # Features and what is known of them may arrive in either order.
     line = r"model general is for feature set home33; /mic/features has .*: choose another model\n"
-    assert re.search(line, said)
+    assert re.search(line, printed)
     assert label.returncode == 1
 
 
@@ -162,9 +162,9 @@ def test_a_microphone_is_labelled_under_one_name_only_once(ros, labmic, tmp_path
         ros.node("live", folder=tmp_path / "logs") as live,
         ros.node("label", model="general") as label,
     ):
-        said = label.communicate(timeout=120)[0]
+        printed = label.communicate(timeout=120)[0]
         end(live)
-    assert "/mic/label is published by hearthlog_live already" in said
+    assert "/mic/label is published by hearthlog_live already" in printed
     assert label.returncode == 1
 
 

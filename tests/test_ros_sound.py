@@ -72,8 +72,8 @@ def test_a_topic_has_the_features_of_its_sound(ros, case, sound, tmp_path):
     robot = speaking(ros, name, path, milliseconds)
     with robot, topic_recorder(ros, logs, "ros2:///robot/audio") as recorder:
         wait_until_logged(logs, features=120)
-        said = end(recorder)
-    assert recorder.returncode == 0, said
+        output = end(recorder)
+    assert recorder.returncode == 0, output
     command = [*HEARTHLOG, "record", str(path), "-o", str(tmp_path / "file"), "--model", "none"]
     subprocess.run(command, check=True)
     frames, stamps, values = features(logs)
@@ -146,9 +146,9 @@ def test_what_is_wrong_with_a_topic_is_said(ros, case, sound, tmp_path):
     name, address, line = case
     robot = speaking(ros, name, sound()) if name else nullcontext()
     with robot, topic_recorder(ros, tmp_path / "logs", address) as recorder:
-        said = ""
-        while line not in said:
-            said = recorder.stdout.readline()
-            assert said
-        assert "waiting for it" in said
+        output = ""
+        while line not in output:
+            output = recorder.stdout.readline()
+            assert output
+        assert "waiting for it" in output
         end(recorder, signal.SIGINT)

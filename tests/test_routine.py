@@ -216,9 +216,9 @@ def test_the_night_is_the_one_before_or_the_one_after():
     rng = np.random.default_rng(6)
     days = [usual_day(rng) for _ in range(4)]
     days[2] += [(at("02:00") + 60 * n, 2, "coughing", 1) for n in range(30)]
-    heard = home(days)
+    recorded = home(days)
     for night_after, number in ((False, 2), (True, 1)):
-        profiles = Profiles(heard, UTC, night_after=night_after)
+        profiles = Profiles(recorded, UTC, night_after=night_after)
         place = profiles.figures.index(DayFigure("coughing", COUNT, night=True))
         counts = [profiles.of(MONDAY + timedelta(days=n)).values[place] for n in (1, 2)]
         assert [count > 25 for count in counts] == [number == 1, number == 2]
@@ -323,9 +323,9 @@ def logs(tmp_path_factory):
 
 def test_an_alert_tells_of_an_unusual_day_in_the_morning_after_it(logs):
     shelf, start = find_home_logs([logs]), midnight(MONDAY)
-    heard = read_activity(shelf, "home", start, 1 << 62, pytest.fail)
+    recorded = read_activity(shelf, "home", start, 1 << 62, pytest.fail)
     end = start + 20 * 24 * HOUR * NANOSECONDS
-    (ring,), _ = notifications(rule("unusual_day", "day", once_in=100), heard, start, end, UTC)
+    (ring,), _ = notifications(rule("unusual_day", "day", once_in=100), recorded, start, end, UTC)
     assert ring.time == start + (19 * 24 + 8) * HOUR * NANOSECONDS
     assert ring.text.startswith("Fri 20 Feb and the night after it, ")
     assert "bouts of coughing in the night 3" in ring.text

@@ -196,10 +196,10 @@ def test_of_a_log_cut_anywhere_every_chunk_is_saved(log, recover, seed):
     rng = random.Random(seed)
     for length in [rng.randrange(len(data)) for _ in range(15)]:
         result = recover(data[:length])
-        whole = [r for r in records if r.end <= length]
-        expected = messages_of(whole)
+        full = [r for r in records if r.end <= length]
+        expected = messages_of(full)
         if result is None:
-            assert not any(r.opcode in {CHUNK, METADATA, ATTACHMENT} for r in whole)
+            assert not any(r.opcode in {CHUNK, METADATA, ATTACHMENT} for r in full)
             continue
         assert result.messages == expected, length
         within_chunk = any(r.opcode == CHUNK and r.start < length < r.end for r in records)
@@ -524,8 +524,8 @@ def test_files_of_other_writers_are_recovered_in_the_same_way(recover, form):
     data, everything = written(**FORMS[form])
     records = structure(data)
     assert messages_of(records) == everything
-    whole = recover(data)
-    assert (whole.messages, whole.recovery.damages) == (everything, [])
+    full = recover(data)
+    assert (full.messages, full.recovery.damages) == (everything, [])
     rng = random.Random(form)
     for _ in range(20):
         place = rng.randrange(len(data))
@@ -579,10 +579,10 @@ def test_a_bag_of_rosbags(recover, tmp_path, mode):
             writer.write(connection, 1000 + number, bytes(data))
     (path,) = (tmp_path / "bag").glob("*.mcap")
     data = path.read_bytes()
-    whole = recover(data)
-    assert len(whole.messages) == 500
-    assert whole.recovery.damages == []
-    assert recover(data[:-300]).messages == whole.messages
+    full = recover(data)
+    assert len(full.messages) == 500
+    assert full.recovery.damages == []
+    assert recover(data[:-300]).messages == full.messages
     if mode == "none":
         assert recover(data[: len(data) // 2]) is None  # it was one chunk
 

@@ -47,9 +47,9 @@ SECOND = 1_000_000_000
 WATER = "scenario/water"
 
 
-def mark(start: float, end: float, label: str, **said: str) -> Mark:
+def mark(start: float, end: float, label: str, **output: str) -> Mark:
     span = START + round(start * SECOND), START + round(end * SECOND)
-    return Mark("mic", *span, label, **said)
+    return Mark("mic", *span, label, **output)
 
 
 @pytest.fixture(scope="module")
@@ -92,11 +92,11 @@ def test_marks_of_a_scenario_and_of_the_home_leave_each_other_alone(home):
 def test_a_review_marks_the_classes_of_a_scenario_in_a_lane_of_their_own(home):
     write_marks(home, [mark(0, 9, "speech")])
     timeline = read_timeline([home])
-    heard = timeline.microphones["mic"]
-    segments = {one.name: one.spans for one in heard.labellings}
-    classes = heard.classes_of("water")
+    recorded = timeline.microphones["mic"]
+    segments = {one.name: one.spans for one in recorded.labellings}
+    classes = recorded.classes_of("water")
     assert ("tap_water" in classes, "speech" in classes) == (True, False)
-    assert ("tap_water" in heard.classes, "speech" in heard.classes) == (False, True)
+    assert ("tap_water" in recorded.classes, "speech" in recorded.classes) == (False, True)
     marking = Marking("mic", timeline.coverage["mic"], "Ann", WATER, segments[WATER], "water")
     screen = Screen()
     session = ReviewSession(screen, marking, classes, UTC, print, print, print, print)
@@ -166,10 +166,10 @@ def test_label_files_are_of_the_scenario_that_is_named(home, tmp_path, capfd):
     assert run(capfd, "annotate", "export", home, "-o", exported).returncode == 1
     run(capfd, "annotate", "export", home, "-o", exported, "--scenario", "water")
     assert exported.read_text() == labels.read_text()
-    asked = "asks for scenario water: give --labels water"
+    requested = "asks for scenario water: give --labels water"
     spans = tmp_path / "spans.csv"
     run(capfd, "diff", home, "water", "--queue", "--list", spans)
-    with pytest.raises(DataError, match=asked):
+    with pytest.raises(DataError, match=requested):
         queue_spans(str(spans), find_labellings(home), ("mic", "live"), (None, None), None)
 
 
@@ -204,9 +204,9 @@ def test_a_catalogue_has_the_labels_of_scenarios_in_a_column_of_their_own(home, 
         1,
         [],
     )
-    said = json.loads(done.stdout)
-    assert {one["scenario"] for one in said["scenarios"]} == {"water"}
-    assert {one["scenario"] for one in said["labels"]} == {""}
+    output = json.loads(done.stdout)
+    assert {one["scenario"] for one in output["scenarios"]} == {"water"}
+    assert {one["scenario"] for one in output["labels"]} == {""}
 
 
 def test_who_is_marked_as_a_speaker_is_learned_like_who_is_enrolled(home, tmp_path):

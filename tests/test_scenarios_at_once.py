@@ -104,16 +104,16 @@ def sound(tmp_path_factory) -> Path:
     rng = np.random.default_rng(2)
     parts = [soundfile.read(clip, dtype="float32")[0][:32_000] for clip in clips]
     spaced = [np.concatenate([part, np.zeros(8_000, np.float32)]) for part in parts]
-    whole = np.concatenate(spaced) + rng.normal(0, 3e-4, sum(map(len, spaced))).astype(np.float32)
+    full = np.concatenate(spaced) + rng.normal(0, 3e-4, sum(map(len, spaced))).astype(np.float32)
     path = tmp_path_factory.mktemp("sound") / "home.wav"
-    soundfile.write(path, np.clip(whole, -1, 1), 16_000)
+    soundfile.write(path, np.clip(full, -1, 1), 16_000)
     return path
 
 
 def record(sound: Path, logs: Path, **settings: object) -> Path:
     """Record the sound to one log, and return it."""
-    asked = Settings(output=logs, max_bag_duration=86_400, **{"model": GENERAL, **settings})
-    (log,) = record_files(asked, FileSource([sound], START), Flag()).logs
+    requested = Settings(output=logs, max_bag_duration=86_400, **{"model": GENERAL, **settings})
+    (log,) = record_files(requested, FileSource([sound], START), Flag()).logs
     return log
 
 
@@ -130,11 +130,11 @@ def long_log(tmp_path_factory) -> Path:
     samples, rate = soundfile.read(min(clips.glob("*.flac")), dtype="float32")
     loudest = int(np.convolve(samples**2, np.ones(1600), "same").argmax())
     knock = samples[max(loudest - 4000, 0) : loudest + 4000]
-    whole = np.random.default_rng(3).normal(0, 3e-3, 600 * rate).astype(np.float32)
+    full = np.random.default_rng(3).normal(0, 3e-3, 600 * rate).astype(np.float32)
     for first in range(10 * rate, 590 * rate, 20 * rate):
-        whole[first : first + len(knock)] += 0.3 * knock / np.abs(knock).max()
+        full[first : first + len(knock)] += 0.3 * knock / np.abs(knock).max()
     folder = tmp_path_factory.mktemp("long")
-    soundfile.write(folder / "long.wav", np.clip(whole, -1, 1), rate)
+    soundfile.write(folder / "long.wav", np.clip(full, -1, 1), rate)
     return record(folder / "long.wav", folder / "logs", model=BATHROOM, scenarios={"home": GENERAL})
 
 
@@ -179,8 +179,8 @@ def test_a_log_says_which_scenarios_ran_and_is_sound(log, capfd):
     assert (about["model"], about["scenario/mic/water"]) == (GENERAL, BATHROOM)
     assert about["scenario/mic/water/sha256"] == model.sha256
     assert lines(log)[1] == f"scenario water: 5 labels by bathroom ({model.sha256[:12]})"
-    said = run(capfd, "info", log)
-    assert f"scenario water, mic: model bathroom ({model.sha256[:12]})\n" in said.stdout
+    printed = run(capfd, "info", log)
+    assert f"scenario water, mic: model bathroom ({model.sha256[:12]})\n" in printed.stdout
     facts = json.loads(run(capfd, "info", log, "--json").stdout)
     assert facts["scenarios"] == [
         {"microphone": "mic", "name": "water", "model": BATHROOM, "sha256": model.sha256}
@@ -373,17 +373,21 @@ def test_a_class_of_two_scenarios_is_refused_and_both_are_named(tmp_path, sound)
 def test_a_recorder_of_microphones_goes_on_without_a_scenario_that_cannot_label(sound, tmp_path):
     spoken = keep(tmp_path / "spoken.safetensors", {"tap_water": "speech"})
     scenarios = {"gone": tmp_path / "gone.safetensors", "old": GOLDEN, "spoken": spoken}
-    asked = Settings(
+    requested = Settings(
         output=tmp_path / "logs", model=GENERAL, scenarios={**scenarios, "water": BATHROOM}
     )
-    with FolderLock(asked.output, asked.node) as lock:
-        summary = recording._record(asked, {"mic": FileSource([sound], START)}, Flag(), None, lock)
+    with FolderLock(requested.output, requested.node) as lock:
+        summary = recording._record(
+            requested, {"mic": FileSource([sound], START)}, Flag(), None, lock
+        )
     assert summary.models_refused == 3
-    (log,) = find_logs(asked.output)
+    (log,) = find_logs(requested.output)
     assert set(OF_WATER) <= set(channels_of(log))
-    told = [line for line in lines(log) if "left out until the next start" in line]
-    assert len(told) == 3
-    assert all(any(line.startswith(f"scenario {name}: ") for line in told) for name in scenarios)
+    reported = [line for line in lines(log) if "left out until the next start" in line]
+    assert len(reported) == 3
+    assert all(
+        any(line.startswith(f"scenario {name}: ") for line in reported) for name in scenarios
+    )
 
 
 def test_what_goes_on_since_another_was_refused_keeps_its_classes(tmp_path):
@@ -464,8 +468,8 @@ def test_each_microphone_may_have_its_own_scenarios(sound, tmp_path):
     sources = {name: FileSource([sound], START) for name in ("hall", "bath")}
     with closing(ModelWatch(Path(BATHROOM), SimpleQueue(), "water")) as watch:
         models = {"bath": LabellingModels(scenarios={"water": watch}), "hall": LabellingModels()}
-        asked = settings.model_copy(update={"output": tmp_path, "feature_set": "home33"})
-        session = RecordingSession(asked, sources, models)
+        requested = settings.model_copy(update={"output": tmp_path, "feature_set": "home33"})
+        session = RecordingSession(requested, sources, models)
         for number, events in enumerate(
             zip(*(s.events(Flag()) for s in sources.values()), strict=True)
         ):
@@ -539,10 +543,10 @@ def test_what_a_bridge_tells_of_a_scenario_is_apart_from_its_microphone(log):
     assert water.classes == ["silence", "flushing_water", "tap_water"]
     assert set(water.labels()) <= {"flushing_water", "tap_water"}
     assert state.microphones["mic"].labels() == without.microphones["mic"].labels()
-    told = discovery(Topics("hearthlog", "home"), "mic-water", water.classes)["components"]
-    assert "level" not in told
-    assert told["heard"]["state_topic"] == "hearthlog/home/mic-water/heard"
-    assert any("tap_water" in key for key in told)
+    reported = discovery(Topics("hearthlog", "home"), "mic-water", water.classes)["components"]
+    assert "level" not in reported
+    assert reported["heard"]["state_topic"] == "hearthlog/home/mic-water/heard"
+    assert any("tap_water" in key for key in reported)
 
 
 def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_path):
@@ -614,8 +618,8 @@ def test_alerts_hear_what_a_scenario_labels_from_the_log_and_as_it_is_written(lo
 
 def test_the_doctor_misses_the_labels_of_a_scenario_that_ran(log, tmp_path, capfd):
     cut = tmp_path / "home_20260301T070000Z.mcap"
-    whole = log.read_bytes()
-    cut.write_bytes(whole.replace(b"scenario/mic/water", b"scenario/mic/waver"))
+    full = log.read_bytes()
+    cut.write_bytes(full.replace(b"scenario/mic/water", b"scenario/mic/waver"))
     done = run(capfd, "doctor", cut)
     assert "/mic/scenario/waver/label is missing" in done.stdout
     assert "/mic/scenario/water/label should not be there" in done.stdout

@@ -126,7 +126,7 @@ def test_a_scene_without_time_for_a_sound_is_refused():
 
 
 @pytest.fixture(scope="module")
-def heard(model_file, training_set):
+def captured(model_file, training_set):
     """A model, and the clips that it knows."""
     model = load_model(model_file)
     scenario = scenario_of(model)
@@ -134,8 +134,8 @@ def heard(model_file, training_set):
     return model_file, model, read_manifest(training_set, labels), scenario
 
 
-def test_a_model_is_good_on_clips_that_it_knows(heard):
-    found = evaluate_scenes(*heard, OPTIONS, ignore_progress)
+def test_a_model_is_good_on_clips_that_it_knows(captured):
+    found = evaluate_scenes(*captured, OPTIONS, ignore_progress)
     assert found.scores.macro_f1 > 0.8
     assert [one.seed for one in found.scenes] == [10, 11]
     assert found.coughs.found > 0.8
@@ -148,8 +148,8 @@ def test_a_model_is_good_on_clips_that_it_knows(heard):
     assert every == pytest.approx(np.mean([o.false_alarms_per_hour for o in found.scenes]), rel=0.1)
 
 
-def test_labels_beside_their_sounds_lose(heard, tmp_path):
-    model_file, model, clips, scenario = heard
+def test_labels_beside_their_sounds_lose(captured, tmp_path):
+    model_file, model, clips, scenario = captured
     early = replace(model, description=model.description.model_copy(update={"label_frame": 0}))
     save_model(early, tmp_path / "early.safetensors")
     right, wrong = (
@@ -160,7 +160,7 @@ def test_labels_beside_their_sounds_lose(heard, tmp_path):
     assert wrong.detections.event_based.macro_f1 < right.detections.event_based.macro_f1 - 0.1
 
 
-def labelled(monkeypatch, heard, change):
+def labelled(monkeypatch, captured, change):
     """Score labels that are made of the truth."""
 
     def record(self, scene):
@@ -168,11 +168,11 @@ def labelled(monkeypatch, heard, change):
         return scene.truth, change(_labelling(scene.truth))
 
     monkeypatch.setattr(_Recorder, "record", record)
-    return evaluate_scenes(*heard, OPTIONS, ignore_progress)
+    return evaluate_scenes(*captured, OPTIONS, ignore_progress)
 
 
-def test_labels_that_are_the_truth_are_perfect(monkeypatch, heard):
-    found = labelled(monkeypatch, heard, lambda truth: truth)
+def test_labels_that_are_the_truth_are_perfect(monkeypatch, captured):
+    found = labelled(monkeypatch, captured, lambda truth: truth)
     assert found.scores.macro_f1 == found.detections.event_based.f1 == 1.0
     assert {one.macro_f1 for one in found.scenes} == {1.0}
     assert {one.false_alarms_per_hour for one in found.scenes} == {0.0}
@@ -181,7 +181,7 @@ def test_labels_that_are_the_truth_are_perfect(monkeypatch, heard):
     assert list(found.truth.labels) == list(found.found.labels)
 
 
-def test_what_is_recorded_is_what_was_composed(monkeypatch, heard, training_set):
+def test_what_is_recorded_is_what_was_composed(monkeypatch, captured, training_set):
     recorded = []
 
     def record(self, scene):
@@ -191,10 +191,10 @@ def test_what_is_recorded_is_what_was_composed(monkeypatch, heard, training_set)
 
     monkeypatch.setattr(_Recorder, "record", record)
     options = replace(OPTIONS, colour="pink", floor=-50.0, gain=-3.0)
-    evaluate_scenes(*heard, options, ignore_progress)
+    evaluate_scenes(*captured, options, ignore_progress)
     clips = {}
-    for clip in heard[2]:
-        if clip.label in heard[1].classes[1:]:
+    for clip in captured[2]:
+        if clip.label in captured[1].classes[1:]:
             clips.setdefault(clip.label, []).append(clip.path)
     assert training_set.parent in clips["music"][0].parents
 
@@ -210,20 +210,20 @@ def test_what_is_recorded_is_what_was_composed(monkeypatch, heard, training_set)
         assert np.array_equal(single.samples, coughs.samples)
 
 
-def test_a_cough_of_two_labels_is_found_once(monkeypatch, heard):
+def test_a_cough_of_two_labels_is_found_once(monkeypatch, captured):
     def halved(truth):
         middle = (truth.starts + truth.ends) // 2
         starts = np.stack([truth.starts, middle], axis=1).ravel()
         ends = np.stack([middle, truth.ends], axis=1).ravel()
         return replace(truth, starts=starts, ends=ends, labels=np.repeat(truth.labels, 2))
 
-    found = labelled(monkeypatch, heard, halved)
+    found = labelled(monkeypatch, captured, halved)
     assert found.coughs.found == 1.0
     assert found.coughs.median_seconds == pytest.approx(0.15)
 
 
-def test_late_labels_and_wrong_ones_are_not(monkeypatch, heard):
-    late = labelled(monkeypatch, heard, lambda truth: _moved(truth, 10**9))
+def test_late_labels_and_wrong_ones_are_not(monkeypatch, captured):
+    late = labelled(monkeypatch, captured, lambda truth: _moved(truth, 10**9))
     assert late.scores.macro_f1 < 0.85
     assert late.detections.event_based.macro_f1 < 0.2
     assert late.coughs.found == 0.0
@@ -233,7 +233,7 @@ def test_late_labels_and_wrong_ones_are_not(monkeypatch, heard):
         names = ["music" if name == "coughing" else name for name in truth.labels]
         return replace(truth, labels=np.array(names, object))
 
-    found = labelled(monkeypatch, heard, wrong)
+    found = labelled(monkeypatch, captured, wrong)
     assert found.scores.per_class["coughing"].f1 == 0.0
     assert found.detections.false_alarms_per_day["music"] > 0.0
     assert (found.coughs.found, found.coughs.others) == (0.0, 1.0)
@@ -273,9 +273,9 @@ def test_the_same_seed_gives_the_same_scores_and_another_one_others(
     assert "single coughs of 0.3 s" in table.stdout
 
 
-def test_what_the_model_has_learned_from_is_counted(heard, training_set, new_clips, capfd):
-    model_file, model, _, scenario = heard
-    known = evaluate_scenes(*heard, replace(OPTIONS, scenes=1), ignore_progress)
+def test_what_the_model_has_learned_from_is_counted(captured, training_set, new_clips, capfd):
+    model_file, model, _, scenario = captured
+    known = evaluate_scenes(*captured, replace(OPTIONS, scenes=1), ignore_progress)
     assert known.sources_learned == known.sources == known.clips == 8 * 5
     others = read_manifest(new_clips, scenario.labels)
     new = evaluate_scenes(model_file, model, others, scenario, OPTIONS, ignore_progress)
@@ -343,10 +343,10 @@ def test_bad_input_is_one_line_that_says_what_to_do(model_file, training_set, tm
         ((training_set, "--plot", tmp_path / "there.png"), 1, "exists already"),
         ((training_set, "--plot", "p.pdf"), 2, "*.png"),
     )
-    for (data, *options), status, said in cases:
+    for (data, *options), status, output in cases:
         result = run(capfd, *words_of(model_file, data, *options))
         assert result.returncode == status, options
-        assert said in result.stderr
+        assert output in result.stderr
         lines = [line for line in result.stderr.splitlines() if "recording 1 scene" not in line]
         assert len(lines) == 1
         assert result.stdout == ""

@@ -230,9 +230,9 @@ def test_a_service_may_use_the_network_if_a_microphone_is_there(service):
 
 
 def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service):
-    told = 'readable_by = "group"\n[bridge.prometheus]\nport = 9177\n'
-    told += 'token_file = "/etc/prometheus-token"\n'
-    service.write("/etc/home.toml", told)
+    reported = 'readable_by = "group"\n[bridge.prometheus]\nport = 9177\n'
+    reported += 'token_file = "/etc/prometheus-token"\n'
+    service.write("/etc/home.toml", reported)
     service.write("/etc/prometheus-token", "a-token-of-the-figures\n")
     install(service, "--config", "/etc/home.toml")
     wait_for_labels(service)
@@ -241,7 +241,7 @@ def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service
     service.write("/etc/systemd/system/hearthlog-bridge.service.d/python.conf", library)
     result = install(service, "--bridge", "--config", "/etc/home.toml")
     assert result.stdout == "/etc/systemd/system/hearthlog-bridge.service\n"
-    asked = (
+    requested = (
         "from urllib.request import Request, urlopen; shown = {'Authorization': "
         "'Bearer a-token-of-the-figures'}; print(urlopen(Request("
         "'http://127.0.0.1:9177/metrics', headers=shown)).read())"
@@ -250,7 +250,7 @@ def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service
     service.wait(
         lambda: (
             'listening{microphone="mic",node="home"} 1.0'
-            in service.run(python, "-c", asked, check=False).stdout
+            in service.run(python, "-c", requested, check=False).stdout
         )
     )
     process = service.shows("MainPID", unit="hearthlog-bridge")
@@ -263,7 +263,7 @@ def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("reported", "output"),
     [
         ("[bridge.ping]\nurl = 'http://x'\n", "who may not read the logs; say there readable_by"),
         ("", "has no output; add a table such as [bridge.mqtt]"),
@@ -274,11 +274,11 @@ def test_the_bridge_runs_as_a_user_of_its_own_who_may_only_read_the_logs(service
         ),
     ],
 )
-def test_a_bridge_that_would_not_run_is_refused_with_one_line(service, told, said):
-    service.write("/etc/home.toml", told)
+def test_a_bridge_that_would_not_run_is_refused_with_one_line(service, reported, output):
+    service.write("/etc/home.toml", reported)
     result = install(service, "--bridge", "--config", "/etc/home.toml", check=False)
     assert result.returncode
-    assert said in result.stderr
+    assert output in result.stderr
     assert result.stderr.count("\n") == 1
 
 
@@ -297,8 +297,8 @@ def test_a_service_takes_over_another_configuration_and_refuses_a_wrong_one(serv
     process = service.shows("MainPID")
     service.write("/etc/home.toml", "node = 'one\n")
     service.run("systemctl", "reload", "hearthlog")
-    said = ("journalctl", "-u", "hearthlog", "-o", "cat")
-    service.wait(lambda: "keeps its present configuration" in service.run(*said).stdout)
+    output = ("journalctl", "-u", "hearthlog", "-o", "cat")
+    service.wait(lambda: "keeps its present configuration" in service.run(*output).stdout)
     service.write("/etc/home.toml", "node = 'two'\n")
     service.run("systemctl", "reload", "hearthlog")
     service.wait(lambda: list(logs_of(service).rglob("two_*.active")))
@@ -323,7 +323,7 @@ def test_a_service_of_a_user_records_in_the_folder_it_was_installed_in(service):
 
 
 @pytest.mark.parametrize(
-    ("before", "options", "said"),
+    ("before", "options", "output"),
     [
         ("true", "--account nobody-here", "there is no user 'nobody-here'; make one: useradd"),
         ("echo 'outputs = 1' > /etc/home.toml", "--config /etc/home.toml", "unknown key 'outputs'"),
@@ -352,13 +352,13 @@ def test_a_service_of_a_user_records_in_the_folder_it_was_installed_in(service):
         ("ln -s /dev/null " + UNIT, "", f"{UNIT}: was not written by hearthlog; move it away"),
     ],
 )
-def test_what_would_not_run_is_refused_with_one_line(service, before, options, said):
+def test_what_would_not_run_is_refused_with_one_line(service, before, options, output):
     service.run("rm", "-f", "/etc/home.toml")
     service.run("sh", "-c", before)
     result = install(service, *options.split(), check=False)
     assert result.returncode in {1, 2}
     assert result.stdout == ""
-    assert said in result.stderr
+    assert output in result.stderr
     assert result.stderr.count("\n") == 1
     assert service.shows("ActiveState") == "inactive"
 

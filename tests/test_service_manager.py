@@ -31,7 +31,7 @@ class Systemd:
         self._socket.bind(name.replace("@", "\0"))
         self.env = {"NOTIFY_SOCKET": name, "WATCHDOG_USEC": str(int(WATCHDOG * 1e6))}
 
-    def told(self, seconds):
+    def lines_within(self, seconds):
         """Return the lines that come within so many seconds."""
         end = time.monotonic() + seconds
         lines = []
@@ -46,7 +46,7 @@ class Systemd:
         end = time.monotonic() + seconds
         lines = []
         while time.monotonic() < end:
-            lines += self.told(0.2)
+            lines += self.lines_within(0.2)
             if any(all(text in line for text in texts) for line in lines):
                 return lines
         pytest.fail(f"{texts} was not told, but {lines}")
@@ -87,8 +87,8 @@ def test_systemd_is_told_of_the_start_the_state_the_life_and_the_end(labmic, any
         lines = systemd.wait_for("STATUS=mic: listening")
         assert lines.count("READY=1") == 1
         assert list((tmp_path / "logs").rglob("*.active"))
-        assert "WATCHDOG=1" in systemd.told(WATCHDOG)
-    lines = systemd.told(0.5)
+        assert "WATCHDOG=1" in systemd.lines_within(WATCHDOG)
+    lines = systemd.lines_within(0.5)
     assert "STOPPING=1" in lines
     assert "READY=1" not in lines
 
@@ -117,7 +117,7 @@ def test_a_microphone_that_was_never_there_does_not_keep_the_service_from_starti
 
 
 def test_each_of_several_microphones_is_in_the_status(labmic, systemd, tmp_path):
-    labmic.beside("second")
+    labmic.add_device("second")
     about = tmp_path / "home.toml"
     tables = ("kitchen", labmic.device), ("hall", "none")
     about.write_text(
@@ -139,15 +139,15 @@ def test_a_recorder_whose_disk_is_full_is_alive(labmic, systemd, small_disk):
         (small_disk / "filler").write_bytes(b"\0" * 5_000_000)
     with recording(watched(labmic, systemd), small_disk / "logs"):
         assert "READY=1" in systemd.wait_for("STATUS=mic: listening")
-        assert "WATCHDOG=1" in systemd.told(WATCHDOG)
+        assert "WATCHDOG=1" in systemd.lines_within(WATCHDOG)
 
 
 def test_a_recorder_that_hangs_says_nothing(labmic, systemd, tmp_path):
     with recording(watched(labmic, systemd), tmp_path / "logs") as process:
         systemd.wait_for("STATUS=mic: listening")
         process.send_signal(signal.SIGSTOP)
-        systemd.told(0.5)
-        assert systemd.told(WATCHDOG) == []
+        systemd.lines_within(0.5)
+        assert systemd.lines_within(WATCHDOG) == []
         process.send_signal(signal.SIGCONT)
         systemd.wait_for("WATCHDOG=1")
 
@@ -157,48 +157,48 @@ def frames():
 
 
 @pytest.fixture
-def told(systemd, monkeypatch):
+def reported(systemd, monkeypatch):
     """Return what systemd is told of these events, in this process."""
     for name, value in (systemd.env | {"WATCHDOG_USEC": "1000"}).items():
         monkeypatch.setenv(name, value)
 
-    def tell(*events, microphones=("kitchen", "hall")):
+    def send(*events, microphones=("kitchen", "hall")):
         manager = ServiceManager(microphones)
         for microphone, event in events:
             manager.add(microphone, event)
             time.sleep(0.001)
-        return systemd.told(0.2)
+        return systemd.lines_within(0.2)
 
-    return tell
+    return send
 
 
-def test_a_recorder_of_which_one_microphone_hangs_does_not_count_as_alive(told):
+def test_a_recorder_of_which_one_microphone_hangs_does_not_count_as_alive(reported):
     kitchen, hall = ("kitchen", frames()), ("hall", SourceHealth(0, ERROR, "not there"))
-    assert told(kitchen, kitchen, kitchen).count("WATCHDOG=1") == 0
-    assert told(kitchen, hall, kitchen, kitchen, kitchen).count("WATCHDOG=1") == 1
-    assert told(kitchen, hall, kitchen, hall).count("WATCHDOG=1") == 2
+    assert reported(kitchen, kitchen, kitchen).count("WATCHDOG=1") == 0
+    assert reported(kitchen, hall, kitchen, kitchen, kitchen).count("WATCHDOG=1") == 1
+    assert reported(kitchen, hall, kitchen, hall).count("WATCHDOG=1") == 2
 
 
-def test_what_a_microphone_says_of_itself_stays_one_line(told):
+def test_what_a_microphone_says_of_itself_stays_one_line(reported):
     broken = SourceHealth(0, ERROR, "it broke\nWATCHDOG=1\n\nand how")
-    lines = told(("kitchen", broken))
+    lines = reported(("kitchen", broken))
     assert lines == ["READY=1", "STATUS=kitchen: it broke WATCHDOG=1 and how; hall: starting"]
 
 
-def test_another_process_is_not_watched(told, monkeypatch):
+def test_another_process_is_not_watched(reported, monkeypatch):
     monkeypatch.setenv("WATCHDOG_PID", "1")
     healthy = SourceHealth(0, OK, "listening")
-    assert "WATCHDOG=1" not in told(("mic", healthy), ("mic", frames()), microphones=["mic"])
+    assert "WATCHDOG=1" not in reported(("mic", healthy), ("mic", frames()), microphones=["mic"])
 
 
-def test_a_watchdog_that_is_no_number_is_none(told, monkeypatch):
+def test_a_watchdog_that_is_no_number_is_none(reported, monkeypatch):
     monkeypatch.setenv("WATCHDOG_USEC", "soon")
-    assert "WATCHDOG=1" not in told(("mic", frames()), microphones=["mic"])
+    assert "WATCHDOG=1" not in reported(("mic", frames()), microphones=["mic"])
 
 
-def test_systemd_that_has_gone_does_not_stop_the_recorder(told, monkeypatch):
+def test_systemd_that_has_gone_does_not_stop_the_recorder(reported, monkeypatch):
     monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere/notify")
-    assert told(("mic", frames()), microphones=["mic"]) == []
+    assert reported(("mic", frames()), microphones=["mic"]) == []
 
 
 def test_a_recorder_that_starts_again_by_itself_does_not_say_that_it_ends(

@@ -269,7 +269,7 @@ def test_an_existing_configuration_keeps_its_comments_and_other_keys(home):
 
 
 @pytest.mark.parametrize(
-    ("options", "status", "said"),
+    ("options", "status", "output"),
     [
         (("--node", "an na"), 2, "--node: node name 'an na' cannot be part of a file name"),
         (("--timezone", "Mars"), 2, "--timezone: "),
@@ -284,10 +284,10 @@ def test_an_existing_configuration_keeps_its_comments_and_other_keys(home):
         (("--page-port", "80"), 2, "--page-port needs --page"),
     ],
 )
-def test_a_wrong_answer_is_refused_with_one_line(home, options, status, said):
+def test_a_wrong_answer_is_refused_with_one_line(home, options, status, output):
     folder, env = home
     (folder / "wrong").write_text("nonsense\n")
-    assert said in refused(folder, env, *DEFAULTS, *options, status=status)
+    assert output in refused(folder, env, *DEFAULTS, *options, status=status)
 
 
 def test_an_occupied_port_is_refused_with_one_line(home):
@@ -305,7 +305,7 @@ def test_a_machine_without_microphones_is_refused_with_one_line(home):
 
 
 def test_a_microphone_that_another_program_uses_is_refused_with_one_line(labmic, tmp_path):
-    labmic.beside("other")
+    labmic.add_device("other")
     labmic.occupy()
     answers = (*DEFAULTS, "--microphone", "labmic=kitchen")
     result = run(tmp_path, labmic.env, *answers)

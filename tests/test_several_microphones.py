@@ -98,8 +98,8 @@ def test_training_asks_for_a_base_and_then_learns_of_both_microphones(home, capf
     log = log_in(home)
     marks = [Mark(name, *loudest(home, name)) for name in MODELS]
     write_marks(log, marks, reviewed=[ReviewedSpan(*mark[:3]) for mark in marks])
-    asked = run(capfd, "train", "--home", home)
-    assert (asked.returncode, asked.stderr) == (
+    requested = run(capfd, "train", "--home", home)
+    assert (requested.returncode, requested.stderr) == (
         2,
         "hearthlog: the latest logs were labelled by two and one: choose one with --base\n",
     )
@@ -118,8 +118,8 @@ def test_models_are_judged_by_what_each_microphone_heard_at_the_same_time(
     sources = {name: FileSource([file], START) for name, file in files.items()}
     models = dict.fromkeys(files, model_file)
     home = record_together(tmp_path / "logs", sources, models, max_bag_duration=3600)
-    heard = loudest(home, "bath")
-    spans = [ReviewedSpan(name, *heard[:2], chosen=RANDOM) for name in files]
+    recorded = loudest(home, "bath")
+    spans = [ReviewedSpan(name, *recorded[:2], chosen=RANDOM) for name in files]
     write_marks(log_in(home), [], reviewed=spans)
     model = load_model(model_file)
     found = gather_evidence(model, model, recent_logs([home]))

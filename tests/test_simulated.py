@@ -52,9 +52,9 @@ def test_its_card_and_the_list_of_models_say_so_too(hearthlog, simulated, model_
     entries = json.loads(hearthlog("models", "list", "--folder", folder, "--json").stdout)
     found = {one["name"]: one["simulated"] for one in entries if not one["starter"]}
     assert found == {"made_up": True, "real": False}
-    for name, says in (("made_up", True), ("real", False)):
+    for name, states in (("made_up", True), ("real", False)):
         card = hearthlog("models", "show", name, "--folder", folder).stdout
-        assert ("Trained on simulated sounds only" in card) is says
+        assert ("Trained on simulated sounds only" in card) is states
 
 
 def test_a_model_that_takes_the_place_of_another_is_looked_at_as_well(
@@ -63,10 +63,10 @@ def test_a_model_that_takes_the_place_of_another_is_looked_at_as_well(
     link = tmp_path / "champion.safetensors"
     link.symlink_to(model_file)
     insist(tmp_path, load_model(simulated).sha256)
-    watch = ModelWatch(link, asked := SimpleQueue())
+    watch = ModelWatch(link, requested := SimpleQueue())
     link.unlink()
     link.symlink_to(simulated)
-    asked.put(None)
+    requested.put(None)
     while watch.ready is None:  # else pytest ends it
         assert not list(watch.refusals())
         sleep(0.02)

@@ -105,10 +105,10 @@ def test_so_does_a_lag_that_covers_the_decisions_in_real_sound(real_frames, mode
 def test_blocks_of_any_size_give_the_same_states(lag):
     probabilities = made_up(6)
     smoother = FixedLagSmoother(default_transitions(CLASSES), lag)
-    whole = decided(smoother, probabilities, len(probabilities))
-    assert len(whole) == len(probabilities)
+    full = decided(smoother, probabilities, len(probabilities))
+    assert len(full) == len(probabilities)
     for size in (1, 13, 1024):
-        assert decided(smoother, probabilities, size).tolist() == whole.tolist()
+        assert decided(smoother, probabilities, size).tolist() == full.tolist()
 
 
 def test_a_state_is_decided_after_the_lag_and_what_comes_later_does_not_change_it():
@@ -161,9 +161,9 @@ def test_once_converged_no_other_past_gives_other_states(seed):
     states = started_late.close()[converged - 1 :]
     for _ in range(5):
         past = rng.dirichlet(np.full(5, 0.1), rng.integers(1, 50)).astype(np.float32)
-        heard = np.concatenate([past, probabilities])
-        whole = decided(FixedLagSmoother(transitions, 1000), heard, 100)
-        assert whole[len(past) + converged - 1 :].tolist() == states.tolist()
+        labelled = np.concatenate([past, probabilities])
+        full = decided(FixedLagSmoother(transitions, 1000), labelled, 100)
+        assert full[len(past) + converged - 1 :].tolist() == states.tolist()
 
 
 def test_sounds_go_on_for_as_long_as_expected_and_end_in_silence():
@@ -218,12 +218,12 @@ SMOOTHINGS = [
 @pytest.mark.parametrize("size", [1, 7, 300])
 def test_blocks_of_any_size_give_the_same_segments(smoothing, size):
     transitions, frames = default_transitions(CLASSES), made_up_frames(3, 1500)
-    whole = Segmenter(CLASSES, smoothing, transitions).push(frames)
+    full = Segmenter(CLASSES, smoothing, transitions).push(frames)
     segmenter, segments = Segmenter(CLASSES, smoothing, transitions), []
     for start in range(0, 1500, size):
         segments += segmenter.push(frames.part(slice(start, start + size)))
-    assert segments == whole
-    assert len(whole) > 20
+    assert segments == full
+    assert len(full) > 20
 
 
 def parts(smoothing, ready):
@@ -231,7 +231,7 @@ def parts(smoothing, ready):
     transitions = default_transitions(CLASSES)
     for seed in range(8):
         frames = made_up_frames(seed, 1800)
-        whole = Segmenter(CLASSES, smoothing, transitions).push(frames)
+        full = Segmenter(CLASSES, smoothing, transitions).push(frames)
         for begin in range(100, 900, 100):
             part = Segmenter(CLASSES, smoothing, transitions)
             frame = begin
@@ -242,7 +242,7 @@ def parts(smoothing, ready):
                 continue
             converged = part.segments_converged
             later = part.push(frames.part(slice(frame, None)))
-            expected = [s for s in whole if s.decided_at >= frames.stamps[frame]]
+            expected = [s for s in full if s.decided_at >= frames.stamps[frame]]
             yield frame - begin, converged, later, expected
 
 
@@ -412,9 +412,9 @@ def test_silence_apart_from_the_classes_gives_the_same_states_in_blocks_of_any_s
     probabilities[100:140] = [1, 0, 0, 0, 0]
     probabilities[300:340] = [0, 1, 0, 0, 0]
     smoother = FixedLagSmoother(default_transitions(CLASSES), LAG, 0.5, ClassesApart(0, 0.2))
-    whole = decided(smoother, probabilities, len(probabilities))
+    full = decided(smoother, probabilities, len(probabilities))
     for size in (1, 13, 1024):
-        assert decided(smoother, probabilities, size).tolist() == whole.tolist()
+        assert decided(smoother, probabilities, size).tolist() == full.tolist()
     likely = log_likelihoods(probabilities, 0.5, ClassesApart(0, 0.2))
     assert np.isfinite(likely).all()
     best = np.delete(likely, 0, axis=1).max(axis=1)

@@ -47,8 +47,8 @@ def enrolled(clips, tmp_path_factory):
         for number, clip in enumerate(clips[voice][:2]):
             path = folder / f"{name}{number}.wav"
             samples, turns = converse({voice: [clip]}, 16.0, number)
-            said = [samples[int(t.start * RATE) : int(t.end * RATE)] for t in turns]
-            soundfile.write(path, np.concatenate(said), RATE)
+            output = [samples[int(t.start * RATE) : int(t.end * RATE)] for t in turns]
+            soundfile.write(path, np.concatenate(output), RATE)
             enrol_file(folder / "voices", name, path)
     return folder / "voices"
 
@@ -73,23 +73,25 @@ def labels_of(model, samples, folder):
 
 
 def test_a_recorder_tells_who_of_those_that_are_enrolled_speaks(model, clips, tmp_path):
-    path, told = model
+    path, reported = model
     assert load_model(path).classes == ("silence", "allison", "theo", "unknown")
     assert load_model(path).description.scenario_name == "speakers"
-    assert "sources never split" in told
+    assert "sources never split" in reported
     for name, voice in (("theo", THEO), ("allison", ALLISON)):
         samples, turns = converse({voice: clips[voice][2:]}, 30.0, 1)
-        heard = labels_of(path, samples, tmp_path / name)
+        recorded = labels_of(path, samples, tmp_path / name)
         spoken = sum(turn.end - turn.start for turn in turns)
-        assert heard.get(name, 0.0) > 0.7 * spoken, heard
-        assert heard[name] > 0.8 * (sum(heard.values()) - heard.get("silence", 0.0)), heard
+        assert recorded.get(name, 0.0) > 0.7 * spoken, recorded
+        assert recorded[name] > 0.8 * (sum(recorded.values()) - recorded.get("silence", 0.0)), (
+            recorded
+        )
 
 
 def test_other_sounds_are_nobody(model, household, tmp_path):
     samples = [soundfile.read(path)[0] for path in sorted(household.glob("coughing/*"))[:8]]
-    heard = labels_of(model[0], np.concatenate(samples), tmp_path)
-    nobody = heard.get("unknown", 0.0) + heard.get("silence", 0.0)
-    assert nobody > 0.7 * sum(heard.values())
+    recorded = labels_of(model[0], np.concatenate(samples), tmp_path)
+    nobody = recorded.get("unknown", 0.0) + recorded.get("silence", 0.0)
+    assert nobody > 0.7 * sum(recorded.values())
 
 
 def test_the_same_enrolled_sound_gives_the_same_model(model, enrolled, tmp_path):
@@ -112,9 +114,9 @@ def test_somebody_enrolled_with_two_voices_is_refused(enrolled, clips, tmp_path)
     path = tmp_path / "other.wav"
     soundfile.write(path, np.concatenate(clips[ALLISON][2:]), RATE)
     enrol_file(both, "theo", path)
-    said = refusal(both, tmp_path)
-    assert "theo: two voices are heard in what is enrolled (2" in said
-    assert "enrol the other voice under a name of its own" in said
+    output = refusal(both, tmp_path)
+    assert "theo: two voices are heard in what is enrolled (2" in output
+    assert "enrol the other voice under a name of its own" in output
 
 
 def test_two_voices_are_two_and_one_is_one(clips):
@@ -138,8 +140,8 @@ def test_somebody_enrolled_once_is_asked_again(enrolled, tmp_path):
     latest = sorted(once.rglob("theo_*"))[-2:]
     for path in latest:
         path.unlink()
-    said = refusal(once, tmp_path)
-    assert "theo is enrolled once: enrol theo at another time, too" in said
+    output = refusal(once, tmp_path)
+    assert "theo is enrolled once: enrol theo at another time, too" in output
 
 
 def recording(label, group="a", seconds=12.0):

@@ -466,8 +466,8 @@ def test_a_log_is_named_mcap(recorded, refused, tmp_path):
 
 @pytest.mark.parametrize("verb", ["merge", "cut"])
 def test_what_stands_outside_of_a_damaged_chunk_is_copied(recorded, hearthlog, tmp_path, verb):
-    whole = find_logs(recorded)[0]
-    data = bytearray(whole.read_bytes())
+    full = find_logs(recorded)[0]
+    data = bytearray(full.read_bytes())
     data[len(data) // 2] ^= 0xFF
     damaged, saved, copy = (tmp_path / f"{name}.mcap" for name in ("damaged", "saved", "copy"))
     damaged.write_bytes(data)
@@ -476,7 +476,7 @@ def test_what_stands_outside_of_a_damaged_chunk_is_copied(recorded, hearthlog, t
     assert done.stderr.startswith(f"hearthlog: {damaged}: damaged at byte ")
     hearthlog("recover", damaged, "-o", saved)
     kept = raw_messages(copy)
-    assert len(raw_messages(whole)) > len(kept) > 0
+    assert len(raw_messages(full)) > len(kept) > 0
     assert [m for m in raw_messages(saved) if not m[0].endswith("/gap")] == [
         m for m in kept if not m[0].endswith("/gap")
     ]

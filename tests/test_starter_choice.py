@@ -197,9 +197,9 @@ def test_the_doctor_names_the_network_that_a_model_wants(yamnet):
     yamnet.unlink()
     recorded(model=Path("general-embedding"), hour=1)
     recorded(hour=2)
-    heard, unheard, plain = sorted(find_logs(Path("logs")))
+    labelled, unheard, plain = sorted(find_logs(Path("logs")))
     what = "general-embedding takes what the network yamnet hears"
-    assert list(_networks([plain, heard])) == [("ok", "mic", f"{what}, which is there")]
+    assert list(_networks([plain, labelled])) == [("ok", "mic", f"{what}, which is there")]
     ((level, _, text),) = _networks([unheard])
     assert level == "warning"
     assert text.startswith(f"{what}, and it is not there: labels by features alone; hearthlog m")

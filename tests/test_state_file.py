@@ -72,11 +72,11 @@ def test_files_of_earlier_versions_are_taken_over_once(tmp_path):
 
 
 def test_a_file_of_an_earlier_version_that_cannot_be_read_is_named_and_takes_no_other(tmp_path):
-    said = []
+    output = []
     (tmp_path / "totals.json").write_bytes(b"\xff\xfe")
     (tmp_path / "mqtt-home.json").write_text("{}")
-    assert state_in(tmp_path, say=said.append).names("") == ["mqtt"]
-    (line,) = said
+    assert state_in(tmp_path, say=output.append).names("") == ["mqtt"]
+    (line,) = output
     assert line.startswith(f"{tmp_path}/totals.json: cannot be read (")
     assert (tmp_path / "totals.json").exists()
 
@@ -94,11 +94,11 @@ def test_a_damaged_file_is_set_aside_and_the_bridge_starts_over(tmp_path, damage
         "cut": content[: len(content) // 2],
     }
     path.write_bytes(changed[damage])
-    said = []
-    with closing(state_in(tmp_path, say=said.append)) as state:
+    output = []
+    with closing(state_in(tmp_path, say=output.append)) as state:
         assert state.names("") == []
         state.write("list", "[1]")
-    (line,) = said
+    (line,) = output
     assert line.startswith(f"{path}: is damaged (")
     (aside,) = tmp_path.glob("state.sqlite3.damaged-*")
     assert aside.name in line
@@ -107,11 +107,11 @@ def test_a_damaged_file_is_set_aside_and_the_bridge_starts_over(tmp_path, damage
 
 
 def test_a_damaged_entry_is_named_and_takes_no_other(tmp_path):
-    said, state = [], state_in(tmp_path)
+    output, state = [], state_in(tmp_path)
     state.write("list", '{"a": 1}')
     state.write("other", "[3]")
-    assert entry_of(state, said.append).load() is None
-    assert said == [f"{tmp_path}/state.sqlite3, list: starts over"]
+    assert entry_of(state, output.append).load() is None
+    assert output == [f"{tmp_path}/state.sqlite3, list: starts over"]
     assert StateEntry(state, "other", list[int], pytest.fail, "", "").load() == [3]
 
 
@@ -200,10 +200,10 @@ def test_a_file_that_cannot_be_used_for_a_while_is_read_and_written_later(tmp_pa
             state.write(name, "[1]")
     (tmp_path / "state.sqlite3-wal").mkdir()
     monkeypatch.setattr(bridge_state, "_AGAIN_SECONDS", 0.0)
-    said = []
-    state = state_in(tmp_path, say=said.append)
+    output = []
+    state = state_in(tmp_path, say=output.append)
     state.claim(tmp_path)
-    assert "cannot be used (" in said[0]
+    assert "cannot be used (" in output[0]
     assert entry_of(state).load() == [1]
     entry_of(state).save([1, 2])
     state.remove(["gone"])
@@ -222,8 +222,8 @@ def test_what_cannot_be_carried_into_the_file_stays_in_memory_and_is_carried_lat
         state.write("list", "[1]")
     monkeypatch.setattr(bridge_state, "_AGAIN_SECONDS", 0.0)
     (tmp_path / "state.sqlite3-wal").mkdir()
-    said = []
-    state = state_in(tmp_path, say=said.append)
+    output = []
+    state = state_in(tmp_path, say=output.append)
     entry_of(state).save([1, 2])
     (tmp_path / "state.sqlite3-wal").rmdir()
     with closing(sqlite3.connect(tmp_path / "state.sqlite3")) as database:
@@ -232,7 +232,7 @@ def test_what_cannot_be_carried_into_the_file_stays_in_memory_and_is_carried_lat
         )
         database.commit()
         assert entry_of(state).load() == [1, 2]
-        assert said[-1].endswith("(no); entries stay in memory until it can be")
+        assert output[-1].endswith("(no); entries stay in memory until it can be")
         database.execute("DROP TRIGGER refuse")
         database.commit()
     assert entry_of(state).load() == [1, 2]
@@ -247,18 +247,18 @@ def fill(path):
 
 
 def test_a_full_disk_loses_nothing_that_was_written_before(tmp_path):
-    said, saved = [], [1]
+    output, saved = [], [1]
     with small_disk(tmp_path / "disk", "400k") as disk:
         with closing(state_in(disk)) as state:
             entry_of(state).save(saved)
             fill(disk / "filling")
             for number in range(200):  # until the log of SQLite no longer fits
-                if not entry_of(state, said.append).save([number] * 500):
+                if not entry_of(state, output.append).save([number] * 500):
                     break
                 saved = [number] * 500
-        (line,) = said
+        (line,) = output
         assert line == f"{state.path}: cannot be written (database or disk is full); kept in memory"
-        with closing(state_in(disk, say=said.append)) as state:
+        with closing(state_in(disk, say=output.append)) as state:
             assert entry_of(state).load() == saved
             (disk / "filling").unlink()
             assert entry_of(state).save([7])

@@ -43,10 +43,10 @@ def test_they_do_not_drift_over_a_million_frames_of_extreme_values():
 @given(st.lists(st.integers(0, 70), max_size=30), st.integers(1, 700), st.integers(0, 2**32))
 def test_blocks_of_any_size_agree_bit_for_bit(sizes, count, seed):
     features = np.random.default_rng(seed).standard_normal((count, 21)).astype(np.float32)
-    for block, whole in zip(
+    for block, full in zip(
         in_blocks(features, sizes), RollingStatistics(20, 21)(features), strict=True
     ):
-        np.testing.assert_array_equal(block, whole)
+        np.testing.assert_array_equal(block, full)
 
 
 def test_after_a_restart_the_window_fills_again():

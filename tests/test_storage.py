@@ -167,9 +167,9 @@ def topic_total(logs, topic):
 
 
 def test_an_unfinished_log_of_a_store_is_read_up_to_its_last_whole_chunk(store, logs, fetched):
-    whole = find_logs(logs)[0].read_bytes()
+    full = find_logs(logs)[0].read_bytes()
     cut = store / "cut.mcap.active"
-    cut.fs.pipe_file(cut.path, whole[: len(whole) // 2])
+    cut.fs.pipe_file(cut.path, full[: len(full) // 2])
     sizes = fetched(store)
     with LogFile(cut) as file:
         assert not file.complete
@@ -323,8 +323,8 @@ def test_a_log_that_vanishes_while_it_is_read_is_one_line(store):
 def test_a_log_that_becomes_shorter_while_it_is_read_is_one_line(store):
     log = find_logs(store)[0]
     with LogFile(log) as file:
-        whole = log.read_bytes()
-        log.fs.pipe_file(log.path, whole[: len(whole) // 2])
+        full = log.read_bytes()
+        log.fs.pipe_file(log.path, full[: len(full) // 2])
         with pytest.raises(LogError, match=r"mcap: .*changed while it was read"):
             read_chunks(file, file.chunks)
         assert not file.is_at(log)

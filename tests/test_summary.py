@@ -318,14 +318,14 @@ def status(level, name, text):
 
 
 def test_health_is_the_worst_that_was_said_and_of_that_the_last(tmp_path):
-    said = [
+    output = [
         [status(0, "a", "fine")],
         [status(2, "a", "lost"), status(1, "b", "late")],
         [status(1, "a", "late"), status(2, "b", "lost again")],
         [status(0, "a", "fine"), status(0, "b", "fine")],
     ]
     paths = []
-    for number, part in enumerate([said[:2], said[2:]]):
+    for number, part in enumerate([output[:2], output[2:]]):
         writer = LogWriter(
             tmp_path / f"{number}.mcap", [Topic(DIAGNOSTICS, message_types.DIAGNOSTICS)], {}
         )
@@ -339,8 +339,8 @@ def test_health_is_the_worst_that_was_said_and_of_that_the_last(tmp_path):
 
 def test_of_a_log_that_is_still_written_the_latest_health_is_that_of_its_end(tmp_path):
     writer = LogWriter(tmp_path / "a.mcap", [Topic(DIAGNOSTICS, message_types.DIAGNOSTICS)], {})
-    said = [status(2, "a", "lost"), status(1, "b", "late")], [status(0, "a", "listening")]
-    for i, statuses in enumerate(said):
+    output = [status(2, "a", "lost"), status(1, "b", "late")], [status(0, "a", "listening")]
+    for i, statuses in enumerate(output):
         array = message(message_types.DIAGNOSTICS, header=header(START, "mic"), status=statuses)
         writer.write(DIAGNOSTICS, START + i, encode(array))
     writer.flush()

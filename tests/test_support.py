@@ -30,11 +30,11 @@ def bundle(hearthlog, logs, tmp_path):
 
 def test_it_says_what_the_logs_and_the_machine_are(bundle, logs):
     assert bundle.keys() == FILES
-    told = json.loads(bundle["logs.json"])
-    assert [each["name"] for each in told] == [
+    reported = json.loads(bundle["logs.json"])
+    assert [each["name"] for each in reported] == [
         str(log.relative_to(logs)) for log in find_logs(logs)
     ]
-    assert sum(sum(each["frames"].values()) for each in told) > 1000
+    assert sum(sum(each["frames"].values()) for each in reported) > 1000
     assert {"numpy", "mcap"} < json.loads(bundle["machine.json"])["packages"].keys()
     assert json.loads(bundle["configuration.json"])["node"] == "home"
 
@@ -48,9 +48,9 @@ def test_no_label_is_in_it_nor_how_often_there_was_one(bundle, logs):
         for label in columns[name]
     }
     assert len(labels) > 2
-    told = json.loads(bundle["configuration.json"])
-    told["never_keep"] = []
-    everything = json.dumps(told) + "".join(
+    reported = json.loads(bundle["configuration.json"])
+    reported["never_keep"] = []
+    everything = json.dumps(reported) + "".join(
         text for name, text in bundle.items() if name != "configuration.json"
     )
     everything = re.sub(r'"device": "[^"]*"', "", everything)  # here, names of files of sound

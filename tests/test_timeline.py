@@ -254,9 +254,9 @@ def test_a_span_of_time_is_cut_out_to_the_nanosecond(folder, timeline):
     start, end = START + 41_234_567_891, START + 95_000_000_003
     part = read_timeline([folder], start, end)
     assert (part.grid.start, part.grid.end) == (start, end)
-    whole, cut = (t.microphones["mic"].labellings[0].spans for t in (timeline, part))
+    complete, cut = (t.microphones["mic"].labellings[0].spans for t in (timeline, part))
     expected = [
-        (max(a, start), min(b, end), t) for a, b, t in as_list(whole) if a < end and b > start
+        (max(a, start), min(b, end), t) for a, b, t in as_list(complete) if a < end and b > start
     ]
     assert as_list(cut) == expected
     stamps = stamps_of(read(folder, "label"))
@@ -418,8 +418,8 @@ def test_a_damaged_log_is_a_loss_and_the_others_are_shown(tmp_path, folder):
     assert any(str(own[1]) in loss for loss in timeline.losses)
     assert any("empty.mcap: is not an MCAP file" in loss for loss in timeline.losses)
     _, stamps, _ = features(own[2])
-    heard = ~np.isnan(line(timeline, LEVEL))
-    assert heard[timeline.grid.find(stamps)].all()
+    recorded = ~np.isnan(line(timeline, LEVEL))
+    assert recorded[timeline.grid.find(stamps)].all()
 
 
 def test_a_damaged_review_layer_is_a_loss_and_its_log_is_shown(tmp_path, folder, timeline):
@@ -446,13 +446,13 @@ def test_of_logs_that_are_too_large_a_sample_is_read_and_said(folder, timeline, 
 
 
 def test_the_floor_is_drawn_beside_the_level_as_the_diagnostics_tell_it(timeline, folder):
-    expected, told = np.full(timeline.grid.count, np.nan), 0
+    expected, reported = np.full(timeline.grid.count, np.nan), 0
     for one in read(folder, "diagnostics"):
         for pair in one.status[0].values:
             if pair.key == "floor_dbfs":
                 expected[timeline.grid.middles >= nanoseconds(one.header.stamp)] = float(pair.value)
-                told += 1
-    assert told > 5
+                reported += 1
+    assert reported > 5
     level, floor = line(timeline, LEVEL), line(timeline, FLOOR)
     expected[np.isnan(level)] = np.nan
     np.testing.assert_array_equal(floor, expected)
@@ -478,8 +478,8 @@ def health(stamp, *levels):
 
 def test_a_trouble_lasts_until_it_is_over_or_another_one_begins(tmp_path):
     labels = labels_log(tmp_path / "a.mcap", 2000)
-    said = [(0, ()), (1, (1,)), (11, (1,)), (21, (2, 0, 1)), (31, (0,)), (41, (1,))]
-    rows = [health(START + second * SECOND, *levels) for second, levels in said]
+    printed = [(0, ()), (1, (1,)), (11, (1,)), (21, (2, 0, 1)), (31, (0,)), (41, (1,))]
+    rows = [health(START + second * SECOND, *levels) for second, levels in printed]
     write_log(tmp_path / "b.mcap", {"/diagnostics": rows})
     timeline = read_timeline([labels, tmp_path / "b.mcap"])
     assert as_list(timeline.microphones["mic"].troubles) == [
@@ -603,8 +603,8 @@ def test_labellings_differ_where_both_say_something_else(grid, data):
         {t for spans in (one, other) for t in (*spans.starts.tolist(), *spans.ends.tolist())}
     )
     for time in edges:
-        said = [[t for a, b, t in as_list(spans) if a <= time < b] for spans in (one, other)]
-        expected = [b for a, b in zip(*said, strict=False) if a != b]
+        printed = [[t for a, b, t in as_list(spans) if a <= time < b] for spans in (one, other)]
+        expected = [b for a, b in zip(*printed, strict=False) if a != b]
         assert [text for a, b, text in found if a <= time < b] == expected
     assert all(a < b for a, b, _ in found)
     assert all(a[1] <= b[0] for a, b in pairwise(found))
@@ -789,18 +789,20 @@ def test_beside_a_class_of_the_recorder_stands_how_many_of_its_sounds_were_right
     shutil.copytree(folder, home)
     assert run(capfd, "relabel", home, "--model", model_file).returncode == 0
     (log, *_) = find_logs(home)
-    whole = ReviewedSpan("mic", START, START + 600 * SECOND, chosen="random")
-    write_marks(log, [], reviewed=[whole])
+    complete = ReviewedSpan("mic", START, START + 600 * SECOND, chosen="random")
+    write_marks(log, [], reviewed=[complete])
     assert run(capfd, "review", home, "--save", output).returncode == 0
     names = {}
     for chunk in RrdReader(output).stream():
         if (entity := str(chunk.entity_path)).startswith("/mic/words/names/"):
             names[entity] = chunk.to_record_batch().column("TextDocument:text").to_pylist()[-1][0]
     live = {entity: text for entity, text in names.items() if "/names/live/" in entity}
-    told = {text for text in live.values() if " · " in text}
+    reported = {text for text in live.values() if " · " in text}
     checked = class_precision(read_timeline([home]), find_home_logs([home]))
-    assert told == {f"{name} · {n.right}/{n.labelled} right" for (_, name), n in checked.items()}
-    assert len(told) < len(live)
+    assert reported == {
+        f"{name} · {n.right}/{n.labelled} right" for (_, name), n in checked.items()
+    }
+    assert len(reported) < len(live)
     others = {text for entity, text in names.items() if entity not in live}
     assert others >= {"Talking", "Reviewed · class colours"}
     assert not any(text.endswith(" right") for text in others)
@@ -854,13 +856,13 @@ def test_each_class_has_a_row_that_is_as_bright_as_it_was_probable(recording, ti
     middles = np.nanmean(heights.reshape(shades.shape), axis=(0, 2))
     places = (len(rows) - np.arange(len(rows)) - 0.5) * ROWS_HEIGHT / len(rows)
     np.testing.assert_allclose(middles, places)
-    heard = ~np.isnan(values).any(axis=1)
-    found = np.searchsorted(times, timeline.grid.middles[heard], "right") - 1
+    recorded = ~np.isnan(values).any(axis=1)
+    found = np.searchsorted(times, timeline.grid.middles[recorded], "right") - 1
     assert not np.isnan(heights[found]).any()
-    missing = np.searchsorted(times, timeline.grid.middles[~heard], "right") - 1
+    missing = np.searchsorted(times, timeline.grid.middles[~recorded], "right") - 1
     assert np.isnan(heights[missing[missing >= 0]]).all()
     for number, name in enumerate(rows):
-        share = values[heard, names.index(name)]
+        share = values[recorded, names.index(name)]
         for shift, full in zip((24, 16, 8), colour(name), strict=True):
             # The viewer draws a piece in the colour of its end.
             seen = (shades[found + 1, number, 0] >> shift & 255).astype(float)
@@ -875,9 +877,11 @@ def test_single_frames_are_those_of_the_log_and_lines_end_in_a_gap(recording, fo
     hole = np.isnan(values).any(axis=1)
     stamps = stamps_of(labels)
     assert np.isin(times[~hole], stamps).all()
-    for heights, said in zip(values.T, np.array([m.probabilities for m in labels]).T, strict=True):
+    for heights, printed in zip(
+        values.T, np.array([m.probabilities for m in labels]).T, strict=True
+    ):
         drawn = np.interp(stamps, times[~hole], heights[~hole])
-        np.testing.assert_allclose(drawn, said, atol=0.0101)
+        np.testing.assert_allclose(drawn, printed, atol=0.0101)
     after_gaps = stamps_of(labels)[1:][np.diff(stamps_of(labels)) > 2 * FRAME_NANOSECONDS]
     assert len(after_gaps) == 2
     for start in after_gaps:
@@ -907,11 +911,11 @@ def test_the_frames_of_a_long_time_are_read_when_they_are_needed(folder, timelin
 def test_the_heat_map_is_brighter_where_a_feature_is_higher(recording, timeline):
     names, values = (getattr(plot(timeline, FEATURES), name) for name in ("names", "values"))
     times, cells = column(recording, "/mic/features", "SeriesPoints:colors")
-    heard = ~np.isnan(values[:, 0])
-    size = -(-heard.sum() // len(times))  # shares that are one column
-    first = np.arange(0, heard.sum(), size)
+    recorded = ~np.isnan(values[:, 0])
+    size = -(-recorded.sum() // len(times))  # shares that are one column
+    first = np.arange(0, recorded.sum(), size)
     assert 400 < len(first) == len(times)
-    means = np.array([part.mean(axis=0) for part in np.split(values[heard], first[1:])])
+    means = np.array([part.mean(axis=0) for part in np.split(values[recorded], first[1:])])
     colours = np.array(cells, np.uint32)
     light = sum((colours >> shift & 255).astype(int) for shift in (8, 16, 24))
     for feature in (1, 3, 8, 12):

@@ -130,11 +130,9 @@ def test_a_source_gives_at_most_its_share_evenly_spaced(tmp_path):
     data = dataset(*clips, clip(tmp_path, "music", sound("music", 60), "other"))
     assert np.bincount(data.target).tolist() == [SEGMENTS_PER_GROUP, SEGMENTS_PER_GROUP]
     each = [dataset(c, clip(tmp_path, "music", sound("music", 3))) for c in clips]
-    whole = np.concatenate([one.windows[one.target == 1] for one in each])
-    place = [
-        int((whole == row).all(axis=(1, 2)).argmax()) for row in data.windows[data.target == 1]
-    ]
-    assert (place[0], place[-1]) == (0, len(whole) - 1)
+    full = np.concatenate([one.windows[one.target == 1] for one in each])
+    place = [int((full == row).all(axis=(1, 2)).argmax()) for row in data.windows[data.target == 1]]
+    assert (place[0], place[-1]) == (0, len(full) - 1)
     assert set(np.diff(place)) == {2, 3}
 
 
@@ -184,8 +182,8 @@ def test_clips_that_cannot_be_read_are_left_out_and_named(tmp_path, monkeypatch)
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_clip_with_samples_that_are_no_numbers_is_learned_from_around_them(tmp_path, value):
-    whole = sound("speech", 6)
-    broken = whole.astype(np.float32)
+    full = sound("speech", 6)
+    broken = full.astype(np.float32)
     broken[int(2.5 * RATE) : 3 * RATE] = value
     broken[-1] = value  # and so the last frame
     path = tmp_path / "broken.wav"
@@ -216,15 +214,15 @@ def test_a_training_goes_on_without_what_it_cannot_read_and_says_so(home):
     done = run(*options, "-o", home / "b.safetensors")
     assert (clean.exit_code, done.exit_code) == (0, 3)
     assert (home / "a.safetensors").read_bytes() == (home / "b.safetensors").read_bytes()
-    told = [line for line in done.stderr.splitlines() if "left out" in line]
+    reported = [line for line in done.stderr.splitlines() if "left out" in line]
     expected = (
         f"no such file: {manifest}:39: 'none.wav'",
         f"a label that the scenario does not know: {manifest}:40: 'spech'",
         f"a line that is not complete: {manifest}:41: has 2 fields",
         f"cannot be read, or not all of it: {home}/bad.wav: cannot be read as audio",
     )
-    assert len(told) == len(expected)
-    for line, words in zip(told, expected, strict=True):
+    assert len(reported) == len(expected)
+    for line, words in zip(reported, expected, strict=True):
         assert line.startswith(f"hearthlog: left out: 1, {words}")
     as_json = json.loads(run(*options, "-o", home / "c.safetensors", "--json").stdout)
     assert len(as_json["left_out"]) == 4
@@ -312,8 +310,8 @@ def test_the_mean_of_f1_says_of_which_class_it_is_not(capsys):
     )
     known = [float(f1) for name, f1 in rows if name != "Not sure"]
     assert len(known) == len(general.classes) - 1
-    said = f"macro F1 without unknown: {np.mean(known):.3f}"
-    assert said in model_card(general)
+    printed = f"macro F1 without unknown: {np.mean(known):.3f}"
+    assert printed in model_card(general)
     print_figures(general)
     assert f"macro F1 {np.mean(known):.3f} without 'Not sure', " in capsys.readouterr().out
 

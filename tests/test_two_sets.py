@@ -155,9 +155,9 @@ def test_of_a_home_of_both_sets_the_marks_of_one_are_learned_and_the_others_coun
     adapted = ["--base", model_file, "--home", both, "-o", tmp_path / "x.safetensors"]
     done = hearthlog("train", *adapted, "--json")
     assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
-    assert said["skipped"] == {"its features are not home33": 2}
-    learned = said["training_data"]["home"]
+    output = json.loads(done.stdout)
+    assert output["skipped"] == {"its features are not home33": 2}
+    learned = output["training_data"]["home"]
     assert sum(one["seconds"] for name, one in learned.items() if name != "silence") == 24
     assert [item.features.shape[1] for item in home_recordings(both, AUROS21)] == [21, 21, 0, 0, 0]
 

@@ -119,12 +119,12 @@ def test_extreme_values_survive(tmp_path):
 
 def test_a_file_that_is_being_written_streams_up_to_its_last_whole_chunk(recorded, tmp_path):
     _, unfinished = recorded
-    whole = unfinished.read_bytes()
-    layout = chunks(whole)
+    full = unfinished.read_bytes()
+    layout = chunks(full)
     middle, _ = layout[len(layout) // 2]
     cut = tmp_path / "cut.mcap.active"
-    for length in (middle - 1, middle, len(whole)):
-        cut.write_bytes(whole[:length])
+    for length in (middle - 1, middle, len(full)):
+        cut.write_bytes(full[:length])
         own = ours(LogReader(cut))
         assert len(own) == sum(count for end, count in layout if end <= length)
         assert like(rows("stream", cut, CUT), own) == own
@@ -132,25 +132,25 @@ def test_a_file_that_is_being_written_streams_up_to_its_last_whole_chunk(recorde
 
 def test_the_index_says_what_is_in_the_file(logs):
     for path in logs:
-        (said,) = rows("summary", path)
+        (output,) = rows("summary", path)
         log = LogReader(path)
         own = ours(log)
         times = [row["logTime"] for row in own]
-        statistics, channels = said["statistics"], said["channels"]
+        statistics, channels = output["statistics"], output["channels"]
         topics = {str(c["id"]): c["topic"] for c in channels}
         counts = {topics[i]: int(n) for i, n in statistics["channelMessageCounts"].items()}
-        assert said["header"]["profile"] == "ros2"
+        assert output["header"]["profile"] == "ros2"
         assert counts == Counter(row["topic"] for row in own)
         assert int(statistics["messageCount"]) == len(own)
         assert int(statistics["messageStartTime"]) == times[0]
         assert int(statistics["messageEndTime"]) == times[-1]
-        assert statistics["chunkCount"] == len(said["compressions"])
-        assert set(said["compressions"]) == {"zstd"}
+        assert statistics["chunkCount"] == len(output["compressions"])
+        assert set(output["compressions"]) == {"zstd"}
         assert {c["topic"]: c["metadata"] for c in channels} == {
             topic: channel.metadata for topic, channel in log.channels.items()
         }
-        assert said["metadata"] == log.metadata
-        assert said["attachments"] == {k: data.decode() for k, data in log.attachments.items()}
+        assert output["metadata"] == log.metadata
+        assert output["attachments"] == {k: data.decode() for k, data in log.attachments.items()}
         assert (len(log.metadata), len(log.attachments)) == (3, 3)
 
 
@@ -164,13 +164,13 @@ def flipped(path, place, folder):
 
 
 def test_the_file_carries_the_checksums_that_the_typescript_readers_check(logs, tmp_path):
-    (said,) = rows("summary", logs[0])
+    (output,) = rows("summary", logs[0])
     with logs[0].open("rb") as stream:
         summary = make_reader(stream).get_summary()
     chunk = summary.chunk_indexes[1].chunk_start_offset + CRC_IN_CHUNK
     attachment = summary.attachment_indexes[0]
     text = attachment.offset + attachment.length - 5  # its last byte; a checksum follows
-    schema = int(said["footer"]["summaryStart"]) + 20
+    schema = int(output["footer"]["summaryStart"]) + 20
     assert any(logs[0].read_bytes()[chunk : chunk + 4])  # a zero would not be checked
     for place, ways, complaint in (
         (chunk, ["messages", "stream"], "Incorrect chunk CRC"),

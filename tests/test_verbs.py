@@ -106,8 +106,8 @@ def folder(tmp_path_factory):
         assert (result.returncode, sprung(folder)) == (0, []), f"{command}: {result.stderr}"
     (folder / "home.toml").write_text(TOLD)
     (folder / "rules.toml").write_text(RULES)
-    whole = min(folder.glob("logs/**/*Z.mcap")).read_bytes()
-    (folder / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    full = min(folder.glob("logs/**/*Z.mcap")).read_bytes()
+    (folder / "cut.mcap").write_bytes(full[: len(full) // 2])
     assert {path.name for path in exposed(folder)} == {"home.toml", "rules.toml", "cut.mcap"}
     make_private(folder)
     return folder

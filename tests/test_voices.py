@@ -81,7 +81,7 @@ def home(two_days, tmp_path):
     return shutil.copytree(two_days[0], tmp_path / "logs")
 
 
-def told(logs, known=None):
+def reported(logs, known=None):
     """Tell voices apart; return them, and when each speaks."""
     speech = read_speech(find_home_logs([logs]))
     voices, of = find_voices(speech, known)
@@ -112,7 +112,7 @@ def as_json(hearthlog, *arguments):
 
 def test_two_people_who_talk_are_two_voices_on_both_days(two_days):
     logs, days = two_days
-    voices, of, speech = told(logs)
+    voices, of, speech = reported(logs)
     assert voices.numbers.tolist() == [1, 2]
     whose = set()
     for day, turns in enumerate(days):
@@ -126,15 +126,15 @@ def test_two_people_who_talk_are_two_voices_on_both_days(two_days):
 
 def test_one_person_is_one_voice(clips, tmp_path):
     logs, _ = record_conversation({ALLISON: clips[ALLISON]}, tmp_path, START, 3)
-    voices, of, _ = told(logs)
+    voices, of, _ = reported(logs)
     assert voices.numbers.tolist() == [1]
     assert set(of.tolist()) == {0}
 
 
 def test_the_voices_of_one_day_are_known_again_on_the_next(clips, two_days, tmp_path):
     first, _ = record_conversation(clips, tmp_path, START - DAY, 5)
-    known, _, _ = told(first)
-    voices, of, _ = told(two_days[0], known)
+    known, _, _ = reported(first)
+    voices, of, _ = reported(two_days[0], known)
     assert voices.numbers.tolist() == [1, 2]
     assert np.array_equal(voices.evidence.sums, known.evidence.sums)
     assert NO_CLUSTER not in of
@@ -151,8 +151,8 @@ def test_each_voice_of_a_conversation_is_the_one_that_is_like_it():
     likes = summed(where[::2], of[::2], 3)
     evidence = likes.rows(np.array([0, 1]))
     known = HomeVoices(np.array([4, 7]), evidence, names=["anna", ""], id="0" * 8)
-    heard = summed(where[1::2], of[1::2], 3).rows(np.array([1, 2, 0]))
-    voices, found = find_voices(speech_with(heard), known)
+    recorded = summed(where[1::2], of[1::2], 3).rows(np.array([1, 2, 0]))
+    voices, found = find_voices(speech_with(recorded), known)
     assert voices.numbers[found].tolist() == [7, 8, 4]
     assert voices.names == ["anna", "", ""]
     few = summed(where[80:100:2], of[80:100:2], 3).rows(np.array([2]))
@@ -161,7 +161,7 @@ def test_each_voice_of_a_conversation_is_the_one_that_is_like_it():
 
 
 def test_turns_lie_where_the_labels_say_speech(two_days):
-    _, _, speech = told(two_days[0])
+    _, _, speech = reported(two_days[0])
     starts, ends = speech.starts, speech.ends
     assert (starts[1:] >= ends[:-1]).all()
     assert 60 < speech.seconds < 110, "of two minutes with pauses"
@@ -274,10 +274,10 @@ def test_people_who_speak_at_once_in_two_rooms_are_both_heard(rooms):
 
 def test_what_is_said_when_the_time_asked_for_begins_and_ends_is_heard_as_in_the_whole(rooms):
     home = find_home_logs([rooms / "kitchen"])
-    whole = read_speech(home)
+    full = read_speech(home)
     for cut in [START + second * NANOSECONDS for second in range(5, 40, 5)]:
         parts = read_speech(home, None, cut), read_speech(home, cut, None)
-        assert sum(part.seconds for part in parts) == pytest.approx(whole.seconds, abs=0.5)
+        assert sum(part.seconds for part in parts) == pytest.approx(full.seconds, abs=0.5)
 
 
 @pytest.mark.parametrize("late", [-3, 0, 3])
@@ -497,7 +497,7 @@ def test_voices_that_could_not_be_read_are_not_written(tmp_path, sums):
 )
 def test_frames_that_no_sound_can_have_are_of_no_voice(two_days, monkeypatch, name, value):
     spoilt = DEFAULT.feature_names.index(name)
-    whole = read_speech(find_home_logs([two_days[0]])).seconds
+    full = read_speech(find_home_logs([two_days[0]])).seconds
 
     def read_spoilt(*arguments, **options):
         columns = read_columns(*arguments, **options)
@@ -507,7 +507,7 @@ def test_frames_that_no_sound_can_have_are_of_no_voice(two_days, monkeypatch, na
 
     monkeypatch.setattr("hearthlog.analyzer.discover.speech.read_columns", read_spoilt)
     speech = read_speech(find_home_logs([two_days[0]]))
-    assert 10 < whole - speech.seconds <= 40, "of twenty seconds in each of two logs"
+    assert 10 < full - speech.seconds <= 40, "of twenty seconds in each of two logs"
     assert np.isfinite(speech.voices.sums).all()
     assert np.abs(speech.voices.sums).max() < 1e5
 

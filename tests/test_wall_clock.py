@@ -60,8 +60,8 @@ def test_a_recorder_that_starts_with_such_a_clock_follows_it_once_it_is_right(cl
     _, stamps, _ = features(logs)
     assert stamps[0] < YEAR
     assert abs(time.time_ns() - stamps[-1]) < 60 * SECONDS
-    said = {status.message for each in read(logs, "diagnostics") for status in each.status}
-    assert [line for line in said if "which a log cannot have; set it" in line]
+    output = {status.message for each in read(logs, "diagnostics") for status in each.status}
+    assert [line for line in output if "which a log cannot have; set it" in line]
 
 
 @pytest.mark.parametrize("step", [-86_400, 7])
@@ -73,7 +73,9 @@ def test_a_clock_that_is_set_while_the_microphone_is_silent_is_told_of_in_the_ga
     wait_for_frames(logs, 20)
     labmic.freeze()
     clock[0] = step * SECONDS
-    wait_for(lambda: not ("waiting for it" not in told(logs) and "went silent" not in told(logs)))
+    wait_for(
+        lambda: not ("waiting for it" not in reported(logs) and "went silent" not in reported(logs))
+    )
     labmic.restore()
     wait_for_frames(logs, len(features(logs)[0]) + 40)
     recorder.finish()
@@ -81,7 +83,7 @@ def test_a_clock_that_is_set_while_the_microphone_is_silent_is_told_of_in_the_ga
     assert gap.reason == f"the microphone went silent; the clock was set by {step:+.3f} s"
 
 
-def told(logs):
+def reported(logs):
     """What was said of the microphone so far."""
     return " ".join(status.message for m in read(logs, "diagnostics") for status in m.status)
 

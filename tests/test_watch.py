@@ -264,7 +264,7 @@ class Letters(list):
         monkeypatch.setattr(rr.RecordingStream, "send_columns", note)
 
 
-def heard_now(sounds, label, begin, count, **about):
+def recorded_now(sounds, label, begin, count, **about):
     """Add labels of now."""
     microphone, confidence = about.get("microphone", "mic"), about.get("confidence", 0.87)
     own = sounds.microphones.setdefault(microphone, CurrentSound(microphone))
@@ -278,10 +278,10 @@ def test_large_letters_say_what_is_heard_now_how_sure_and_since_when(tmp_path, m
     letters, sounds = Letters(monkeypatch), CurrentSounds(tmp_path, pytest.fail)
     begin = 1_772_348_400 * SECOND
     with LiveServer(free_port(), "127.0.0.1", MINUTES) as server:
-        heard_now(sounds, "silence", begin, 100)
-        heard_now(sounds, "coughing", begin + 5 * SECOND, 40)
+        recorded_now(sounds, "silence", begin, 100)
+        recorded_now(sounds, "coughing", begin + 5 * SECOND, 40)
         server.show_current(sounds, UTC)
-        other = heard_now(sounds, "music", begin, 1, microphone="living_room [](x:/y)")
+        other = recorded_now(sounds, "music", begin, 1, microphone="living_room [](x:/y)")
         other.seen -= AWAY_SECONDS + 1
         server.show_current(sounds, UTC)
         write_list(tmp_path, ["coughing"])
@@ -305,7 +305,7 @@ def test_where_nobody_listens_the_lane_ends_with_the_last_label(tmp_path, monkey
     begin = 1_772_348_400 * SECOND
     with LiveServer(free_port(), "127.0.0.1", MINUTES) as server:
         server.show([StateLane(RECORDER, "mic", np.array([begin]), ["coughing"])])
-        sound = heard_now(sounds, "coughing", begin, 40)
+        sound = recorded_now(sounds, "coughing", begin, 40)
         server.show_current(sounds, UTC)
         assert len(lanes) == 1
         sound.seen -= AWAY_SECONDS + 1
@@ -320,7 +320,7 @@ def test_large_letters_change_once_a_minute_while_the_sound_does_not(tmp_path, m
     with LiveServer(free_port(), "127.0.0.1", MINUTES) as server:
         for second in range(3600):
             confidence = 0.87 + 0.04 * (second % 2)
-            heard_now(sounds, "silence", begin + second * SECOND, 20, confidence=confidence)
+            recorded_now(sounds, "silence", begin + second * SECOND, 20, confidence=confidence)
             server.show_current(sounds, UTC)
     assert 60 <= len(letters) <= 80
     assert letters[-1] == "# Quiet · 91 % · for over 1 h 0 min"
@@ -452,11 +452,11 @@ def test_a_damaged_log_is_told_and_the_others_are_shown(logs, tmp_path, name):
     with watching(tmp_path) as (watcher, url), looking(url) as eye:
         assert eye.views()
         watcher.send_signal(signal.SIGINT)
-        _, said = watcher.communicate(timeout=30)
+        _, output = watcher.communicate(timeout=30)
     assert watcher.returncode == 3
-    assert said.count("home_1.mcap") == 1
-    assert "home_2.mcap" not in said
-    assert said.count("\n") == 3
+    assert output.count("home_1.mcap") == 1
+    assert "home_2.mcap" not in output
+    assert output.count("\n") == 3
 
 
 def test_an_empty_folder_is_waited_for(day, model_file, tmp_path):
@@ -465,8 +465,8 @@ def test_an_empty_folder_is_waited_for(day, model_file, tmp_path):
         subprocess.run(command, check=True)
         eye.views(6)
         watcher.terminate()
-        _, said = watcher.communicate(timeout=30)
-    assert f"no log in {tmp_path} yet; waiting for a recorder" in said
+        _, output = watcher.communicate(timeout=30)
+    assert f"no log in {tmp_path} yet; waiting for a recorder" in output
 
 
 def test_a_folder_that_is_not_there_is_told(hearthlog, tmp_path):
@@ -504,9 +504,10 @@ def test_without_a_display_it_is_said_what_else_there_is(hearthlog, tmp_path):
 def test_who_listens_to_the_network_is_warned(tmp_path):
     with watching(tmp_path, "--bind", "0.0.0.0") as (watcher, _):
         watcher.terminate()
-        _, said = watcher.communicate(timeout=30)
+        _, output = watcher.communicate(timeout=30)
     assert (
-        "anybody who reaches this port, even a web page in a browser, sees everything shown" in said
+        "anybody who reaches this port, even a web page in a browser, sees everything shown"
+        in output
     )
 
 

@@ -146,9 +146,9 @@ def test_processes_end_with_their_parent(tmp_path, end):
         os.killpg(parent.pid, end)
         assert parent.wait(LONG) == -end
         assert psutil.wait_procs(children, LONG)[1] == []
-        said = parent.stderr.read()
+        output = parent.stderr.read()
     assert not list(tmp_path.iterdir())
-    assert said.count(b"Traceback") == (end == signal.SIGINT)  # the parent's alone
+    assert output.count(b"Traceback") == (end == signal.SIGINT)  # the parent's alone
 
 
 def test_a_lost_worker_of_a_cluster_costs_only_its_task(cluster, tmp_path):
@@ -231,9 +231,9 @@ def test_a_scheduler_that_goes_away_leaves_nothing_but_the_error_on_the_terminal
             wait_for(begun.exists)
             scheduler.kill()
             assert client.wait(LONG) == 0
-            said = client.stderr.read().decode()
-    assert said.startswith("the Dask scheduler at")
-    assert said.count("\n") == 1
+            output = client.stderr.read().decode()
+    assert output.startswith("the Dask scheduler at")
+    assert output.count("\n") == 1
 
 
 def _site_of_another_version(folder):
@@ -259,9 +259,9 @@ def _site_without_hearthlog(folder):
 def test_a_worker_with_another_hearthlog_that_joins_later_gets_nothing(cluster, tmp_path, site_of):
     start, paths, has = site_of(tmp_path)
     options = ["--nthreads", "1", "--no-nanny", *PRIVATE]
-    told = pytest.warns(HearthlogWarning, match=rf"has {has}, this is .*: not used")
+    reported = pytest.warns(HearthlogWarning, match=rf"has {has}, this is .*: not used")
     with (
-        told,
+        reported,
         open_workers(scheduler=cluster) as workers,
         running([*start, cluster, *options], paths=paths, cwd=tmp_path),
     ):
@@ -275,10 +275,10 @@ def test_a_worker_with_another_hearthlog_that_joins_later_gets_nothing(cluster, 
 def test_a_worker_with_another_hearthlog_is_refused_before_a_run(cluster, tmp_path, site_of):
     start, paths, has = site_of(tmp_path)
     options = ["--nthreads", "1", "--no-nanny", *PRIVATE]
-    said = rf"the Dask worker at tcp://127\.0\.0\.1:\d+ has {has}, this is "
+    output = rf"the Dask worker at tcp://127\.0\.0\.1:\d+ has {has}, this is "
     with running([*start, cluster, *options], paths=paths, cwd=tmp_path):
         wait_for(lambda: _threads(cluster) == 2)
-        with pytest.raises(WorkerError, match=said), open_workers(scheduler=cluster):
+        with pytest.raises(WorkerError, match=output), open_workers(scheduler=cluster):
             pass
     wait_for(lambda: _threads(cluster) == 1)
 

@@ -26,7 +26,7 @@ def machine(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("output", "expected"),
     [
         ({"variable": "Asia/Tokyo", "file": "Europe/Rome\n"}, "Asia/Tokyo"),
         ({"variable": ":Asia/Tokyo"}, "Asia/Tokyo"),
@@ -37,8 +37,8 @@ def machine(tmp_path, monkeypatch):
         ({}, "UTC"),
     ],
 )
-def test_the_zone_is_that_of_the_machine(machine, said, expected):
-    assert machine(**said) == expected
+def test_the_zone_is_that_of_the_machine(machine, output, expected):
+    assert machine(**output) == expected
 
 
 @pytest.mark.parametrize("name", ["Europe/Atlantis", "", "../../etc/passwd", "Europe", "a\0b"])

@@ -27,13 +27,13 @@ def record_together(
     """
     microphones = [{"name": name, "device": name} for name in sources]
     wanted = {"max_bag_duration": 60, "microphone": microphones} | settings
-    asked = Settings(output=folder, **wanted)
+    requested = Settings(output=folder, **wanted)
     labelling = dict.fromkeys(sources, LabellingModels())
     with ExitStack() as stack:
         for name, path in (models or {}).items():
             watch = stack.enter_context(closing(ModelWatch(path, ReloadRequests().queue())))
             labelling[name] = LabellingModels(watch)
-        session = RecordingSession(asked, sources, labelling)
+        session = RecordingSession(requested, sources, labelling)
         streams = [zip(repeat(name), each.events(Flag())) for name, each in sources.items()]
         for name, event in heapq.merge(*streams, key=lambda one: event_time(one[1])):
             session.add(name, event)

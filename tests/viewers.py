@@ -333,10 +333,10 @@ class Page:
     async def _open_as(self, address, content):
         await self._call("Fetch.enable", {"patterns": [{"urlPattern": address}]})
         opened = await self._send("Page.navigate", {"url": address})
-        while (said := await self._socket.receive_json()).get("method") != "Fetch.requestPaused":
+        while (output := await self._socket.receive_json()).get("method") != "Fetch.requestPaused":
             pass
         answer = {
-            "requestId": said["params"]["requestId"],
+            "requestId": output["params"]["requestId"],
             "responseCode": 200,
             "responseHeaders": [{"name": "Content-Type", "value": "text/html"}],
             "body": base64.b64encode(content.encode()).decode(),

@@ -54,8 +54,8 @@ def test_marks_are_true_of_whole_sounds_that_were_wrong_and_never_of_silence(hom
         assert mark.label != "silence"
         assert (mark.start, mark.end, mark.label) in true
         assert mark.end <= logs[2].start
-    said = true_labelling([(0.0, 14400.0, "silence")], START * NANOSECONDS)
-    assert wrong_sounds(logs, said, logs[2].start) == []
+    output = true_labelling([(0.0, 14400.0, "silence")], START * NANOSECONDS)
+    assert wrong_sounds(logs, output, logs[2].start) == []
 
 
 def test_the_worst_class_is_one_that_was_right_before():

@@ -17,14 +17,14 @@ def test_a_home_is_composed_of_halves_that_share_no_source_and_that_no_starter_h
     assert len({log.start // 86_400_000_000_000 for log in home.logs}) == 3
     assert {"silence", "speech", "crying"} <= {*home.truth.labels} <= {"silence", *PLAYED[GENERAL]}
     with starter_file(GENERAL).with_name("sources.csv").open(encoding="utf-8") as file:
-        heard = {row["source_group"] for row in csv.DictReader(file)}
+        recorded = {row["source_group"] for row in csv.DictReader(file)}
     halves = []
     for half in range(2):
         with (tmp_path / f"half-{half}.csv").open(encoding="utf-8") as file:
             halves.append({row["source_group"] for row in csv.DictReader(file)})
     assert all(halves)
     assert not halves[0] & halves[1]
-    assert not (halves[0] | halves[1]) & heard
+    assert not (halves[0] | halves[1]) & recorded
 
 
 def test_nothing_is_played_of_which_there_are_no_recordings(tmp_path):

@@ -215,11 +215,11 @@ def test_layers_of_logs_that_were_thinned_are_current_too(relabelled, tmp_path, 
 def test_an_unfinished_log_stays_unfinished(recording, tmp_path):
     logs = part(recording, tmp_path / "one", (0,))
     (log,) = logs_in(logs)
-    whole = log.read_bytes()
+    full = log.read_bytes()
     log.unlink()
     with LogFile(logs_in(recording)[0]) as file:
         last = file.chunks[-1]
-    active_path(log).write_bytes(whole[: last["offset"] + last["length"] + last["index_length"]])
+    active_path(log).write_bytes(full[: last["offset"] + last["length"] + last["index_length"]])
     copy_logs(logs, tmp_path / "logs", 2, MINUTE)
     first, second = find_logs(tmp_path / "logs")
     assert second.name == "home_20260301T000100Z.mcap.active"

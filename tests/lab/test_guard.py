@@ -96,6 +96,6 @@ def test_it_is_one_command(tmp_path, clips, capsys):
     with manifest.open("w", newline="") as file:
         csv.writer(file).writerows([["path", "label", "source_group", "source"], *rows])
     guard.guard([manifest])
-    said = capsys.readouterr().out.splitlines()
-    assert [line.partition("  ")[0] for line in said[1 : 1 + len(WAYS)]] == [w.name for w in WAYS]
-    assert {line.split()[0] for line in said[-2:]} == {"music", "tap_water"}
+    output = capsys.readouterr().out.splitlines()
+    assert [line.partition("  ")[0] for line in output[1 : 1 + len(WAYS)]] == [w.name for w in WAYS]
+    assert {line.split()[0] for line in output[-2:]} == {"music", "tap_water"}

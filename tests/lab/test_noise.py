@@ -75,8 +75,8 @@ def test_what_comes_later_does_not_change_what_was_kept(gain, cut, later):
     other = sound.copy()
     other[:, cut:] = white(1.2, later, seed=1)[:, cut:]
     remover = Remover(gain, 1.5)
-    heard = cut - WINDOW
-    assert np.array_equal(remover(sound)[:, :heard], remover(other)[:, :heard])
+    labelled = cut - WINDOW
+    assert np.array_equal(remover(sound)[:, :labelled], remover(other)[:, :labelled])
 
 
 @GAINS

@@ -50,7 +50,7 @@ def labels_of(truth, mark):
 
 def test_a_person_marks_what_is_true_and_leaves_what_is_right(home):
     logs, truth = home
-    said = find_labellings(logs).read("mic", "live").labelling
+    output = find_labellings(logs).read("mic", "live").labelling
     done = Person(truth).review(logs, 60, SUNDAY)
     marks = sorted(done.marks)
     assert marks == written(logs, read_marks)
@@ -61,8 +61,8 @@ def test_a_person_marks_what_is_true_and_leaves_what_is_right(home):
             mark.label
         }
     for span in done.reviewed:
-        parts = overlay([truth, said, one(span.start, span.end)]).in_all()
-        unlike = truth.labels[parts.rows[0]] != said.labels[parts.rows[1]]
+        parts = overlay([truth, output, one(span.start, span.end)]).in_all()
+        unlike = truth.labels[parts.rows[0]] != output.labels[parts.rows[1]]
         marked = [any(m.start <= t < m.end for m in marks) for t in parts.starts.tolist()]
         left = unlike & ~np.array(marked) & (truth.labels[parts.rows[0]] != "other_negative")
         assert ((parts.ends - parts.starts)[left] < NANOSECONDS / 2).all()

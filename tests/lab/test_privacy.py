@@ -118,12 +118,12 @@ def test_it_is_one_command(tmp_path, monkeypatch, capsys):
     with manifest.open("w", newline="") as file:
         csv.writer(file).writerows([["path", "label", "source_group", "text"], *rows])
     privacy.privacy(manifest, 1)
-    said = capsys.readouterr().out.splitlines()
-    assert said[0].startswith("4 digits of 2 speakers, 1 sentences of 1 with ")
-    begin = next(number for number, line in enumerate(said) if line.startswith("original"))
-    first = [line.split()[0] for line in said[begin:]]
+    output = capsys.readouterr().out.splitlines()
+    assert output[0].startswith("4 digits of 2 speakers, 1 sentences of 1 with ")
+    begin = next(number for number, line in enumerate(output) if line.startswith("original"))
+    first = [line.split()[0] for line in output[begin:]]
     assert first == ["original", *3 * ["auros21"], *3 * ["home33"]]
-    assert float(said[begin].split()[1]) == 1
+    assert float(output[begin].split()[1]) == 1
 
 
 def logged_by_a_recorder(sound, private):

@@ -90,12 +90,12 @@ def test_another_microphone_hears_the_same_in_a_narrow_band_and_weaker():
     near, narrow = Rooms("kitchen", 4), NarrowRooms("kitchen", 4)
     click = np.zeros(20 * FRAME_SAMPLES, np.float32)
     click[0] = 1.0
-    heard = [
+    recorded = [
         (near.floor.ravel(), narrow.floor.ravel()),
         (near.steady["fridge"].ravel(), narrow.steady["fridge"].ravel()),
         (near.received(click, "kitchen"), narrow.received(click, "kitchen")),
     ]
-    for before, after in heard:
+    for before, after in recorded:
         frequency = np.fft.rfftfreq(len(before), 1 / 16_000)
         a, b = (np.square(np.abs(np.fft.rfft(sound))) for sound in (before, after))
         inside = (frequency > 500) & (frequency < 3000)
@@ -107,15 +107,15 @@ def test_another_microphone_hears_the_same_in_a_narrow_band_and_weaker():
 def test_the_hours_of_a_week_are_those_in_which_the_most_is_heard():
     library, hour = ClipLibrary(None), 3600 * 20
     weeks = quarter.plan_quarter(2, library, 1)
-    whole = plan_days(14, library, Habits(1))
+    full = plan_days(14, library, Habits(1))
     for number, ((first, one), (second, other)) in enumerate(weeks):
         assert 0 <= first < second < 168 * hour
         assert one.frames == other.frames == hour
         begin = number * 168 * hour
-        heard = {s.clip.label for s in whole.sounds if begin <= s.start < begin + 168 * hour}
-        assert len(heard - {s.clip.label for s in (*one.sounds, *other.sounds)}) <= 1
+        recorded = {s.clip.label for s in full.sounds if begin <= s.start < begin + 168 * hour}
+        assert len(recorded - {s.clip.label for s in (*one.sounds, *other.sounds)}) <= 1
         assert [s.frames for s in one.sounds] == [
             s.frames
-            for s in whole.sounds
+            for s in full.sounds
             if begin + first <= s.start and s.end <= begin + first + hour
         ]

@@ -23,32 +23,32 @@ def measured(capfd, *words):
 
 
 @pytest.fixture(scope="module")
-def heard(model_file, training_set):
+def recorded(model_file, training_set):
     """A model, some of the clips that it knows, and its scenario."""
     model = load_model(model_file)
     scenario = scenario_of(model)
     return model, read_manifest(training_set, scenario.labels)[::2], scenario
 
 
-def test_unchanged_clips_are_scored_as_by_evaluate_model(heard):
-    found = robustness(*heard, ignore_progress, [])
-    plain = evaluate_model(*heard, ignore_progress)
+def test_unchanged_clips_are_scored_as_by_evaluate_model(recorded):
+    found = robustness(*recorded, ignore_progress, [])
+    plain = evaluate_model(*recorded, ignore_progress)
     assert found.unchanged == plain.scores
     assert found.skipped == plain.skipped
     assert found.sources_learned == plain.sources_learned > 0
     assert found.changed == {}
 
 
-def test_a_gain_of_nothing_changes_nothing(heard):
-    found = robustness(*heard, ignore_progress, [Condition("nothing", gain=0.0)])
+def test_a_gain_of_nothing_changes_nothing(recorded):
+    found = robustness(*recorded, ignore_progress, [Condition("nothing", gain=0.0)])
     scores, difference = found.changed["nothing"]
     assert scores == found.unchanged
     assert (difference.macro_f1, *difference.interval) == (0.0, 0.0, 0.0)
 
 
-def test_the_more_noise_the_worse_on_the_same_segments(heard):
+def test_the_more_noise_the_worse_on_the_same_segments(recorded):
     steps = [Condition(str(below), noise=below) for below in (30.0, 0.0, -20.0)]
-    found = robustness(*heard, ignore_progress, steps)
+    found = robustness(*recorded, ignore_progress, steps)
     every = [found.unchanged, *(one.scores for one in found.changed.values())]
     assert len({one.segments for one in every}) == 1
     assert {tuple(np.sum(one.confusion, axis=1)) for one in every} == {
@@ -61,14 +61,14 @@ def test_the_more_noise_the_worse_on_the_same_segments(heard):
         assert difference.macro_f1 == pytest.approx(change)
 
 
-def test_the_same_clips_give_the_same_scores_however_they_are_divided(heard, monkeypatch):
-    told = []
-    asked = [CONDITIONS[3], CONDITIONS[-1]]
-    first = robustness(*heard, told.append, asked)
+def test_the_same_clips_give_the_same_scores_however_they_are_divided(recorded, monkeypatch):
+    reported = []
+    requested = [CONDITIONS[3], CONDITIONS[-1]]
+    first = robustness(*recorded, reported.append, requested)
     monkeypatch.setattr(evaluation, "_CLIPS_AT_ONCE", 1)
-    assert robustness(*heard, ignore_progress, asked) == first
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    assert robustness(*recorded, ignore_progress, requested) == first
+    assert reported == sorted(reported)
+    assert reported[-1] == 1.0
 
 
 def tone_bursts(level=-20.0):
@@ -190,8 +190,8 @@ def test_bad_input_is_one_line(model_file, training_set, tmp_path, capfd):
         ((training_set, "--plot", tmp_path / "there.png"), 1, "exists already"),
         ((tmp_path / "no.csv",), 1, "no.csv"),
     )
-    for (data, *options), status, said in cases:
+    for (data, *options), status, output in cases:
         result = measured(capfd, model_file, "--data", data, *options)
         assert result.returncode == status
-        assert said in result.stderr
+        assert output in result.stderr
         assert len([x for x in result.stderr.splitlines() if "listening" not in x]) == 1
