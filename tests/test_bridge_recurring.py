@@ -219,7 +219,7 @@ def test_what_came_of_a_name_is_one_line(tmp_path, monkeypatch, acts, states):
     acting(monkeypatch, f"import sys; sys.stdout = sys.stderr; {acts}")
     naming = GroupNaming(tmp_path)
     assert naming.start(KEY, 3, "kettle").startswith("Marking as Kettle.")
-    answer = patiently(lambda: naming.output[KEY], lambda text: "Marking as" not in text)
+    answer = patiently(lambda: naming.outcomes[KEY], lambda text: "Marking as" not in text)
     assert states in answer
     assert len(answer) < 500
 
@@ -232,9 +232,9 @@ def test_one_group_is_named_at_a_time_and_an_end_of_the_bridge_is_one_of_that(
     naming.start(KEY, 3, "")
     with pytest.raises(BridgeError, match="still marking another sound"):
         naming.start("4 of 5b4e0d1c", 4, "kettle")
-    assert naming.output.keys() == {KEY}
+    assert naming.outcomes.keys() == {KEY}
     naming.close()
-    patiently(lambda: naming.output[KEY], lambda text: "ended by signal 15" in text)
+    patiently(lambda: naming.outcomes[KEY], lambda text: "ended by signal 15" in text)
     acting(monkeypatch, "")
     naming.start("4 of 5b4e0d1c", 4, "kettle")
 

@@ -48,7 +48,7 @@ def shown_groups(summary: GroupsSummary) -> dict[str, GroupSummary]:
 def recurring_list(
     summary: GroupsSummary,
     looked: int,
-    said: Mapping[str, str],
+    outcomes: Mapping[str, str],
     moment: Moment,
     words: Words = ENGLISH,
 ) -> Any:
@@ -58,7 +58,7 @@ def recurring_list(
     ----------
     looked : int
         When the summary was written, in nanoseconds of UTC.
-    said : mapping of str to str
+    outcomes : mapping of str to str
         Status of naming, by key of the group.
     """
     shown = shown_groups(summary)
@@ -68,14 +68,14 @@ def recurring_list(
         "looked": words.when(min(max(looked, 0), moment.now), *moment),
         "more": words.text("recurring.more", count=words.number(left)) if left > 0 else "",
         "groups": [
-            _described(key, group, said.get(key, ""), (moment, words), is_alone=is_alone)
+            _described(key, group, outcomes.get(key, ""), (moment, words), is_alone=is_alone)
             for key, group in shown.items()
         ],
     }
 
 
 def _described(
-    key: str, group: GroupSummary, said: str, shown: tuple[Moment, Words], *, is_alone: bool
+    key: str, group: GroupSummary, outcome: str, shown: tuple[Moment, Words], *, is_alone: bool
 ) -> Any:
     moment, words = shown
     number = words.text("recurring.sound", number=group.number)
@@ -87,7 +87,7 @@ def _described(
         "about": _how_often(group, words),
         "heard": _named_as(group, words),
         "listen": words.text("recurring.examples", times=examples),
-        "said": said,
+        "said": outcome,
     }
 
 
@@ -134,7 +134,7 @@ class GroupNaming:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.said: dict[str, str] = {}
+        self.outcomes: dict[str, str] = {}
         self._folder = folder
         self._process: subprocess.Popen[str] | None = None
         self._thread: Thread | None = None
@@ -166,7 +166,7 @@ class GroupNaming:
             if not os.access(self._folder, os.W_OK):
                 raise BridgeError(READ_ONLY)
             process = self._process = _started([*options, "--json", "--", str(self._folder)])
-            self.said[key] = text
+            self.outcomes[key] = text
             self._thread = Thread(
                 target=self._follow, args=(process, key, number, words), daemon=True
             )
@@ -186,7 +186,7 @@ class GroupNaming:
         timer.start()
         with process:
             result, last = _read(cast(IO[str], process.stderr), f"{_PREFIX}group {number}:")
-            self.said[key] = _outcome(process.wait(), result, last, words)
+            self.outcomes[key] = _outcome(process.wait(), result, last, words)
         timer.cancel()
 
 
@@ -253,11 +253,11 @@ class RecurringSounds:
         self._look()
         if self._summary is None:
             return _NOTHING
-        said = dict(self._naming.said)
-        state = self._seen, said, local_time(*moment).date()
+        outcomes = dict(self._naming.outcomes)
+        state = self._seen, outcomes, local_time(*moment).date()
         described = self._described.get(words.language)
         if described is None or described[0] != state:
-            shown = recurring_list(self._summary, self._looked, said, moment, words)
+            shown = recurring_list(self._summary, self._looked, outcomes, moment, words)
             described = self._described[words.language] = state, shown
         return described[1]
 
