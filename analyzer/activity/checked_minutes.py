@@ -45,21 +45,13 @@ _FOLLOWING = 3  # logs: a segment is in the one in which it ends
 
 
 class ReviewedLabels(NamedTuple):
-    """A reviewed span, with the labels in it and in the ten minutes before and after.
-
-    Attributes
-    ----------
-    model : str
-        SHA-256 of the model that labelled; empty if unknown.
-    undecided : Spans
-        Undecided spans: the labels there are neither right nor wrong.
-    """
+    """A reviewed span, with the labels in it and in the ten minutes before and after."""
 
     span: ReviewedSpan
     labels: Labelling
     true: Labelling
-    model: str
-    undecided: Spans = NONE
+    model: str  # SHA-256 of the model that labelled; empty if unknown
+    undecided: Spans = NONE  # the labels there are neither right nor wrong
 
 
 def count_unchanged(reviewed: Iterable[ReviewedLabels]) -> tuple[int, int]:
@@ -89,13 +81,7 @@ def read_reviewed_labels(  # noqa: PLR0913, PLR0917
     losses: list[str],
     chosen: Collection[str] = CHOICES,
 ) -> Iterator[ReviewedLabels]:
-    """Read the labels of the reviewed spans.
-
-    Parameters
-    ----------
-    start, end : int
-        Nanoseconds of UTC: time range of the logs to read.
-    """
+    """Read the labels of the reviewed spans in logs from start to end, in nanoseconds of UTC."""
     found: list[tuple[Path, ReviewedSpan]] = []
     for layer in logs.between(start, end, REVIEW_LAYER):
         log = log_of_layer(layer.path)
@@ -192,19 +178,13 @@ def labelling_of_marks(marks: Iterable[Mark]) -> Labelling:
 
 
 class ClassCheck(NamedTuple):
-    """Counts of correct and missed events of a class in the checked minutes.
-
-    Attributes
-    ----------
-    in_quiet : int
-        Missed events in minutes labelled as silent.
-    """
+    """Counts of correct and missed events of a class in the checked minutes."""
 
     labelled: int
     right: int
     true: int
     missed: int
-    in_quiet: int = 0
+    in_quiet: int = 0  # missed events in minutes labelled as silent
 
     @property
     def precision(self) -> tuple[float, float] | None:
@@ -218,10 +198,7 @@ class ClassCheck(NamedTuple):
     def miss_rate(self, weight: float) -> tuple[float, float] | None:
         """Return the 90 % interval of the miss rate; None without a true event.
 
-        Parameters
-        ----------
-        weight : float
-            Weight of a quiet minute, from `quiet_weight`.
+        The weight of a quiet minute is from `quiet_weight`.
         """
         if not self.true:
             return None
@@ -240,26 +217,15 @@ def _interval(some: float, total: float) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, eq=False)
 class CheckedMinutes:
-    """Events of each class in reviewed minutes drawn at random.
+    """Events of each class in reviewed minutes drawn at random."""
 
-    Attributes
-    ----------
-    labelled, right, true, missed : dict of str to np.ndarray [shape=(n,)], int64
-        By class, number of events that start in each minute: labelled events, labelled events that
-        are true in part, true events, and true events without any labelled part.
-    sounding, television : np.ndarray [shape=(n,)], bool
-        Whether the labels show any sound, and whether they resemble a television.
-    models : list of str
-        SHA-256 of the model that labelled each minute; empty if unknown.
-    """
-
-    labelled: dict[str, Int64]
-    right: dict[str, Int64]
-    true: dict[str, Int64]
-    missed: dict[str, Int64]
-    sounding: Bool
-    television: Bool
-    models: list[str]
+    labelled: dict[str, Int64]  # [shape=(n,)], by class: events that start in each minute
+    right: dict[str, Int64]  # [shape=(n,)]; labelled events that are true in part
+    true: dict[str, Int64]  # [shape=(n,)]
+    missed: dict[str, Int64]  # [shape=(n,)]; true events without any labelled part
+    sounding: Bool  # [shape=(n,)]; whether the labels show any sound
+    television: Bool  # [shape=(n,)]; whether the labels resemble a television
+    models: list[str]  # SHA-256 of the model that labelled each minute; empty if unknown
 
     def __len__(self) -> int:
         return len(self.models)
@@ -293,12 +259,9 @@ class CheckedMinutes:
         return ClassCheck(*(int(counts.sum()) for counts in sums))
 
     def rates(self, name: str, share: float) -> CheckedRates | None:
-        """Return the rates of a class; None if too few minutes were checked.
+        """Return the rates of a class of a share, 0 to 1, of all labelled events.
 
-        Parameters
-        ----------
-        share : float
-            Share of the class among all labelled events, 0 to 1.
+        None if too few minutes were checked.
         """
         kept = self._kept(name)
         none = np.zeros(len(self), np.int64)
@@ -312,14 +275,9 @@ class CheckedMinutes:
 def read_checked_minutes(
     logs: HomeLogs, labelling: str, start: int, end: int, losses: list[str]
 ) -> CheckedMinutes:
-    """Read the reviewed minutes that were drawn at random.
+    """Read the reviewed minutes drawn at random between start and end, in nanoseconds of UTC.
 
     The true labels are the reviewed labels, overlaid with the marks.
-
-    Parameters
-    ----------
-    start, end : int
-        Nanoseconds of UTC: minutes that start before or end after them are skipped.
     """
     reviewed = read_reviewed_labels(logs, labelling, start, end, losses, {RANDOM})
     return checked_minutes(one for one in reviewed if start <= one.span.start < end)
@@ -387,17 +345,9 @@ _MOST = 7  # days: more would cost time and hardly change the share
 def quiet_weight(logs: HomeLogs, labelling: str, checked: Bool) -> float:
     """Return the number of quiet minutes per checked one, relative to minutes with sound.
 
-    This is the weight of Horvitz and Thompson, over the last seven days with checked minutes.
-
-    Parameters
-    ----------
-    checked : np.ndarray [shape=(n,)], bool
-        Whether anything sounds in each checked minute.
-
-    Returns
-    -------
-    float
-        1 if only one kind of minutes was checked, or exists.
+    `checked` [shape=(n,)] says whether anything sounds in each checked minute. This is the weight
+    of Horvitz and Thompson, over the last seven days with checked minutes; 1 if only one kind of
+    minutes was checked, or exists.
     """
     kinds = [sounding for day in _days(logs, labelling) for sounding in _sounding(logs, *day)]
     sounding = np.concatenate([*kinds, np.empty(0, bool)])

@@ -42,31 +42,17 @@ from hearthlog.schemas.arrays import Bool, Int64
 
 @dataclass(frozen=True)
 class HomeMinutes:
-    """Minutes covered by at least one microphone.
+    """Minutes covered by at least one microphone; by class, all except silence."""
 
-    Attributes
-    ----------
-    starts : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    sounding, television, gone_through : np.ndarray [shape=(n,)], bool
-        Whether the labels have any sound, or a television-like sound; whether a person reviewed
-        the complete minute.
-    reviewed : Spans
-        Reviewed by a person, at all microphones.
-    labelled, corrected, certain : dict of str to np.ndarray [shape=(n,)], int64
-        By class except silence, the number of events that begin in each minute: labelled events
-        outside reviewed spans; all events after corrections; corrected events that begin in
-        reviewed spans.
-    """
-
-    starts: Int64
-    sounding: Bool
-    television: Bool
-    gone_through: Bool
-    reviewed: Spans
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC
+    sounding: Bool  # [shape=(n,)]; whether the labels have any sound
+    television: Bool  # [shape=(n,)]; whether they have a television-like sound
+    gone_through: Bool  # [shape=(n,)]; whether a person reviewed the complete minute
+    reviewed: Spans  # by a person, at all microphones
+    # [shape=(n,)]; events that begin in each minute, outside of reviewed spans
     labelled: dict[str, Int64]
-    corrected: dict[str, Int64]
-    certain: dict[str, Int64]
+    corrected: dict[str, Int64]  # [shape=(n,)]; all events after corrections
+    certain: dict[str, Int64]  # [shape=(n,)]; corrected events that begin in reviewed spans
 
     def between(self, spans: Spans) -> "HomeMinutes":
         """Return the minutes that begin in some spans."""
@@ -91,13 +77,7 @@ class HomeMinutes:
         )
 
     def counted(self, name: str, starts: Int64) -> Int64:
-        """Return the events of a class that `count` counts.
-
-        Parameters
-        ----------
-        starts : np.ndarray [shape=(n,)], int64
-            Event starts within these minutes.
-        """
+        """Return the events of a class, by starts within these minutes, that `count` counts."""
         if name not in SET_APART:
             return starts
         beside = np.isin(starts // MINUTE * MINUTE, self.starts[self.television])
@@ -126,14 +106,9 @@ class HomeMinutes:
 def home_minutes(
     labels: Labelling, gone_through: Sequence[Spans], coverage: Spans, events: Mapping[str, Int64]
 ) -> HomeMinutes:
-    """Count the events that begin in each minute with any coverage.
+    """Count the events that begin in each minute with coverage by at least one microphone.
 
-    Parameters
-    ----------
-    coverage : Spans
-        Covered by at least one microphone.
-    events : mapping of str to np.ndarray [shape=(n,)], int64
-        By class except silence, event starts after corrections.
+    `events` has the event starts of each class except silence, after corrections.
     """
     first, last = int(coverage.starts[0]) // MINUTE, -(-int(coverage.ends[-1]) // MINUTE)
     edges = np.arange(first, last + 1) * MINUTE
@@ -190,13 +165,7 @@ class HomeMetrics:
     rates: dict[str, CheckedRates]  # by class, from the checked minutes
 
     def between(self, start: int, end: int) -> "HomeMetrics":
-        """Return the metrics of a time span.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC; events belong to the span in which they begin.
-        """
+        """Return the metrics of a span in nanoseconds of UTC; events belong where they begin."""
         return HomeMetrics(
             self.classes,
             cut(self.coverage, start, end),
@@ -209,32 +178,17 @@ class HomeMetrics:
         )
 
     def events_in(self, name: str, span: Spans) -> Int64:
-        """Return the event starts of a class in a time span, in nanoseconds of UTC.
-
-        Parameters
-        ----------
-        name : str
-            Class name; classes without events, such as silence, return an empty array.
-        """
+        """Return the event starts of a class, if any, in a time span, in nanoseconds of UTC."""
         starts = self.events.get(name, NONE.starts)
         return starts[(starts >= span.starts[0]) & (starts < span.ends[0])]
 
 
 def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetrics:
-    """Combine the microphones of a home.
+    """Combine the one or more microphones of a home.
 
-    Parameters
-    ----------
-    data : HomeData
-        With segments and classes of at least one microphone.
-    checks : CheckedMinutes, optional
-        Randomly drawn, checked minutes of the home.
-
-    Returns
-    -------
-    HomeMetrics
-        A span is silent if every microphone labels silence; segments of one class at most ten
-        seconds apart, from any microphones, are one event.
+    A span is silent if every microphone labels silence; segments of one class at most ten seconds
+    apart, from any microphones, are one event. `checks` are randomly drawn, checked minutes of the
+    home.
     """
     labels = _together(data.segments.values())
     everything = joined(labels.starts, labels.ends)
@@ -315,13 +269,7 @@ class DayMetrics:
         return min(shares) >= MOST
 
     def share_of(self, name: str) -> float:
-        """Return the share of the day covered for a class, 0 to 1.
-
-        Parameters
-        ----------
-        name : str
-            Class name; 0 for a class that no model of the home has.
-        """
+        """Return the share of the day covered for a class, 0 to 1; 0 if no model has it."""
         return _share(self.home.listened.get(name, NONE), self.span)
 
     def minutes(self, name: str) -> Duration | None:
@@ -330,23 +278,11 @@ class DayMetrics:
         return _if_known(minutes, self.share_of(name))
 
     def events(self, name: str) -> Int64:
-        """Return the event starts of a class on this day, in nanoseconds of UTC.
-
-        Parameters
-        ----------
-        name : str
-            Class name; classes without events, such as silence, return an empty array.
-        """
+        """Return the event starts of a class, if any, on this day, in nanoseconds of UTC."""
         return self.home.events_in(name, self.span)
 
     def night_events(self, name: str) -> Int64:
-        """Return the event starts that `night_count` counts for a class, in nanoseconds of UTC.
-
-        Parameters
-        ----------
-        name : str
-            Class name; classes without events, such as silence, return an empty array.
-        """
+        """Return the event starts that `night_count` counts for a class, in nanoseconds of UTC."""
         return self.home.minutes.counted(name, self.home.events_in(name, self.night))
 
     def count(self, name: str) -> Count | None:
@@ -442,13 +378,7 @@ class DayMetrics:
 
 
 def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> DayMetrics:
-    """Return the figures of one day of a home.
-
-    Parameters
-    ----------
-    day : date
-        Local date; its night is from 22:00 on the day before to 07:00.
-    """
+    """Return the figures of a local day; its night is from 22:00 on the day before to 07:00."""
     start, end = day_span(day, zone)
     night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))
     span = one(start, end)

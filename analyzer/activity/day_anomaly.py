@@ -45,50 +45,29 @@ _SHORTEST, _LONGEST, _MOST_HOURS = 2, 6, 3
 
 @dataclass(frozen=True)
 class Baseline:
-    """Usual range of figures; each array has shape (..., f), float64.
+    """Usual range of figures; each array has shape (..., f)."""
 
-    Attributes
-    ----------
-    low, middle, high : np.ndarray
-        Edges and median: one day in ten is below the low edge, one in ten above the high edge.
-    below, above : np.ndarray
-        Distances from the middle to the edges, never exactly 0.
-    """
-
-    low: Float64
-    middle: Float64
-    high: Float64
-    below: Float64
-    above: Float64
+    low: Float64  # edge: one day in ten is below
+    middle: Float64  # median
+    high: Float64  # edge: one day in ten is above
+    below: Float64  # distance from the middle to the edge, never exactly 0
+    above: Float64  # likewise
     weekend: Float64
 
     def deviations(self, row: Float64, weekend: Bool) -> Float64:
-        """Return the deviations of a day's figures from the middle, in units of the edge distance.
+        """Return deviations of figures from the middle, in edge distances.
 
-        Parameters
-        ----------
-        row : np.ndarray [shape=(..., f)], float64
-            As from `rooted`.
-        weekend : np.ndarray [shape=(...)], bool
-
-        Returns
-        -------
-        np.ndarray [shape=(..., f)], float64
-            Positive for more, or later; NaN for missing figures.
+        They are positive for more, or later. The row [shape=(..., f)] is as from `rooted`; NaN
+        marks a missing figure.
         """
         away = row - self.middle - weekend[..., np.newaxis] * self.weekend
         return away / np.where(away > 0, self.above, self.below)
 
 
 def fit_baseline(table: Float64, weekend: Bool, figures: Sequence[DayFigure]) -> Baseline:
-    """Fit the usual range of figures.
+    """Fit the usual range of figures of n days [shape=(..., n, f)], as from `rooted`.
 
-    Parameters
-    ----------
-    table : np.ndarray [shape=(..., n, f)], float64
-        Figures of n days, as from `rooted`; NaN for missing figures.
-    weekend : np.ndarray [shape=(..., n)], bool
-        Whether a day is at a weekend.
+    A missing figure is NaN; `weekend` has shape (..., n).
     """
     weekend = weekend[..., np.newaxis]
     offset = _weekend(table, weekend)
@@ -123,18 +102,9 @@ def _middle(table: Float64) -> tuple[Float64, Float64, Int64]:
 
 
 def quantile(table: Float64, share: float) -> Float64:
-    """Return a quantile over the days, without missing values.
+    """Return a quantile [shape=(..., f)], `share` 0 to 1, over the days [shape=(..., n, f)].
 
-    Parameters
-    ----------
-    table : np.ndarray [shape=(..., n, f)], float64
-    share : float
-        0 to 1.
-
-    Returns
-    -------
-    np.ndarray [shape=(..., f)], float64
-        NaN without any value.
+    Missing values are left out; NaN without any value.
     """
     ascending = np.sort(table, axis=-2)  # NaN sorts last
     days = np.isfinite(table).sum(axis=-2, keepdims=True)
@@ -146,17 +116,9 @@ def quantile(table: Float64, share: float) -> Float64:
 
 
 def regular_hours(days: Sequence[DayProfile], classes: Sequence[str]) -> list[DayFigure]:
-    """Find the hours of the day with sound of a class on nine of ten days.
+    """Find the hours of the day with sound of a class of the half hours on nine of ten days.
 
-    Parameters
-    ----------
-    classes : sequence of str
-        Classes of the half hours.
-
-    Returns
-    -------
-    list of DayFigure
-        At most three for each class, extended by half an hour before and after.
+    They are at most three for each class, extended by half an hour before and after.
     """
     found = []
     for row, name in enumerate(classes):
@@ -199,17 +161,9 @@ def _regular(minutes: Float64, width: int) -> tuple[Float64, Float64]:
 def figure_table(
     days: Sequence[DayProfile], classes: Sequence[str], hours: Sequence[DayFigure]
 ) -> Float64:
-    """Return the figures of days as rows: profile figures, then regular hours.
+    """Return the figures of days as rows [shape=(n, f)]: profile figures, then regular hours.
 
-    Parameters
-    ----------
-    classes : sequence of str
-        Classes of the half hours.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, f)], float64
-        NaN for missing figures.
+    `classes` are those of the half hours; a missing figure is NaN.
     """
     places = [(classes.index(each.what), *(each.hours or (0, BINS))) for each in hours]
     return np.array(
@@ -218,12 +172,7 @@ def figure_table(
 
 
 def rooted(table: Float64, figures: Sequence[DayFigure]) -> Float64:
-    """Return a table with the square root of counts and lengths.
-
-    Parameters
-    ----------
-    table : np.ndarray [shape=(n, f)], float64
-    """
+    """Return a table [shape=(n, f)] with the square root of counts and lengths."""
     clocks = np.array([figure.kind == CLOCK for figure in figures])
     return np.where(clocks, table, np.sqrt(np.where(clocks, 0, table)))
 
@@ -262,21 +211,10 @@ def routine_of(figure: DayFigure) -> str:
 def routine_scores(
     own: Float64, others: Float64, figures: Sequence[DayFigure]
 ) -> tuple[float, Float64]:
-    """Score the anomaly of a day: the mean of its three most deviating routines.
+    """Score the anomaly of a day, and of other days: mean of the three most deviating routines.
 
-    Parameters
-    ----------
-    own : np.ndarray [shape=(f,)], float64
-        Deviations of the figures of a day; NaN for missing figures.
-    others : np.ndarray [shape=(n, f)], float64
-        Deviations of other days, which give the widths of routines.
-
-    Returns
-    -------
-    score : float
-        Score of the day.
-    scores : np.ndarray [shape=(n,)], float64
-        Scores of the other days.
+    `own` [shape=(f,)] and `others` [shape=(n, f)] have the deviations, NaN for missing figures; the
+    other days give the widths of routines.
     """
     groups = _groups(figures)
     means = np.array([_mean(np.vstack([others, own])[:, rows] * sign) for rows, sign in groups]).T
@@ -324,45 +262,26 @@ _DIFFERS = {1: 1.5, SPAN: 1.0}
 
 
 class FigureDifference(NamedTuple):
-    """A figure outside its usual range.
-
-    Attributes
-    ----------
-    value : float
-        Of the day, or the median of three days: event count, minutes, or minutes since midnight.
-    low, middle, high : float
-        Usual range: one day in ten is below `low`, one in ten above `high`.
-    deviation : float
-        From the middle, in units of the edge distance; positive for more, or later.
-    """
+    """A figure outside its usual range."""
 
     figure: DayFigure
+    # event count, minutes, or minutes since midnight; of the day, or median of three days
     value: float
-    low: float
+    low: float  # one day in ten is below
     middle: float
-    high: float
-    deviation: float
+    high: float  # one day in ten is above
+    deviation: float  # from the middle, in units of the edge distance; positive for more, or later
 
 
 @dataclass(frozen=True)
 class DayAnomaly:
-    """Anomaly of a day.
-
-    Attributes
-    ----------
-    once_in : float
-        Return period of such a deviation in days, 1 to 365.
-    span : int
-        Days that the differences cover: the day alone, 1, or with the two previous days, 3.
-    days : int
-        Number of days in the comparison.
-    """
+    """Anomaly of a day."""
 
     day: date
-    once_in: float
-    span: int
+    once_in: float  # return period of such a deviation in days, 1 to 365
+    span: int  # days that the differences cover: 1, or 3 with the two previous days
     differences: Sequence[FigureDifference]
-    days: int
+    days: int  # number of days in the comparison
 
 
 class Routines:
@@ -375,11 +294,8 @@ class Routines:
     def judge(self, day: date) -> DayAnomaly | None:
         """Compute the anomaly of a day.
 
-        Returns
-        -------
-        DayAnomaly or None
-            None if less than half of its figures are present, or there are fewer than 14 days to
-            compare with that have as many.
+        None if less than half of its figures are present, or there are fewer than 14 days to
+        compare with that have as many.
         """
         span = self._between(day, SPAN - 1, 0)
         earlier = self.earlier(day)
@@ -404,27 +320,14 @@ class Routines:
 
 
 class Compared(NamedTuple):
-    """Days with their deviations from the baseline.
+    """Days with their deviations from the baseline."""
 
-    Attributes
-    ----------
-    figures : sequence of DayFigure
-        Present on at least half of the earlier days.
-    rows : np.ndarray [shape=(k, f)], float64
-        Figures of the days, as from `rooted`; NaN for missing figures.
-    weekend : np.ndarray [shape=(k,)], bool
-    own : np.ndarray [shape=(k, f)], float64
-        Deviations of the days.
-    others : np.ndarray [shape=(n, f)], float64
-        Deviations of each earlier day from the other earlier days.
-    """
-
-    figures: Sequence[DayFigure]
+    figures: Sequence[DayFigure]  # present on at least half of the earlier days
     usual: Baseline
-    rows: Float64
-    weekend: Bool
-    own: Float64
-    others: Float64
+    rows: Float64  # [shape=(k, f)], as from `rooted`; NaN for missing figures
+    weekend: Bool  # [shape=(k,)]
+    own: Float64  # [shape=(k, f)]; deviations of the days
+    others: Float64  # [shape=(n, f)]; deviations of each earlier day from the others
 
 
 def compare(
@@ -433,17 +336,7 @@ def compare(
     figures: Sequence[DayFigure],
     classes: Sequence[str],
 ) -> Compared:
-    """Compare days with earlier days.
-
-    Parameters
-    ----------
-    span : sequence of DayProfile
-        At least one.
-    earlier : sequence of DayProfile
-        At least 14.
-    classes : sequence of str
-        Classes of the half hours.
-    """
+    """Compare one or more days with at least 14 earlier days; `classes` are of the half hours."""
     hours = regular_hours(earlier, classes)
     every = [*figures, *hours]
     table = rooted(figure_table([*earlier, *span], classes, hours), every)
@@ -458,13 +351,7 @@ def compare(
 
 
 def judge(compared: Compared, day: date) -> DayAnomaly:
-    """Return the anomaly of the last of some days.
-
-    Parameters
-    ----------
-    compared : Compared
-        The day and the days just before it.
-    """
+    """Return the anomaly of the last of successive days."""
     # Halved, because either may be rare by chance.
     alone, together = (
         float(np.clip(rarity(own, compared) / 2, 1, LONGEST))

@@ -46,13 +46,7 @@ _QUIET_PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
 
 
 def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spans:
-    """Find the longest quiet span from 07:00 to 22:00.
-
-    Returns
-    -------
-    Spans
-        A single span; empty without any sound in that time.
-    """
+    """Find the longest quiet span from 07:00 to 22:00; empty without any sound in that time."""
     waking = one(at_hour(day, MORNING, zone), at_hour(day, EVENING, zone))
     quiet = without(common(coverage, waking), sound)
     if not len(quiet.starts):
@@ -62,13 +56,7 @@ def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spa
 
 
 def stretches(sound: Spans, night: Spans) -> int:
-    """Count the stretches of sound in a night, separated by ten quiet minutes.
-
-    Returns
-    -------
-    int
-        Number of stretches with at least half a minute of sound.
-    """
+    """Count the stretches of half a minute of sound or more in a night, ten quiet minutes apart."""
     inside = common(sound, night)
     found = joined(*inside, _QUIET_PAUSE)
     if not len(found.starts):
@@ -93,54 +81,30 @@ _BUSY, _HALF_HOUR = 5, 30 * MINUTE  # number of sounds that start in a busy half
 
 
 class DayFigure(NamedTuple):
-    """One figure of a day.
-
-    Attributes
-    ----------
-    kind : str
-        `COUNT`, `LENGTH` (in minutes) or `CLOCK` (minutes since midnight).
-    night : bool
-        Whether it covers the night, 22:00 to 07:00, rather than the day.
-    hours : (int, int) or None
-        Range of half hours of the day, end exclusive; None for the complete day.
-    """
+    """One figure of a day."""
 
     what: str
-    kind: str
-    night: bool = False
+    kind: str  # `COUNT`, `LENGTH` (in minutes) or `CLOCK` (minutes since midnight)
+    night: bool = False  # of the night, 22:00 to 07:00, rather than the day
+    # range of half hours, end exclusive; None for the complete day
     hours: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
 class HomeSegments:
-    """Labelled segments of a home.
+    """Labelled segments of a home."""
 
-    Attributes
-    ----------
-    labels : Labelling
-        Of all microphones, sorted by start, with one name per class; segments may overlap.
-    """
-
-    labels: Labelling
+    labels: Labelling  # of all microphones by start, one name per class; may overlap
     listened: Mapping[str, Spans]
 
 
 @dataclass(frozen=True)
 class DayProfile:
-    """Figures and half hours of a day.
-
-    Attributes
-    ----------
-    values : np.ndarray [shape=(f,)], float64
-        Values of the `figures` of its `Profiles`; NaN for missing figures.
-    half_hours : np.ndarray [shape=(c, 48)], float64
-        Minutes in each half hour of the day, for each class of its `Profiles`; NaN if
-        missing.
-    """
+    """Figures and half hours of a day; missing ones are NaN."""
 
     day: date
-    values: Float64
-    half_hours: Float64
+    values: Float64  # [shape=(f,)]; of the `figures` of its `Profiles`
+    half_hours: Float64  # [shape=(c, 48)]; minutes, for each class of its `Profiles`
 
     @property
     def is_known(self) -> bool:
@@ -149,19 +113,9 @@ class DayProfile:
 
 
 class Profiles:
-    """Computes profiles of the days of a home.
+    """Computes profiles of days, with `figures`, and half hours of `classes`, of each day.
 
-    Parameters
-    ----------
-    night_after : bool
-        Whether the night after a day belongs to it, rather than the night before.
-
-    Attributes
-    ----------
-    figures : list of DayFigure
-        Of each day.
-    classes : list of str
-        Classes with half hours in the profile.
+    With `night_after`, the night after a day belongs to it, rather than the night before.
     """
 
     def __init__(self, home: HomeSegments, zone: tzinfo, *, night_after: bool) -> None:

@@ -40,21 +40,13 @@ _FIELDS = "header.stamp", "label", "probabilities", "values"
 
 
 class DoubtfulSound(NamedTuple):
-    """An event of which the model is not sure.
-
-    Attributes
-    ----------
-    level_db : float
-        Level of its loudest second above the quiet around; minus infinity if unknown.
-    shares : mapping of str to float
-        Mean probability of each of `WORRYING` that the model has.
-    """
+    """An event of which the model is not sure."""
 
     label: str
     start: int
     end: int
-    level_db: float
-    shares: Mapping[str, float]
+    level_db: float  # of its loudest second above the quiet around; -inf if unknown
+    shares: Mapping[str, float]  # mean probability of each of `WORRYING` that the model has
 
     @property
     def is_loud(self) -> bool:
@@ -116,19 +108,10 @@ def _in_order(parts: Sequence[Labelling]) -> Labelling:
 def read_doubtful_sounds(
     logs: Iterable[tuple[Path, int, int]], topics: tuple[str, str], events: Labelling
 ) -> list[DoubtfulSound]:
-    """Read level and probabilities of doubtful events, of at most a hundred.
+    """Read level and probabilities of at most a hundred doubtful events, in time order.
 
-    Parameters
-    ----------
-    logs : iterable of (Path, int, int)
-        Logs with start and end, in nanoseconds of UTC; layers with the labels, too.
-    topics : (str, str)
-        Of the labels, and of the features.
-
-    Returns
-    -------
-    list of DoubtfulSound
-        In time order. Events without readable labels are left out.
+    Each log, or layer with the labels, has start and end in nanoseconds of UTC; topics are of the
+    labels and of the features. Events without readable labels are left out.
     """
     logs, found = list(logs), []
     for row in np.sort(np.argsort(events.confidences, kind="stable")[:_MOST]).tolist():

@@ -40,37 +40,18 @@ def events_of(labels: Labelling, name: str) -> Spans:
 
 
 def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:
-    """Return which minutes have any sound.
-
-    Parameters
-    ----------
-    edges : np.ndarray [shape=(n + 1,)], int64
-        Edges of the minutes.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], bool
-    """
+    """Return which of the minutes between n + 1 edges have any sound."""
     loud = labels.labels != SILENCE
     return lengths(joined(labels.starts[loud], labels.ends[loud]), edges) > 0
 
 
 def television_minutes(labels: Labelling, edges: Int64) -> Bool:
-    """Return which minutes resemble a television, a radio or company.
+    """Return which of the minutes between n + 1 edges resemble a television, a radio or company.
 
     In the ten minutes before and after, either talking, music or laughing sounds in more than two
     of five minutes; or two sounds a minute start, and sounds other than coughing, crying and
     shouting fill a tenth of the time. The classes of these do not matter, because a model may take
     a television for anything.
-
-    Parameters
-    ----------
-    edges : np.ndarray [shape=(n + 1,)], int64
-        Edges of successive minutes.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], bool
     """
     minutes = 2 * AROUND + 1
 
@@ -90,28 +71,13 @@ def _around(amounts: Int64) -> Int64:
 
 
 def events_by_minute(events: Spans, edges: Int64) -> Int64:
-    """Count the events that start in each minute.
-
-    Parameters
-    ----------
-    edges : np.ndarray [shape=(n + 1,)], int64
-        Edges of the minutes.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], int64
-    """
+    """Count the events that start in each of the minutes between n + 1 edges."""
     places = np.searchsorted(events.starts, edges)
     return np.diff(places)
 
 
 def overlapping(events: Spans, others: Spans) -> Bool:
-    """Return which events overlap one of others.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], bool
-    """
+    """Return which events overlap one of others."""
     after = np.searchsorted(others.ends, events.starts, side="right")
     begins = np.append(others.starts, np.iinfo(np.int64).max)[after]
     overlaps: Bool = begins < events.ends
@@ -131,16 +97,10 @@ _PRECISION = 1e-15  # of a share of a beta distribution
 
 
 class Strata(NamedTuple):
-    """Label counts of a class in quiet minutes and in minutes with sound.
+    """Label counts of a class in quiet minutes and in minutes with sound."""
 
-    Attributes
-    ----------
-    quiet, sounding : int
-        Number of minutes without and with sound.
-    """
-
-    quiet: int = 0
-    sounding: int = 0
+    quiet: int = 0  # minutes
+    sounding: int = 0  # minutes
     labelled: int = 0
 
     def plus(self, other: Self) -> "Strata":
@@ -152,43 +112,21 @@ NO_MINUTES = Strata()
 
 
 def strata_of(labelled: Int64, sounding: Bool) -> Strata:
-    """Count quiet minutes and minutes with sound, and the events in them.
-
-    Parameters
-    ----------
-    labelled : np.ndarray [shape=(n,)], int64
-        Labelled events of a class.
-    sounding : np.ndarray [shape=(n,)], bool
-        Whether anything sounds.
-    """
+    """Count quiet minutes and minutes with sound, and the labelled events of a class in them."""
     return Strata(int((~sounding).sum()), int(sounding.sum()), int(labelled.sum()))
 
 
 @dataclass(frozen=True, eq=False)
 class CheckedRates:
-    """Rates of correct labelled events and of missed events per minute of a class.
+    """Rates of correct labelled events and of missed events per minute of a class."""
 
-    Attributes
-    ----------
-    right : np.ndarray [shape=(draws,)], float64
-        Share of correct labelled events, drawn from its distribution.
-    missed : np.ndarray [shape=(draws, 2)], float64
-        Missed events per minute, in quiet minutes and in minutes with sound.
-    """
-
-    right: Float64
-    missed: Float64
+    right: Float64  # [shape=(draws,)]; drawn shares of correct labelled events
+    missed: Float64  # [shape=(draws, 2)]; in quiet minutes and in minutes with sound
     minutes: int
     occurs: bool
 
     def range_of(self, strata: Strata) -> tuple[int, int]:
-        """Return the 90 % range of the number of events.
-
-        Parameters
-        ----------
-        strata : Strata
-            Of unchecked minutes.
-        """
+        """Return the 90 % range of the number of events in unchecked minutes."""
         rng = np.random.default_rng(_SEED)
         minutes = np.array([strata.quiet, strata.sounding], np.float64)
         totals = rng.binomial(strata.labelled, self.right) + rng.poisson(self.missed @ minutes)
@@ -199,26 +137,15 @@ class CheckedRates:
 def checked_rates(
     labelled: Int64, true: Int64, sounding: Bool, share: float
 ) -> CheckedRates | None:
-    """Draw rates of a class, given checked minutes.
+    """Draw rates of a class, given checked minutes [shape=(n,)]; None for fewer than five.
 
     Hot deck with a Bayesian prior: minutes are resampled with replacement, because events come in
     bouts; then the share of right events is drawn from a beta distribution, and rates of missed
     events from gamma distributions. Within quiet minutes and within minutes with sound, checked
     minutes must be drawn at random, but the sampled share of the two kinds may differ.
 
-    Parameters
-    ----------
-    labelled, true : np.ndarray [shape=(n,)], int64
-        Labelled and true events that start in each checked minute.
-    sounding : np.ndarray [shape=(n,)], bool
-        Whether labels show any sound.
-    share : float
-        Share of the class among all labelled events, 0 to 1.
-
-    Returns
-    -------
-    CheckedRates or None
-        None for fewer than five minutes.
+    `labelled` and `true` events start in each minute; `share` is that of the class among all
+    labelled events, 0 to 1.
     """
     if len(labelled) < FEWEST:
         return None
@@ -240,16 +167,10 @@ def checked_rates(
 
 
 def beta_quantile(a: float, b: float, share: float) -> float:
-    """Return a quantile of a beta distribution, like `scipy.special.betaincinv`.
+    """Return a quantile of a beta distribution (a, b > 0), like `scipy.special.betaincinv`.
 
-    The recorder's machine uses this for label precision, and has no scipy.
-
-    Parameters
-    ----------
-    a, b : float
-        Parameters of the distribution, more than 0.
-    share : float
-        Probability below the quantile, 0 to 1.
+    `share` is the probability below it, 0 to 1. The recorder's machine uses this for label
+    precision, and has no scipy.
     """
     low, high = 0.0, 1.0
     while low < (middle := (low + high) / 2) < high:

@@ -19,24 +19,14 @@ _MOST_AGAIN = 50  # segments that a recorder may write twice after its disk was 
 
 
 class SoundEvent(NamedTuple):
-    """Segments of one class with at most ten seconds between them.
-
-    Attributes
-    ----------
-    start, end : int
-        In nanoseconds of UTC; the end may still grow.
-    confidence : float
-        Highest of the segments.
-    seconds : float
-        Total length of the segments.
-    """
+    """Segments of one class with at most ten seconds between them."""
 
     microphone: str
     label: str
-    start: int
-    end: int
-    confidence: float
-    seconds: float
+    start: int  # in nanoseconds of UTC
+    end: int  # likewise; may still grow
+    confidence: float  # highest of the segments
+    seconds: float  # total length of the segments
 
     @property
     def id(self) -> str:
@@ -45,13 +35,7 @@ class SoundEvent(NamedTuple):
 
 
 class EventRecord:
-    """Recent events of one class of a microphone.
-
-    Attributes
-    ----------
-    current : SoundEvent or None
-        Event of the last segment, which the next segment may extend.
-    """
+    """Recent events of one class of a microphone; the next segment may extend `current`."""
 
     def __init__(self, microphone: str, label: str) -> None:
         self._microphone = microphone
@@ -61,13 +45,7 @@ class EventRecord:
         self._segments: deque[tuple[int, int]] = deque(maxlen=_MOST_AGAIN)  # the last ones
 
     def push(self, start: int, end: int, confidence: float) -> bool:
-        """Add a segment, in log order; return whether it begins a new event.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC.
-        """
+        """Add a segment in log order (nanoseconds of UTC); return whether it begins a new event."""
         if (start, end) in self._segments:  # written again after a failed write
             return False
         self._segments.append((start, end))
@@ -112,12 +90,8 @@ class ActiveClasses:
     """Currently active classes: those with at least eight labels in a second.
 
     The result does not depend on how labels are split over calls. Labels older than a second plus
-    the hold time have no effect.
-
-    Attributes
-    ----------
-    time : int
-        Time of the newest label, in nanoseconds of UTC; 0 before the first.
+    the hold time have no effect. `time` is that of the newest label, in nanoseconds of UTC; 0
+    before the first.
     """
 
     def __init__(self, classes: Sequence[str]) -> None:
@@ -127,13 +101,7 @@ class ActiveClasses:
         self._last_labels = np.empty(0, np.int64)  # less than a second of them
 
     def push(self, labels: Sequence[str], times: Int64) -> None:
-        """Add labels.
-
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            When the labels became available, in nanoseconds of UTC.
-        """
+        """Add labels, with the times when they became available, in nanoseconds of UTC."""
         if not len(times):
             return
         if times[0] < self.time:  # the clock was set back: earlier labels are not recent

@@ -78,24 +78,13 @@ def read_home(
     close: tuple[int, int],
     progress: Progress = ignore_progress,
 ) -> HomeData:
-    """Read the data of a report.
+    """Read the data of a report, with segments from log time `since` (nanoseconds of UTC) on.
 
-    Parameters
-    ----------
-    since : int
-        First log time of the segments, in nanoseconds of UTC.
-    close : (int, int)
-        Start and end of the reported days, in nanoseconds of UTC; gaps and troubles are read only
-        for these days.
-    progress : callable, optional
-        Receives the share of the logs read, 0 to 1.
+    Gaps and troubles are read only for the reported days, `close` (start and end, in nanoseconds of
+    UTC). `progress` receives the share of the logs read, 0 to 1.
 
-    Raises
-    ------
-    DataError
-        If the labelling does not exist, or has no label in these days.
-    LogError
-        If segments overlap, begin before 1970, are of different types, or have too many labels.
+    Raise `DataError` if the labelling does not exist, or has no label in these days; `LogError` if
+    segments overlap, begin before 1970, are of different types, or have too many labels.
     """
     layer = _layer(logs, labelling)
     home = HomeData(losses=list(logs.losses))
@@ -309,10 +298,7 @@ def read_scenario_minutes(
 ) -> ScenarioMinutes:
     """Read the duration of each scenario class, over all microphones.
 
-    Parameters
-    ----------
-    days : sequence of (int, int)
-        Starts and ends, in nanoseconds of UTC, in time order.
+    `days` have starts and ends in nanoseconds of UTC, in time order.
     """
     found: dict[str, list[Counter[str]]] = {}
     left_out = OF_EVERY_SCENARIO.union(hidden)

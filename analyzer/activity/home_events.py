@@ -31,32 +31,16 @@ _BEFORE = 3600 * NANOSECONDS  # an event that goes on at midnight, and a televis
 
 
 class HomeEvent(NamedTuple):
-    """Segments of one class, from any microphones, with at most ten seconds between them.
-
-    Attributes
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    seconds : float
-        Total length of the segments.
-    confidence : float
-        Highest of the segments; 1 for a class that a person marked.
-    microphones : tuple of str
-        Names of those with a segment, sorted.
-    reviewed : bool
-        Whether a person has gone through the start of the event, at all microphones.
-    television : bool
-        Whether something like a television sounded: a report does not count the event.
-    """
+    """Segments of one class, from any microphones, with at most ten seconds between them."""
 
     label: str
-    start: int
-    end: int
-    seconds: float
-    confidence: float
-    microphones: tuple[str, ...]
-    reviewed: bool
-    television: bool
+    start: int  # in nanoseconds of UTC
+    end: int  # likewise
+    seconds: float  # total length of the segments
+    confidence: float  # highest of the segments; 1 for a class that a person marked
+    microphones: tuple[str, ...]  # with a segment, sorted
+    reviewed: bool  # whether a person reviewed its start, at all microphones
+    television: bool  # beside something like a television; no report counts it
 
 
 class EventTotal(NamedTuple):
@@ -101,20 +85,10 @@ def marked_classes(data: HomeData) -> list[str]:
 def home_events(
     data: HomeData, metrics: HomeMetrics, classes: Sequence[str], start: int, end: int
 ) -> list[HomeEvent]:
-    """List the events of some classes that begin in a time span.
+    """List the events of classes except silence that begin in a span, end exclusive, by start.
 
-    Parameters
-    ----------
-    classes : sequence of str
-        Silence has no events.
-    start, end : int
-        In nanoseconds of UTC, the end exclusive.
-
-    Returns
-    -------
-    list of HomeEvent
-        Sorted by start. Of each class, as many as the count of a report and those beside a
-        television together.
+    Times are nanoseconds of UTC. Of each class, there are as many as the count of a report and
+    those beside a television together.
     """
     found = [
         event

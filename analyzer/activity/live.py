@@ -50,14 +50,9 @@ class PendingSegment:
     """The open segment of a microphone, after its last written segment.
 
     A segment is written when another class follows, so the time after the last written segment has
-    a single class, whatever individual labels are. The most frequent label gives the class.
-
-    Attributes
-    ----------
-    start : int
-        End of the last segment, or of a later gap, in nanoseconds of UTC; 0 before the first.
-    last : int
-        Time of the newest label, in nanoseconds of UTC; 0 before the first.
+    a single class, whatever individual labels are. The most frequent label gives the class. `start`
+    is the end of the last segment, or of a later gap; `last` is the time of the newest label; both
+    in nanoseconds of UTC, 0 before the first.
     """
 
     def __init__(self) -> None:
@@ -117,14 +112,9 @@ def is_of_alerts(topic: str) -> bool:
 
 
 class LiveActivity:
-    """Activity of one recorder's microphones up to now.
+    """Activity of one recorder's microphones from `start` (nanoseconds of UTC) up to now.
 
-    Parameters
-    ----------
-    start : int
-        Start of the activity, in nanoseconds of UTC.
-    patience : int
-        Longest delay between writing and reading of a message, in nanoseconds.
+    `patience` is the longest delay between writing and reading of a message, in nanoseconds.
     """
 
     def __init__(self, start: int, patience: int) -> None:
@@ -137,12 +127,8 @@ class LiveActivity:
     def read(self, logs: HomeLogs, node: str, end: int, lose: Callable[[str], None]) -> None:
         """Read the activity so far from logs, before any message is pushed.
 
-        Parameters
-        ----------
-        end : int
-            Log time, in nanoseconds of UTC; later messages are skipped.
-        lose : callable
-            Called with a message for each damaged log.
+        Messages after log time `end`, in nanoseconds of UTC, are skipped; `lose` is called with a
+        message for each damaged log.
         """
         for entry in logs.between(self._start, end):
             if entry.node == node:

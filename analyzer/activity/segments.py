@@ -74,14 +74,9 @@ Key = tuple[str, bool]  # a class, and whether the model of a scenario has it
 
 
 def _between(classes: Mapping[Key, Sounds], start: int, end: int, pause: int) -> dict[Key, Sounds]:
-    """Return segments of classes in a time span, with the complete events ongoing at its start.
+    """Return segments in a span, with the complete events, pauses in ns, ongoing at its start.
 
     An event has sounds of any class, as in a rule of any sound: such a rule needs its start too.
-
-    Parameters
-    ----------
-    pause : int
-        Longest pause within an event, in nanoseconds.
     """
     own = {key: sounds.rows(sounds.starts < end) for key, sounds in classes.items()}
     own = {key: replace(sounds, ends=np.minimum(sounds.ends, end)) for key, sounds in own.items()}
@@ -94,24 +89,14 @@ def _between(classes: Mapping[Key, Sounds], start: int, end: int, pause: int) ->
 
 @dataclass(frozen=True)
 class HomeActivity:
-    """Activity of a home in a time span.
+    """Activity of a home in a time span."""
 
-    Attributes
-    ----------
-    sounds : mapping of (str, bool) to Sounds
-        Segments by class, without silence, and whether they are of a scenario's model.
-    coverage : mapping of str to Spans
-        Listening time by labelling source.
-    classes : mapping of str to frozenset of str
-        Classes of the model by labelling source; sources with unknown classes are absent.
-    written : Spans
-        When the recorder wrote; writes at most a minute apart form one span.
-    """
-
+    # segments without silence, by class and whether of a scenario's model
     sounds: Mapping[Key, Sounds]
-    coverage: Mapping[str, Spans]
+    coverage: Mapping[str, Spans]  # listening time by labelling source
+    # of the model by labelling source; unknown ones are absent
     classes: Mapping[str, frozenset[str]]
-    written: Spans
+    written: Spans  # writes of the recorder; at most a minute apart, one span
 
     def of(self, label: str) -> Sounds:
         """Return the segments of a class, or of all classes of the home for `ANY_SOUND`."""
@@ -126,10 +111,7 @@ class HomeActivity:
     def listened(self, label: str, microphone: str) -> Spans:
         """Return the time spans in which a class could have been detected.
 
-        Parameters
-        ----------
-        microphone : str
-            Empty for any microphone with a model that has the class.
+        An empty `microphone` is any one with a model that has the class.
         """
         knowing = [
             spans
@@ -145,12 +127,9 @@ class HomeActivity:
         return known is None or label == ANY_SOUND or label in known
 
     def between(self, start: int, end: int, pause: int) -> "HomeActivity":
-        """Return the activity in a time span, with the complete events ongoing at its start.
+        """Return the activity in a span, with the complete events ongoing at its start.
 
-        Parameters
-        ----------
-        pause : int
-            Longest pause within an event, in nanoseconds.
+        `pause` is the longest pause within an event, in nanoseconds.
         """
         return HomeActivity(
             _between(self.sounds, start, end, pause),
@@ -274,13 +253,7 @@ class SegmentCollector:
         return self._written.last_start
 
     def activity(self, others: Sequence[tuple[str, int, int, str, float]] = ()) -> HomeActivity:
-        """Return the activity so far, with open segments.
-
-        Parameters
-        ----------
-        others : sequence of (str, int, int, str, float), optional
-            Source, start, end, label and confidence of open segments.
-        """
+        """Return the activity so far, with open segments: source, start, end, label, confidence."""
         sounds = {key: rows.sounds() for key, rows in self._rows.items()}
         coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
         written = self._written.spans(_PAUSE)
@@ -297,13 +270,7 @@ class SegmentCollector:
         return HomeActivity(sounds, coverage, classes, written)
 
     def forget_before(self, time: int, pause: int) -> None:
-        """Drop the events that ended before a time.
-
-        Parameters
-        ----------
-        pause : int
-            Longest pause within an event, in nanoseconds.
-        """
+        """Drop the events, with pauses of at most `pause` ns, that ended before a time."""
         every = {key: rows.sounds() for key, rows in self._rows.items()}
         for key, sounds in _between(every, time, NEVER, pause).items():
             self._rows[key].keep(sounds)
@@ -325,18 +292,11 @@ def read_activity(  # noqa: PLR0913, PLR0917
     progress: Progress = ignore_progress,
     others: Sequence[tuple[str, int, int, str, float]] = (),
 ) -> HomeActivity:
-    """Read the activity of a time span from logs.
+    """Read the activity of a span in nanoseconds of UTC, with segments ending up to 12 hours later.
 
-    Parameters
-    ----------
-    start, end : int
-        In nanoseconds of UTC; segments that end up to twelve hours later are included.
-    lose : callable
-        Called with a message for each log that is damaged or unfinished.
-    progress : callable, optional
-        Called with the share of the logs read so far, 0 to 1.
-    others : sequence of (str, int, int, str, float), optional
-        Open segments that are in no log yet, as for `SegmentCollector.activity`.
+    `lose` is called with a message for each log that is damaged or unfinished, `progress` with the
+    share of the logs read so far, 0 to 1. `others` are open segments that are in no log yet, as for
+    `SegmentCollector.activity`.
     """
     collector = SegmentCollector()
     entries = [

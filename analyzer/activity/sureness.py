@@ -25,15 +25,9 @@ _NO_SOUNDS = {SILENCE, TELEVISION, UNKNOWN}
 
 
 class Sureness(NamedTuple):
-    """Least confidence of labels of which a home can be sure.
+    """Least confidence of labels of which a home can be sure."""
 
-    Attributes
-    ----------
-    sure : float
-        0 to 1; infinite if no confidence holds, or nothing was checked.
-    """
-
-    sure: float = inf
+    sure: float = inf  # 0 to 1; infinite if no confidence holds, or nothing was checked
 
     def word(self, confidence: float) -> str:
         """Return a word for a confidence; empty if none can be justified."""
@@ -50,14 +44,9 @@ UNMEASURED = Sureness()
 
 
 def checked_confidences(reviewed: Iterable[ReviewedLabels]) -> tuple[Float64, Bool]:
-    """Return the confidence of the labelled events of random minutes, and whether each is right.
+    """Return the highest confidence of labelled events of random minutes, and which are right.
 
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-        The highest of the segments of an event.
-    np.ndarray [shape=(n,)], bool
-        Whether one of its segments is true in part; what a person could not tell is not.
+    An event is right if one of its segments is true in part; what a person could not tell is not.
     """
     confidences: list[float] = []
     rights: list[bool] = []
@@ -103,12 +92,6 @@ def measured_sureness(confidences: Float64, right: Bool) -> Sureness:
 
 
 def read_sureness(logs: HomeLogs, start: int, end: int) -> Sureness:
-    """Measure the confidences of the recorder's labels in the checked minutes of a time.
-
-    Parameters
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    """
+    """Measure the confidences of the recorder's labels in checked minutes (nanoseconds of UTC)."""
     reviewed = read_reviewed_labels(logs, LIVE, start, end, [], {RANDOM})
     return measured_sureness(*checked_confidences(reviewed))

@@ -32,13 +32,7 @@ class _Quantity(ABC):
         """Format a number."""
 
     def spread(self, median: float, lowest: float, highest: float) -> str:
-        """Format a usual range: `4 (3 to 6)`; if both ends are minutes alone, `min` appears once.
-
-        Parameters
-        ----------
-        median, lowest, highest : float
-            In the unit of `show`.
-        """
+        """Format a usual range: `4 (3 to 6)`; `min` appears once if both ends are minutes alone."""
         low, high = self.show(lowest), self.show(highest)
         if low == high:
             return self.show(median)
@@ -160,18 +154,7 @@ class UsualRange(NamedTuple):
 
 
 def usual_range(values: Sequence[Value | None]) -> UsualRange | None:
-    """Return the usual range of a figure.
-
-    Parameters
-    ----------
-    values : sequence of (Count, Duration, Clock or None)
-        The same figure on each day; None if unknown.
-
-    Returns
-    -------
-    UsualRange or None
-        Of the `middle` of the values; None if fewer than seven days have one.
-    """
+    """Return the usual range of the `middle` of a figure; None for less than seven days."""
     numbers = [value.middle for value in values if value is not None]
     if len(numbers) < FEWEST:
         return None
@@ -181,10 +164,7 @@ def usual_range(values: Sequence[Value | None]) -> UsualRange | None:
 def compared(value: Value, baseline: UsualRange) -> int:
     """Compare a figure, as labelled, with its usual range.
 
-    Returns
-    -------
-    int
-        1: above the highest day, or later; -1: below the lowest, or earlier; 0: usual.
+    1: above the highest day, or later; -1: below the lowest, or earlier; 0: usual.
     """
     if rounded(value.middle) > rounded(baseline.highest):
         return 1

@@ -121,20 +121,16 @@ def _with_classes(head: NamesHead, classes: Sequence[str]) -> NamesHead:
 def learn_home(
     heads: Heads, windows: EmbeddingWindows, marked: Bool, classes: Sequence[str]
 ) -> Heads:
-    """Learn the correction of a home; half of it is added for classes of the base.
+    """Learn the correction of a home from the windows that a person marked [shape=(m,)].
 
-    The base heads stay fixed. The home adds its own linear head, so adaptation needs none of the
-    base's recordings. The head is fitted by logistic regression with a pull to zero: the base
-    decides where nothing is marked.
+    Half of the correction is added for classes of the base; the model labelled the windows without
+    a mark. The base heads stay fixed. The home adds its own linear head, so adaptation needs none
+    of the base's recordings. The head is fitted by logistic regression with a pull to zero: the
+    base decides where nothing is marked.
 
     Without new classes and without marks of class `unknown`, the score of `unknown` against the
     other classes is not learned: marks of sounds wrongly labelled `unknown` would remove nearly all
     of it.
-
-    Parameters
-    ----------
-    marked : np.ndarray [shape=(m,)], bool
-        Whether a person labelled the window; the model labelled the others.
     """
     sounds = sounds_of(classes)
     if UNKNOWN in classes and not heads.new:
@@ -323,29 +319,14 @@ def base_classes(model: Model) -> tuple[str, ...]:
 def adapt_model(base: Model, home: Dataset) -> Model:
     """Adapt the weights of a model to a home.
 
-    Parameters
-    ----------
-    base : Model
-        A classifier of another kind than landmarks is imitated first; it must have stored training
-        windows.
-    home : Dataset
-        Segments of the model's `base_classes`, which may be empty, followed by new classes, which
-        must have segments.
+    A base of another kind than landmarks is imitated first; it must have stored training windows.
+    `home` has segments of the model's `base_classes`, which may be empty, followed by new classes,
+    which must have segments. Parameters, transitions and metrics stay those of `base`, measured in
+    other homes; the temperature before the first adaptation is adjusted by cross-validation over
+    parts of the home. The result can be adapted again to more of the home.
 
-    Returns
-    -------
-    Model
-        Parameters, transitions and metrics are those of `base`, measured in other homes. The
-        temperature before the first adaptation is adjusted by cross-validation over parts of the
-        home. The model can be adapted again to more of the home.
-
-    Raises
-    ------
-    DataError
-        If the home has no segments, or no loud ones of a new class, or if the base cannot be
-        imitated.
-    ModelError
-        If the feature set or the kind of classifier of the base is not installed.
+    Raise `DataError` if the home has no segments, or no loud ones of a new class, or if the base
+    cannot be imitated; `ModelError` if the feature set or kind of classifier is not installed.
     """
     require_trained(base)
     if not len(home):
@@ -493,10 +474,7 @@ def _of_classes(description: Description, classes: Sequence[str]) -> Description
 def _left_out(
     method: Method, examples: Examples, marked: Bool, description: Description
 ) -> Float64:
-    """Return the decisions of adapted classifiers for held-out parts of a home.
-
-    NaN for all segments if too few are marked.
-    """
+    """Return the decisions of adapted classifiers for held-out parts; NaN if too few are marked."""
     everything, count = np.arange(len(marked)), len(description.classes)
     if marked.sum() < _FEWEST_SEGMENTS:
         return np.full((len(marked), count), np.nan)

@@ -26,17 +26,10 @@ def cross_validate(
     folds: Iterable[Fold],
     progress: Progress,
 ) -> Float64:
-    """Classify segments with classifiers trained on other folds.
+    """Return decisions [shape=(len(methods), n, C)] for segments, by classifiers of other folds.
 
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share of the fits, 0 to 1.
-
-    Returns
-    -------
-    np.ndarray [shape=(len(methods), n, C)], float64
-        Decision values; -inf for a class without training data, NaN for segments in no test fold.
+    They are -inf for a class without training data, NaN for segments in no test fold. `progress`
+    receives the completed share of the fits, 0 to 1.
     """
     from joblib import delayed  # noqa: PLC0415  part of the extra `headless`
 
@@ -61,18 +54,7 @@ def _decide_unseen(method: Method, classes: int, fold: Fold, *arrays: Any) -> Fl
 
 
 def softmax(values: Float64) -> Float64:
-    """Turn decision values into probabilities.
-
-    Parameters
-    ----------
-    values : np.ndarray [shape=(n, C)], float64
-        Decision values; -inf is allowed, but not for a complete row.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
-        Each row sums to 1; 0 where the decision value is -inf.
-    """
+    """Turn decision values [shape=(n, C)] into probabilities; a row may not be -inf completely."""
     grown = np.exp(values - values.max(axis=1, keepdims=True))
     return grown / grown.sum(axis=1, keepdims=True)
 
@@ -88,11 +70,8 @@ _FEWEST_SEGMENTS = 20  # of a collection with a fold of its own
 def collection_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> list[Fold]:
     """Return folds that hold out one collection each; small collections share a fold.
 
-    Returns
-    -------
-    list of Fold
-        Empty if there are fewer than three folds, if one leaves a single class for training, or if
-        fewer than half of all other classes occur in other collections.
+    Empty if there are fewer than three folds, if one leaves a single class for training, or if
+    fewer than half of all other classes occur in other collections.
     """
     counts = np.bincount(data.collection)
     fold = np.where(counts < _FEWEST_SEGMENTS, len(counts), np.arange(len(counts)))[data.collection]
@@ -108,12 +87,7 @@ def collection_folds(data: Dataset, taught: AbstractSet[int] = frozenset()) -> l
 
 
 def trained_elsewhere(data: Dataset, folds: Sequence[Fold]) -> Bool:
-    """Return which segments have a known class with five sources in the other folds.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], bool
-    """
+    """Return which segments have a known class with five sources in the other folds."""
     taught = np.zeros(len(data), bool)
     for seen, unseen in folds:
         sources = source_counts(data.target[seen], data.group[seen], len(data.classes))
@@ -128,13 +102,9 @@ def calibrate_elsewhere(
 ) -> tuple[float, Elsewhere]:
     """Find the temperature for collections outside the training set.
 
-    The temperature is fitted on segments of classes with five sources in the other folds. Scores
-    cover these segments; macro F1 also covers segments of no class of the scenario.
-
-    Parameters
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        Of classifiers trained without the fold of the segment.
+    The `decisions` [shape=(n, C)] are of classifiers trained without the fold of the segment. The
+    temperature is fitted on segments of classes with five sources in the other folds. Scores cover
+    these segments; macro F1 also covers segments of no class of the scenario.
     """
     taught = trained_elsewhere(data, folds)
     probabilities = nested_probabilities(decisions, data.target, folds, taught)
@@ -143,14 +113,9 @@ def calibrate_elsewhere(
 
 
 def scores_elsewhere(probabilities: Float64, data: Dataset, taught: Bool) -> Elsewhere:
-    """Score predictions for collections outside the training set.
+    """Score probabilities [shape=(n, C)] of classifiers trained without the segment's collection.
 
-    Parameters
-    ----------
-    probabilities : np.ndarray [shape=(n, C)], float64
-        Of classifiers trained without the collection of the segment.
-    taught : np.ndarray [shape=(n,)], bool
-        Result of `trained_elsewhere`.
+    `taught` [shape=(n,)] is the result of `trained_elsewhere`.
     """
     predicted, scored = probabilities.argmax(axis=1), taught.copy()
     if UNKNOWN in data.classes:
@@ -182,16 +147,9 @@ def _of_classes(
 
 
 def home_temperature(decisions: Float64, target: Indices, base: float) -> float:
-    """Adjust the temperature of a model to a home, as far as its segment count allows.
+    """Adjust the inverse temperature `base` to a home; it weighs as much as 30 segments.
 
-    Parameters
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        Of classifiers that were adapted to other segments of the home.
-    target : np.ndarray [shape=(n,)], intp
-        Classes of the segments.
-    base : float
-        Inverse temperature of the model; weighs as much as 30 segments.
+    The `decisions` [shape=(n, C)] are of classifiers adapted to other segments of the home.
     """
     if not len(target):
         return base
@@ -203,22 +161,11 @@ def home_temperature(decisions: Float64, target: Indices, base: float) -> float:
 def nested_probabilities(
     decisions: Float64, target: Indices, folds: Sequence[Fold], used: Bool | None = None
 ) -> Float64:
-    """Convert decisions to probabilities; each fold uses the temperature of the other folds.
+    """Turn decisions into probabilities [shape=(n, C)], with the temperature of the other folds.
 
-    Parameters
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        Of classifiers trained without the fold of the segment.
-    target : np.ndarray [shape=(n,)], intp
-        Indices of the true classes.
-    folds : sequence of Fold
-        At least two; each segment is tested in one of them.
-    used : np.ndarray [shape=(n,)], bool, optional
-        Segments for fitting temperatures; all by default.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
+    The `decisions` are of classifiers trained without the fold of the segment. There are at least
+    two folds; each segment is tested in one. `used` [shape=(n,)] selects segments for fitting
+    temperatures; all by default.
     """
     used = np.ones(len(target), bool) if used is None else used
     probabilities = np.empty_like(decisions)
@@ -235,17 +182,8 @@ def nested_probabilities(
 def unknown_bias(decisions: Float64, target: Indices, classes: Sequence[str]) -> Float64:
     """Find the bias of class `unknown` that keeps false rejections of known segments rare.
 
-    Parameters
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        Decision values of segments outside the training set.
-    target : np.ndarray [shape=(n,)], intp
-        Their classes.
-
-    Returns
-    -------
-    np.ndarray [shape=(C,)], float64
-        Zero except for class `unknown`, if it exists.
+    The `decisions` [shape=(n, C)] are of segments outside the training set; the bias [shape=(C,)]
+    is zero except for class `unknown`, if it exists.
     """
     bias = np.zeros(len(classes))
     if UNKNOWN in classes:
@@ -260,23 +198,11 @@ def unknown_bias(decisions: Float64, target: Indices, classes: Sequence[str]) ->
 
 
 def inverse_temperature(decisions: Float64, target: Indices) -> float:
-    """Find the factor of decision values that minimises the log loss of their softmax.
+    """Find the factor of decision values [shape=(n, C)] that minimises log loss of their softmax.
 
-    Parameters
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        Decision values; -inf for a class without training data.
-    target : np.ndarray [shape=(n,)], intp
-        Indices of the true classes.
-
-    Returns
-    -------
-    float
-        From exp(-5) to exp(5); the inverse of the temperature.
-
-    References
-    ----------
-    Guo et al., "On Calibration of Modern Neural Networks", 2017.
+    It is the inverse of the temperature, from exp(-5) to exp(5). Decision values are -inf for a
+    class without training data. Source: Guo et al., "On Calibration of Modern Neural Networks",
+    2017.
     """
 
     def loss(logarithm: float) -> float:

@@ -30,15 +30,9 @@ MOST_SECONDS = 3600.0  # of a clip, which is held in memory
 
 
 class ClipSound(NamedTuple):
-    """Sound of a clip without frames with non-finite samples.
+    """Complete frames of a clip at 16 kHz, as a recorder processes them, if finite."""
 
-    Attributes
-    ----------
-    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        Complete frames at 16 kHz, as a recorder would process them; an incomplete frame at the end
-        of the file is dropped.
-    """
-
+    # [shape=(n, FRAME_SAMPLES)]; without an incomplete frame at the end of the file
     frames: Float32
     breaks: Sequence[int] = ()
     lost: int = 0
@@ -101,29 +95,16 @@ _STEADY_SECONDS = 5
 
 
 class RoomCopy(NamedTuple):
-    """Features of a sound in a room.
+    """Features of a sound in a room."""
 
-    Attributes
-    ----------
-    features : np.ndarray [shape=(n, d)], float32
-    floor : np.ndarray [shape=(b,)], float64
-        Floor of the room as the tracker estimates it: band powers of the feature set.
-    """
-
-    features: Float32
-    floor: Float64
+    features: Float32  # [shape=(n, d)]
+    floor: Float64  # [shape=(b,)], as the tracker estimates it: band powers of the feature set
 
 
 def in_room(
     frames: Float32, features: FeatureSet, rng: np.random.Generator, *, silence: bool
 ) -> RoomCopy:
-    """Compute the features of a sound in a random room with steady noise and microphone.
-
-    Parameters
-    ----------
-    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        At least one frame.
-    """
+    """Compute the features of frames, at least one, in a random room with noise and microphone."""
     sound, level = other_room(frames, rng, silence=silence)
     return in_noise(sound, level, features, rng, silence=silence)
 
@@ -131,21 +112,11 @@ def in_room(
 def other_room(
     frames: Float32, rng: np.random.Generator, *, silence: bool
 ) -> tuple[Float64, float]:
-    """Apply a random room and microphone to a sound; return the noise level separately.
+    """Return frames in a random room [shape=(n * FRAME_SAMPLES,)], and the noise level in dBFS.
 
-    Reverberation is exponentially decaying noise after the direct sound, as in Moorer, "About this
-    reverberation business", 1979; a microphone has tilt, bumps and band limits.
-
-    Parameters
-    ----------
-    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        At least one frame.
-
-    Returns
-    -------
-    sound : np.ndarray [shape=(n * FRAME_SAMPLES,)], float64
-    level : float
-        Noise level in dBFS.
+    There is at least one frame. Reverberation is exponentially decaying noise after the direct
+    sound, as in Moorer, "About this reverberation business", 1979; a microphone has tilt, bumps and
+    band limits.
     """
     sound = frames.ravel().astype(np.float64) * 10.0 ** (rng.uniform(*_GAIN_DB) / 20.0)
     if rng.random() < _COPIED_SHARE:
@@ -162,14 +133,9 @@ def other_room(
 def in_noise(
     sound: Float64, level: float, features: FeatureSet, rng: np.random.Generator, *, silence: bool
 ) -> RoomCopy:
-    """Compute the features of a sound in steady noise.
+    """Compute the features of a sound [shape=(n,)] in steady noise of a level in dBFS.
 
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n,)], float64
-        Samples of complete frames at 16 kHz, at least one frame.
-    level : float
-        Level of the noise in dBFS.
+    The sound has complete frames at 16 kHz, at least one.
     """
     noise = steady_noise(len(sound), level, rng)
     copy = captured(sound + noise, features)
@@ -182,12 +148,7 @@ def in_noise(
 
 
 def level_of(sound: Float64) -> float:
-    """Return the mean level of a sound in dBFS, at least -120.
-
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n,)], float64
-    """
+    """Return the mean level of a sound [shape=(n,)] in dBFS, at least -120."""
     return float(10.0 * np.log10(np.mean(np.square(sound, dtype=np.float64)) + 1e-12))
 
 
@@ -204,21 +165,9 @@ def empty_room(features: FeatureSet, rng: np.random.Generator) -> RoomCopy:
 def reverberated(
     sound: Float64, seconds: float, direct: float, rng: np.random.Generator
 ) -> Float64:
-    """Add reverberation to a sound.
+    """Add reverberation of `seconds` (RT60) to a sound [shape=(n,)] at 16 kHz; keep its power.
 
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n,)], float64
-        Samples at 16 kHz.
-    seconds : float
-        Reverberation time (RT60).
-    direct : float
-        Level of the direct sound above the reverberation, in dB.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-        With the power of the original.
+    `direct` is the level of the direct sound above the reverberation, in dB.
     """
     from scipy.signal import fftconvolve  # noqa: PLC0415  what reads a home needs no rooms
 
@@ -231,20 +180,7 @@ def reverberated(
 
 
 def filtered(sound: Float64, response: Callable[[Float64], Float64]) -> Float64:
-    """Apply a frequency response to a sound.
-
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n,)], float64
-        Samples at 16 kHz.
-    response : callable
-        Maps frequencies in hertz to dB.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-        With the power of the original.
-    """
+    """Apply a frequency response, hertz to dB, to a sound at 16 kHz; keep its power."""
     count = len(sound) + _SETTLING + len(sound) % 2
     frequencies = np.linspace(0.0, SAMPLE_RATE / 2, count // 2 + 1)
     gain = 10.0 ** (response(frequencies) / 20.0)
@@ -252,15 +188,7 @@ def filtered(sound: Float64, response: Callable[[Float64], Float64]) -> Float64:
 
 
 def band_limits(frequencies: Float64, low: float, high: float) -> Float64:
-    """Return the response of a band-limited microphone in dB.
-
-    Parameters
-    ----------
-    frequencies : np.ndarray [shape=(n,)], float64
-        In hertz.
-    low, high : float
-        Limits in hertz, where the response is -3 dB.
-    """
+    """Return the response of a band-limited microphone in dB; -3 dB at the limits; all in hertz."""
     frequencies = np.maximum(frequencies, 1.0)
     order = 2 * _LIMITS_ORDER
     below, above = 1.0 + (low / frequencies) ** order, 1.0 + (frequencies / high) ** order
@@ -269,13 +197,7 @@ def band_limits(frequencies: Float64, low: float, high: float) -> Float64:
 
 
 def octaves_of(frequencies: Float64) -> Float64:
-    """Return the distance of frequencies from 1 kHz in octaves.
-
-    Parameters
-    ----------
-    frequencies : np.ndarray [shape=(n,)], float64
-        In hertz; those below 30 count as 30.
-    """
+    """Return the distance of frequencies in hertz (at least 30) from 1 kHz in octaves."""
     octaves: Float64 = np.log2(np.maximum(frequencies, 30.0) / 1000.0)
     return octaves
 
@@ -309,17 +231,7 @@ def _of_power(changed: Float64, sound: Float64) -> Float64:
 
 
 def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
-    """Generate Gaussian noise with a spectrum that falls by 0 to 6 dB per octave.
-
-    Parameters
-    ----------
-    level : float
-        In dBFS.
-
-    Returns
-    -------
-    np.ndarray [shape=(count,)], float64
-    """
+    """Generate Gaussian noise of a level in dBFS whose spectrum falls by 0 to 6 dB per octave."""
     spectrum = np.fft.rfft(rng.standard_normal(count))
     frequencies = np.maximum(np.fft.rfftfreq(count, 1.0 / SAMPLE_RATE), _LOWEST_HERTZ)
     noise = np.fft.irfft(spectrum / frequencies ** rng.choice(_SLOPES), count)
@@ -328,16 +240,9 @@ def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
 
 
 def captured(sound: Float64, features: FeatureSet) -> Float32:
-    """Compute the features of a sound captured by a 16-bit microphone.
+    """Compute the features of sound [shape=(n,)] captured by a 16-bit microphone, which clips it.
 
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n,)], float64
-        Samples of complete frames at 16 kHz; values beyond full scale are clipped.
-
-    Returns
-    -------
-    np.ndarray [shape=(n / FRAME_SAMPLES, d)], float32
+    The sound has complete frames at 16 kHz.
     """
     samples = np.clip(np.rint(sound * 32767.0), -32768, 32767) / 32768.0
     return features.extractor()(samples.astype(np.float32).reshape(-1, FRAME_SAMPLES))
@@ -376,34 +281,16 @@ class Embeds(Protocol):
 
 
 class ClipEmbeddings(NamedTuple):
-    """Embedded windows of a clip.
+    """Embedded windows of a clip."""
 
-    Attributes
-    ----------
-    values : np.ndarray [shape=(m, W)], int8
-        Logged integers.
-    version : np.ndarray [shape=(m,)], intp
-        `AS_IT_IS`, `IN_A_ROOM` or `SHORT`.
-    taught : np.ndarray [shape=(m,)], bool
-        Whether heads are trained on the window; the sound is faint in the others.
-    starts : np.ndarray [shape=(m,)], intp
-        Frame of the clip at which an unchanged window starts; negative before the clip. 0 for other
-        versions.
-    """
-
-    values: Int8
-    version: Indices
-    taught: Bool
+    values: Int8  # [shape=(m, W)]; logged integers
+    version: Indices  # [shape=(m,)]; `AS_IT_IS`, `IN_A_ROOM` or `SHORT`
+    taught: Bool  # [shape=(m,)]; whether heads are trained on the window; others are faint
+    # [shape=(m,)]; frame at which an unchanged window starts, may be negative; else 0
     starts: Indices
 
     def at(self, start: int) -> Int8:
-        """Return the window whose start is nearest to a frame, at most five frames away.
-
-        Returns
-        -------
-        np.ndarray [shape=(1 or 0, W)], int8
-            Empty if no window is near enough.
-        """
+        """Return the window nearest to a start frame [shape=(1, W)]; (0, W) if none within five."""
         away = np.where(self.version == AS_IT_IS, np.abs(self.starts - start), _FAR)
         nearest = int(away.argmin()) if len(away) else 0
         return self.values[nearest : nearest + int(len(away) > 0 and away[nearest] <= _NEAR)]
@@ -436,18 +323,11 @@ class ClipEmbedder:
 def clip_embeddings(
     frames: Float32, embed: Embeds, segments: Indices, *, silence: bool, seed: int = 0
 ) -> ClipEmbeddings:
-    """Embed the windows of a clip; deterministic for a clip and seed.
+    """Embed the windows of a clip of one or more frames; deterministic for a clip and seed.
 
-    Homes contain partly filled windows, short sounds and other rooms; so do these windows.
-
-    Parameters
-    ----------
-    frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        At least one.
-    segments : np.ndarray [shape=(k,)], intp
-        Start frames of the clip's segments, multiples of five; their windows are always embedded.
-    silence : bool
-        Whether the clip is silent: only its segments are embedded.
+    Homes contain partly filled windows, short sounds and other rooms; so do these windows. Windows
+    of the clip's `segments` [shape=(k,)], start frames in multiples of five, are always embedded;
+    of a clip of `silence` only these.
     """
     digest = hashlib.blake2b(np.ascontiguousarray(frames).tobytes(), digest_size=8).digest()
     rng = np.random.default_rng([_EMBEDDING_SEED + seed, int.from_bytes(digest, "little")])
@@ -482,10 +362,7 @@ def _padded(sound: Float64, noise: Float64) -> Float64:
 
 
 def _taught(padded: Float64, count: int, hop: int) -> Indices:
-    """Return the centres of training windows in samples of the clip.
-
-    These windows are filled sufficiently and not faint at the centre.
-    """
+    """Return centres of training windows in samples: filled enough and not faint at the centre."""
     middles = np.arange(0, count + 1, hop)
     filled = np.minimum(middles + _HALF, count) - np.maximum(middles - _HALF, 0)
     enough = min(_FILLED * _WINDOW, _FILLED_BY_SHORT * count)

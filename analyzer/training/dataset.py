@@ -45,69 +45,38 @@ _SEED = 20_261_122
 
 
 class Recording(NamedTuple):
-    """Sound with one label.
-
-    Attributes
-    ----------
-    label, group, collection, licence : str
-        As in a manifest; a group is never in both training and test sets.
-    features : np.ndarray [shape=(n, d)], float32
-        Features of successive frames.
-    floor : np.ndarray [shape=(n, b)], float64, or None
-        Floor of the room at each frame; None without a room, as in a cut clip.
-    most : int or None
-        Maximum number of segments, evenly spaced; None for no limit.
-    span : (int, int) or None
-        Start and end in nanoseconds of UTC, if recorded.
-    fault : str
-        Read error; empty if there is none.
-    hole : str
-        Missing part; empty if complete.
-    embedded : ClipEmbeddings or None
-        Embedded windows; None without a network.
-    """
+    """Sound with one label."""
 
     label: str
-    group: str
+    group: str  # never in both training and test sets
     collection: str
     licence: str
-    features: Float32
+    features: Float32  # [shape=(n, d)]
     weight: float = 1.0
+    # [shape=(n, b)], of each frame; None without a room, as in a cut clip
     floor: Float64 | None = None
     copies: Sequence[RoomCopy] = ()
-    most: int | None = None
-    span: tuple[int, int] | None = None
+    most: int | None = None  # maximum number of evenly spaced segments; None for no limit
+    span: tuple[int, int] | None = None  # start and end in nanoseconds of UTC, if recorded
     sighting: DirectionSample | None = None
-    fault: str = ""
+    fault: str = ""  # read error
     breaks: Sequence[int] = ()
-    hole: str = ""
-    embedded: ClipEmbeddings | None = None
+    hole: str = ""  # missing part
+    embedded: ClipEmbeddings | None = None  # None without a network
 
 
 Segment = tuple[Recording, int]  # with the first frame
 
 
 class EmbeddingWindows(NamedTuple):
-    """Embedded windows for training heads.
+    """Embedded windows for training heads."""
 
-    Attributes
-    ----------
-    values : np.ndarray [shape=(m, W)], int8
-        Logged integers.
-    target, group, collection : np.ndarray [shape=(m,)], intp
-        As for segments.
-    tried : np.ndarray [shape=(m,)], bool
-        Whether the window is unchanged and used for calibrating heads.
-    recording : np.ndarray [shape=(m,)], intp
-        Number of the recording; in a home, of the mark.
-    """
-
-    values: Int8
-    target: Indices
+    values: Int8  # [shape=(m, W)]; logged integers
+    target: Indices  # [shape=(m,)], as are the following
     group: Indices
     collection: Indices
-    tried: Bool
-    recording: Indices
+    tried: Bool  # whether the window is unchanged and used for calibrating heads
+    recording: Indices  # number of the recording; in a home, of the mark
 
     def rows(self, chosen: Indices | Bool) -> "EmbeddingWindows":
         """Return a subset of the windows."""
@@ -127,55 +96,30 @@ NO_WINDOWS = EmbeddingWindows(
 
 @dataclass(frozen=True)
 class Dataset:
-    """Training segments: windows of one second.
+    """Training segments: windows of one second."""
 
-    Attributes
-    ----------
-    windows : np.ndarray [shape=(n, window_frames, d)], float32
-        Features.
-    target : np.ndarray [shape=(n,)], intp
-        Index into `classes`.
-    group, collection : np.ndarray [shape=(n,)], intp
-        Number of the source group, and of the collection.
-    weight : np.ndarray [shape=(n,)], float64
-        Weight of the segment.
-    floor : np.ndarray [shape=(n, b)], float64
-        Floor of the room; b is 0 for a feature set without bands.
-    copies : np.ndarray [shape=(k, n, window_frames, d)], float32
-        The same segments in other rooms; NaN where a copy is missing.
-    copy_floor : np.ndarray [shape=(k, n, b)], float64
-    seconds : dict of str to float
-        Seconds of sound of each class before thinning.
-    spans : np.ndarray [shape=(k, 2)], int64
-        Starts and ends of the used recordings, in nanoseconds of UTC, if recorded.
-    sightings : sequence of (DirectionSample or None)
-        Direction of the recording of each segment, if recorded; empty if none has one.
-    left_out : sequence of SkippedClip
-        Unreadable recordings, which `skipped` counts too, and unreadable parts of others.
-    embedded : np.ndarray [shape=(n, W)], int8
-        Embeddings of the segments; W is 0 without a network.
-    is_embedded : np.ndarray [shape=(n,)], bool
-        Whether a segment has an embedding.
-    """
-
-    windows: Float32
-    target: Indices
-    group: Indices
-    collection: Indices
-    weight: Float64
-    floor: Float64
-    copies: Float32
-    copy_floor: Float64
+    windows: Float32  # [shape=(n, window_frames, d)]
+    target: Indices  # [shape=(n,)]; index into `classes`
+    group: Indices  # [shape=(n,)]; number of the source group
+    collection: Indices  # [shape=(n,)]
+    weight: Float64  # [shape=(n,)]
+    floor: Float64  # [shape=(n, b)]; b is 0 for a feature set without bands
+    copies: Float32  # [shape=(k, n, window_frames, d)]; in other rooms; NaN if missing
+    copy_floor: Float64  # [shape=(k, n, b)]
     classes: tuple[str, ...]
-    seconds: Mapping[str, float]
+    seconds: Mapping[str, float]  # of sound of each class, before thinning
     collection_names: tuple[str, ...]
     collections: Mapping[tuple[str, str], int]
     skipped: Mapping[str, int]
+    # [shape=(k, 2)]; starts and ends of the used recordings in nanoseconds of UTC, if recorded
     spans: Int64 = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    # directions of the segments, if recorded; empty if none has one
     sightings: Sequence[DirectionSample | None] = ()
+    # unreadable recordings, which `skipped` counts too, and unreadable parts of others
     left_out: Sequence[SkippedClip] = ()
+    # [shape=(n, W)]; W is 0 without a network
     embedded: Int8 = field(default_factory=lambda: np.empty((0, 0), np.int8))
-    is_embedded: Bool = field(default_factory=lambda: np.empty(0, bool))
+    is_embedded: Bool = field(default_factory=lambda: np.empty(0, bool))  # [shape=(n,)]
     embedding_windows: EmbeddingWindows = NO_WINDOWS
 
     def __len__(self) -> int:
@@ -224,29 +168,10 @@ def build_dataset(  # noqa: PLR0913, PLR0917
     embedder: ClipEmbedder | None = None,
     seed: int = 0,
 ) -> Dataset:
-    """Cut clips and recordings of a home into segments of a scenario.
+    """Cut clips and recordings of a home into segments of a scenario, as `cut_recordings` does.
 
-    Raise `DataError` if a class has no segments.
-
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share of the clips, 0 to 1.
-    home : iterable of Recording
-        Further recordings; their labels may be names of classes.
-    features : FeatureSet
-        Features to compute; `home` must have the same set.
-    rooms : int
-        Number of copies of each clip in other rooms.
-    embedder : ClipEmbedder, optional
-        Embeds the windows of clips, for methods with heads.
-    seed : int
-        Seed of the random rooms.
-
-    Returns
-    -------
-    Dataset
-        Result of `cut_recordings`.
+    Recordings of the home have the same features; their labels may be names of classes. The other
+    parameters are those of `clip_recordings`. Raise `DataError` if a class has no segments.
     """
     of_clips = clip_recordings(clips, scenario, progress, features, rooms, embedder, seed)
     data = cut_recordings(chain(of_clips, home), scenario, features)
@@ -269,25 +194,11 @@ def clip_recordings(  # noqa: PLR0913, PLR0917
     embedder: ClipEmbedder | None = None,
     seed: int = 0,
 ) -> Iterator[Recording]:
-    """Read clips and compute their features.
+    """Read clips and compute their features, and those of `rooms` copies in other rooms, in order.
 
-    Clips with labels outside the scenario and unreadable clips have no features.
-
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share of the clips, 0 to 1.
-    rooms : int
-        Number of copies in other rooms; deterministic for clips and seed.
-    embedder : ClipEmbedder, optional
-        Embeds the windows of clips, for methods with heads.
-    seed : int
-        Seed of the random rooms.
-
-    Yields
-    ------
-    Recording
-        In the order of the clips.
+    Clips with labels outside the scenario and unreadable clips have no features. Copies are
+    deterministic for clips and seed. The embedder embeds the windows of clips for methods with
+    heads. `progress` receives the completed share of the clips, 0 to 1.
     """
     for number, clip in enumerate(clips):
         progress(number / len(clips))
@@ -316,13 +227,8 @@ def cut_recordings(
 
     All segments of silence are kept; others if above -60 dBFS and at most 12 dB below the mean
     level of their recording. At most 24 evenly spaced segments, times their weight, are kept of
-    each class, source group and collection.
-
-    Returns
-    -------
-    Dataset
-        With the classes of the scenario, some possibly without segments; `skipped` counts the
-        reasons for recordings without segments.
+    each class, source group and collection. Some classes of the scenario may be without segments;
+    `skipped` counts the reasons for recordings without segments.
     """
     classes = tuple(scenario.classes)
     groups: dict[str, int] = {}
@@ -392,9 +298,9 @@ def cut_recordings(
 
 
 def _cut(segments: Sequence[Segment], features: FeatureSet) -> tuple[Float32, Float64]:
-    """Return the features of segments, unchanged and in other rooms, and the floors.
+    """Return features (1 + k, n, window_frames, d) and floors (1 + k, n, b), first unchanged.
 
-    Shapes are (1 + k, n, window_frames, d) and (1 + k, n, b); NaN for a missing copy.
+    A missing copy in another room is NaN.
     """
     count = 1 + max((len(recording.copies) for recording, _ in segments), default=0)
     shape = (count, len(segments), features.window_frames, features.width)
@@ -505,14 +411,7 @@ def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Indices]
 
 
 def spread(values: Indices, most: int | None) -> Indices:
-    """Choose values at even distances.
-
-    Parameters
-    ----------
-    values : np.ndarray [shape=(n,)], intp
-    most : int or None
-        Maximum count; None for all.
-    """
+    """Choose `most` values [shape=(n,)] at even distances; None for all."""
     count = len(values) if most is None else min(len(values), most)
     return values[np.linspace(0, len(values) - 1, count).round().astype(np.intp)]
 
@@ -530,41 +429,22 @@ _DIGEST_BYTES = 8
 
 
 def segment_digests(windows: Float32) -> Int64:
-    """Return the digests of segments; digital silence is excluded, as its digests are all equal.
+    """Return the sorted, unique digests of segments [shape=(n, window_frames, d)].
 
-    Parameters
-    ----------
-    windows : np.ndarray [shape=(n, window_frames, d)], float32
-        Features of the segments.
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], int64
-        Sorted and unique.
+    Digital silence is excluded, as its digests are all equal.
     """
     return np.unique(_digests(windows)[_distinguishable(windows)])
 
 
 def learned_digests(model: Model) -> Int64:
-    """Return the digests of a model's training segments; older models store the segments.
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], int64
-    """
+    """Return the digests of a model's training segments; older models store the segments."""
     if len(model.training_digests):
         return model.training_digests
     return segment_digests(model.training_windows)
 
 
 def learned_groups(model: Model, data: Dataset) -> Indices:
-    """Return the source groups with a segment in a model's training set.
-
-    Returns
-    -------
-    np.ndarray [shape=(g,)], intp
-        Numbers of the groups.
-    """
+    """Return the numbers of the source groups with a segment in a model's training set."""
     learned = np.isin(_digests(data.windows), learned_digests(model))
     return np.unique(data.group[learned & _distinguishable(data.windows)])
 

@@ -28,21 +28,11 @@ _AGAIN = np.linspace(0, 0.95, 20)  # shares of sounds from an earlier place
 
 
 class DirectionSample(NamedTuple):
-    """Directions of a recording.
-
-    Attributes
-    ----------
-    microphone : str
-        Name of the array.
-    start : int
-        In nanoseconds of UTC.
-    shares : np.ndarray [shape=(S,)], float64
-        Shares of the sectors of the circle, with sum 1.
-    """
+    """Directions of a recording from an array."""
 
     microphone: str
-    start: int
-    shares: Float64
+    start: int  # in nanoseconds of UTC
+    shares: Float64  # [shape=(S,)]; of the sectors of the circle, with sum 1
 
 
 def sighting_of(microphone: str, directions: Directions) -> DirectionSample | None:
@@ -57,16 +47,10 @@ def sighting_of(microphone: str, directions: Directions) -> DirectionSample | No
 def with_directions(
     model: Model, target: Indices, sightings: Sequence[DirectionSample | None]
 ) -> Model:
-    """Add the direction likelihoods of a home's arrays to a model.
+    """Add the direction likelihoods of a home's arrays to a model without any.
 
-    Parameters
-    ----------
-    model : Model
-        Without direction likelihoods.
-    target : np.ndarray [shape=(n,)], intp
-        Classes of its training segments; silence is ignored.
-    sightings : sequence of (DirectionSample or None)
-        Directions of the segments, if recorded; empty if none has one.
+    Silence in `target`, the classes of its training segments [shape=(n,)], is ignored; `sightings`
+    is empty if no segment has a direction.
     """
     silence = model.classes.index(SILENCE) if SILENCE in model.classes else -1
     located = zip(target.tolist(), sightings, strict=False)
@@ -101,17 +85,9 @@ def _weights(target: Indices, sightings: Sequence[DirectionSample], classes: int
 def evidence_of(
     classifier: Classifier, sightings: Sequence[DirectionSample | None]
 ) -> Float64 | None:
-    """Return the direction evidence of segments for `Classifier.classify`.
+    """Return the direction evidence [shape=(n, C)] of n segments for `Classifier.classify`.
 
-    Parameters
-    ----------
-    sightings : sequence of (DirectionSample or None)
-        Of n segments; empty if none has a direction.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64, or None
-        None without any direction.
+    None without any direction; `sightings` is empty then.
     """
     evidence = np.zeros((len(sightings), len(classifier.classes)))
     for row, one in enumerate(sightings):

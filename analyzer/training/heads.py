@@ -28,17 +28,10 @@ _STEPS = 200  # of a regression
 
 
 class LinearHeads(NamedTuple):
-    """Linear heads as stored in a model.
+    """Linear heads as stored in a model."""
 
-    Attributes
-    ----------
-    weights : np.ndarray [shape=(H, W, C)], int32
-        In units of `hearthlog.models.classifiers.evidence.UNIT`.
-    bias : np.ndarray [shape=(H, C)], int32
-    """
-
-    weights: Int32
-    bias: Int32
+    weights: Int32  # [shape=(H, W, C)], in `hearthlog.models.classifiers.evidence.UNIT`
+    bias: Int32  # [shape=(H, C)]
 
 
 def learn_heads(
@@ -47,15 +40,10 @@ def learn_heads(
     inputs: Sequence[slice],
     seen: Bool | None = None,
 ) -> LinearHeads:
-    """Fit heads, each with its temperature from held-out collections.
+    """Fit heads on `seen` windows [shape=(m,)]; held-out collections give the temperature of each.
 
     Ridge regression suits classes of few sources: a logistic head separates nine coughs by any
     feature they share, ridge regression weights features by their variation over all windows.
-
-    Parameters
-    ----------
-    seen : np.ndarray [shape=(m,)], bool, optional
-        Windows allowed for training; all by default.
     """
     sound = np.array([name != SILENCE for name in classes])[windows.target]
     chosen = sound if seen is None else sound & seen
@@ -75,25 +63,12 @@ def learn_heads(
 def regressed(  # noqa: PLR0913
     inputs: Float64, truth: Float64, weight: Float64, before: Float64, pull: Float64, *, free: bool
 ) -> tuple[Float64, Float64]:
-    """Fit weights and biases of a correction to decision values.
+    """Fit weights [shape=(d, C)] and biases [shape=(C,)] of a correction to decision values.
 
-    This is multinomial logistic regression.
-
-    Parameters
-    ----------
-    inputs : np.ndarray [shape=(n, d)], float64
-    truth : np.ndarray [shape=(n, C)], float64
-        Target probabilities of the classes.
-    weight : np.ndarray [shape=(n,)], float64
-    before : np.ndarray [shape=(n, C)], float64
-        Log probabilities before the correction, up to a constant.
-    pull : np.ndarray [shape=(C,)], float64
-        Regularisation of weights and biases to zero.
-
-    Returns
-    -------
-    weights : np.ndarray [shape=(d, C)], float64
-    biases : np.ndarray [shape=(C,)], float64
+    This is multinomial logistic regression of `inputs` [shape=(n, d)]. `truth` [shape=(n, C)] has
+    target probabilities, `weight` [shape=(n,)]; `before` [shape=(n, C)] has log probabilities
+    before the correction, up to a constant; `pull` [shape=(C,)] regularises weights and biases to
+    zero.
     """
     width, count = inputs.shape[1], before.shape[1]
     pulls = np.tile(pull, (width + 1, 1))
@@ -153,13 +128,7 @@ def _calibrated(
 
 
 class _Sums:
-    """Sums over windows by class, collection and unit, each of which can be held out.
-
-    Parameters
-    ----------
-    values : np.ndarray [shape=(m, d)], float64
-    target, collection, unit : np.ndarray [shape=(m,)], intp
-    """
+    """Sums over windows by class, collection and unit, each of which can be held out."""
 
     def __init__(
         self, values: Float64, target: Indices, collection: Indices, unit: Indices
@@ -252,10 +221,7 @@ def head_inputs_of(network: str) -> HeadInputs:
 def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
     """Return which head windows must be excluded when segments are held out.
 
-    Parameters
-    ----------
-    unseen : np.ndarray [shape=(k,)], intp
-        Held-out segments; sources and collections are excluded if all their segments are held out.
+    Sources and collections are excluded if all their segments are held out.
     """
     seen = np.setdiff1d(np.arange(len(data)), unseen)
     lost = np.zeros(len(data.embedding_windows.target), bool)
@@ -270,12 +236,9 @@ def unseen_windows(data: Dataset, unseen: Indices) -> Bool:
 def cross_validated_heads(
     data: Dataset, mix: EmbeddingMix, inputs: Sequence[slice], folds: Sequence[Fold]
 ) -> Float64:
-    """Return the outputs of heads for held-out segments.
+    """Return the outputs of heads for held-out segments [shape=(n, C)].
 
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
-        As from `EmbeddingHeads.log_probabilities`; NaN for segments without an embedding or fold.
+    As from `EmbeddingHeads.log_probabilities`; NaN for segments without an embedding or fold.
     """
     by_heads = np.full((len(data), len(data.classes)), np.nan)
     for _, unseen in folds:
@@ -294,50 +257,29 @@ def can_learn_heads(data: Dataset) -> bool:
 
 
 class Tried(NamedTuple):
-    """A cross-validation scheme and the held-out decisions of a classifier.
-
-    Attributes
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        Of the classifier, times its inverse temperature.
-    used : np.ndarray [shape=(n,)], bool
-        Segments for fitting the temperature of the mix.
-    """
+    """A cross-validation scheme and the held-out decisions of a classifier."""
 
     folds: Sequence[Fold]
-    decisions: Float64
-    used: Bool
+    decisions: Float64  # [shape=(n, C)]; times the inverse temperature
+    used: Bool  # [shape=(n,)]; segments for fitting the temperature of the mix
 
 
 class Mixture(NamedTuple):
-    """Fitted heads and temperature of the mix.
-
-    Attributes
-    ----------
-    of_sources, of_collections : np.ndarray [shape=(n, C)], float64
-        Log probabilities of held-out segments; each fold uses the temperature of the other folds.
-    """
+    """Fitted heads and temperature of the mix, with log probabilities of held-out segments."""
 
     mix: EmbeddingMix
     heads: LinearHeads
-    of_sources: Float64
-    of_collections: Float64 | None
+    of_sources: Float64  # [shape=(n, C)]; each fold uses the temperature of the others
+    of_collections: Float64 | None  # [shape=(n, C)]; likewise
 
 
 class BestMix(NamedTuple):
-    """The best mix of heads, names and classifier.
-
-    Attributes
-    ----------
-    by_heads : list of np.ndarray [shape=(n, C)], float64
-        Outputs of heads for segments, by cross-validation scheme.
-    left_out : list of np.ndarray [shape=(n, C)], float64
-        Log probabilities of held-out segments, with the temperature of the other folds.
-    """
+    """The best mix of heads, names and classifier."""
 
     mix: EmbeddingMix
     inputs: tuple[slice, ...]
-    by_heads: list[Float64]
+    by_heads: list[Float64]  # of each scheme [shape=(n, C)], outputs of heads for segments
+    # [shape=(n, C)]; log probabilities, with the temperature of other folds
     left_out: list[Float64]
 
 
@@ -347,12 +289,7 @@ def best_mix(data: Dataset, taken: HeadInputs, ways: Sequence[Tried]) -> BestMix
     Class names of the network detect sounds of no class of the scenario. Where the classes are a
     few sounds among all others, such as sounds of water, names can also replace the trained head
     for a class. The mix with the best score on held-out segments is chosen; a mix with such names
-    may score slightly worse.
-
-    Parameters
-    ----------
-    ways : sequence of Tried
-        At least one.
+    may score slightly worse. `ways` has at least one.
     """
     single = _plain(taken, taken.inputs[:1])
     by_head = [
@@ -376,7 +313,7 @@ def best_mix(data: Dataset, taken: HeadInputs, ways: Sequence[Tried]) -> BestMix
 def _candidates(
     data: Dataset, taken: HeadInputs
 ) -> Iterator[tuple[tuple[slice, ...], list[NamesHead], float]]:
-    """Yield the mixes to compare: inputs of linear heads, names, and their advantage in score.
+    """Yield inputs of linear heads, names, and their advantage in score, of each mix to compare.
 
     A class of few sources cannot be scored without names.
     """
@@ -406,10 +343,7 @@ def learn_mixture(
 ) -> Mixture:
     """Fit heads and the temperature of their mix with a classifier.
 
-    Parameters
-    ----------
-    collections : Tried or None
-        None if there are too few collections.
+    `collections` is None if there are too few collections.
     """
     ways = [sources] if collections is None else [sources, collections]
     best = best_mix(data, taken, ways)
@@ -434,10 +368,7 @@ def _plain(taken: HeadInputs, inputs: Sequence[slice]) -> EmbeddingMix:
 def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | None:
     """Return the head that detects unknown sounds by the class names of a network.
 
-    Returns
-    -------
-    NamesHead or None
-        None without a class `unknown`, or if no other class has a name.
+    None without a class `unknown`, or if no other class has a name.
     """
     first, groups = taken.inputs[-1].start, taken.groups
     known = [name for name in classes if name not in {SILENCE, UNKNOWN}]

@@ -8,23 +8,11 @@ from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 
 def viterbi(probabilities: Float32, transitions: Float64, weight: float = 1.0) -> Indices:
-    """Decode the likeliest path through a whole sound; all classes are equally likely to begin it.
+    """Decode the likeliest path [shape=(n,)] through a complete sound; its first class is any.
 
-    Parameters
-    ----------
-    probabilities : np.ndarray [shape=(n, C)], float32
-        Of the classes, frame by frame, 0 to 1.
-    transitions : np.ndarray [shape=(C, C)], float64
-        Probability that a frame of the row's class is followed by one of the column's class.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], intp
-        Index of the class of each frame.
-
-    References
-    ----------
-    Viterbi, "Error bounds for convolutional codes", 1967.
+    `probabilities` [shape=(n, C)] are 0 to 1; `transitions` [shape=(C, C)] of a frame of the row's
+    class to one of the column's class. Source: Viterbi, "Error bounds for convolutional codes",
+    1967.
     """
     count = len(transitions)
     model = _LikelihoodHMM(count)

@@ -55,33 +55,19 @@ _AROUND = 2 * NANOSECONDS  # covers the extension of a short mark
 
 @dataclass(frozen=True)
 class HomeSound:
-    """Sound of one microphone in one log, with its review.
-
-    Attributes
-    ----------
-    stamps, frames : np.ndarray [shape=(n,)], int64
-        Start of each frame in nanoseconds of UTC, and its number.
-    values : np.ndarray [shape=(n, d)], float32
-        Features; d is 0 if they are of another set.
-    floors : np.ndarray [shape=(n, b)], float64, or None
-        Floor of the room; None for a feature set without bands.
-    directions : Directions
-        Directions from an array; empty if only features were requested.
-    embeddings : Embeddings
-        Embeddings of the requested network; empty for other networks.
-    """
+    """Sound of one microphone in one log, with its review."""
 
     log: Path
     microphone: str
     marks: Sequence[Mark]
     reviewed: Sequence[ReviewedSpan]
-    stamps: Int64
-    frames: Int64
-    values: Float32
-    floors: Float64 | None
+    stamps: Int64  # [shape=(n,)]; start of each frame in nanoseconds of UTC
+    frames: Int64  # [shape=(n,)]; numbers
+    values: Float32  # [shape=(n, d)]; d is 0 if they are of another feature set
+    floors: Float64 | None  # [shape=(n, b)]; None for a feature set without bands
     labelling: str = LIVE
-    directions: Directions = NOWHERE
-    embeddings: Embeddings = NO_EMBEDDINGS
+    directions: Directions = NOWHERE  # from an array; empty if only features were requested
+    embeddings: Embeddings = NO_EMBEDDINGS  # of the requested network; empty for other networks
     embedding: EmbeddingSpace | None = None
 
     @property
@@ -100,15 +86,7 @@ class HomeSound:
         return [(span.start, span.end) for span in self.reviewed if span.chosen == RANDOM]
 
     def inside(self, spans: Sequence[tuple[int, int]], aside: int = 0) -> Bool:
-        """Return which frames overlap spans of time.
-
-        Parameters
-        ----------
-        spans : sequence of (int, int)
-            Starts and ends in nanoseconds of UTC.
-        aside : int
-            Extension of each span at both ends, in nanoseconds.
-        """
+        """Return which frames overlap spans, extended by `aside` at both ends, in nanoseconds."""
         change = np.zeros(len(self.stamps) + 1, np.int64)
         times = np.array(spans, np.int64).reshape(-1, 2) + np.array([-aside, aside])
         first = np.searchsorted(self.stamps + FRAME_NANOSECONDS, times[:, 0], "right")
@@ -161,14 +139,9 @@ def read_sound_of(
 ) -> Iterator[HomeSound]:
     """Read the sound of microphones in a part of a log, and some seconds around it.
 
-    Frames logged coarsely for privacy are dropped: their values are not those of real sound.
-
-    Raise `LogError` if the log or its review layer is damaged.
-
-    Parameters
-    ----------
-    limits : (int, int)
-        Start and end of the part, in nanoseconds of UTC. Floor tracking starts ten minutes earlier.
+    `limits` are start and end in nanoseconds of UTC; floor tracking starts ten minutes earlier.
+    Frames logged coarsely for privacy are dropped: their values are not those of real sound. Raise
+    `LogError` if the log or its review layer is damaged.
     """
     marks, reviewed = read_review(log).get(scenario, ((), ()))
     names = {topic(microphone, "features"): microphone for microphone in sorted(microphones)}
@@ -213,16 +186,9 @@ def _directions(log: Path, microphone: str, limits: tuple[int, int]) -> Directio
 def with_embeddings(
     sound: HomeSound, limits: tuple[int, int], space: EmbeddingSpace | None
 ) -> HomeSound:
-    """Read the embeddings of a part of a log, if a model uses them.
+    """Read the embeddings between limits in nanoseconds of UTC, if a model uses them (`space`).
 
     Raise `LogError` if the log has embeddings that no recorder writes.
-
-    Parameters
-    ----------
-    limits : (int, int)
-        Start and end of the part, in nanoseconds of UTC.
-    space : EmbeddingSpace or None
-        Embeddings that the model uses; None without embeddings.
     """
     name = topic(sound.microphone, "embedding")
     start, end = limits[0] - _AROUND, limits[1] + _AROUND
@@ -326,22 +292,14 @@ def home_recordings(
 def marked_recordings(
     sounds: Iterable[HomeSound], folder: Path, features: FeatureSet, gate: float
 ) -> Iterator[Recording]:
-    """Cut marks out of the sound of a home.
+    """Cut marks, or parts of them between gaps, out of the sound of a home, log by log.
 
     A mark shorter than a second is extended to one second; a short mark of silence is dropped
     instead, because its second contains other sounds. All marks of a UTC day form one group, and so
     does an enrolled recording. An enrolled sound has no room, unless it is silence.
 
-    Parameters
-    ----------
-    gate : float
-        Marks with no sound this many dB above the floor of the room are dropped, except silence; a
-        `HearthlogWarning` counts them and marks of unrecorded time. 0 disables the gate.
-
-    Yields
-    ------
-    Recording
-        A mark, or a part of one between gaps; log by log.
+    Marks with no sound `gate` dB above the floor of the room are dropped, except silence; a
+    `HearthlogWarning` counts them and marks of unrecorded time. 0 disables the gate.
     """
     quiet: list[str] = []
     missing: list[str] = []
@@ -435,13 +393,7 @@ def _recordings(
 def recording_of(
     sound: HomeSound, label: str, frames: Indices, *, floored: bool = True
 ) -> Recording:
-    """Cut successive frames out of the sound of a home.
-
-    Parameters
-    ----------
-    frames : np.ndarray [shape=(n,)], intp
-        Indices of the frames.
-    """
+    """Cut successive frames, by index, out of the sound of a home."""
     stamps = sound.stamps[frames]
     span = int(stamps[0]), int(stamps[-1]) + FRAME_NANOSECONDS
     embedded = _embedded(sound, frames)

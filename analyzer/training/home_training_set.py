@@ -54,38 +54,20 @@ _NOT_LOOKED_AT = (
 
 
 class HomeTrainingSet(NamedTuple):
-    """Training set of a home.
+    """Training set of a home."""
 
-    Attributes
-    ----------
-    segments : Dataset
-        With the classes of the originally adapted model, followed by new ones; empty if no mark can
-        be used for training.
-    nothing : str
-        Reason for an empty training set; empty if there is one.
-    """
-
+    # classes of the originally adapted model, then new ones; empty if no mark can be used
     segments: Dataset
     notes: list[str]
-    nothing: str
+    nothing: str  # reason for an empty training set
 
 
 def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> HomeTrainingSet:
     """Read the training marks of a home, and pseudo-labels that preserve the model.
 
-    Parameters
-    ----------
-    scenario : str, optional
-        Name of the model's scenario: only marks of this scenario are used;
-        by default only marks without a scenario.
-
-    Raises
-    ------
-    LogError
-        If there is no log, or if a log or a layer is damaged.
-    DataError
-        If there are marks, and all of them are in logs of other feature sets, or if there is no
-        silence for rehearsal.
+    Only marks of the scenario are used; by default only marks without one. Raise `LogError` if
+    there is no log, or if a log or a layer is damaged; `DataError` if there are marks, and all of
+    them are in logs of other feature sets, or if there is no silence for rehearsal.
     """
     features = feature_set(model.description.feature_set)
     marked: list[Recording] = []
@@ -183,11 +165,10 @@ class _Counts:
 def _with_new_classes(
     marked: Sequence[Recording], model: Model, features: FeatureSet
 ) -> tuple[Scenario, list[str], set[str]]:
-    """Return a scenario extended by classes with enough marks.
+    """Return a scenario extended by classes with enough marks, shortfalls, and untrainable labels.
 
     A label that the scenario maps to `unknown` becomes a class like any other, and is trained as
-    unknown until then. Also return the shortfalls of other classes, and the labels that cannot be
-    trained.
+    unknown until then.
     """
     known = scenario_of(model).with_classes(base_classes(model))
     as_unknown = set(known.classes.get(UNKNOWN, ())) - {OTHER_NEGATIVE}

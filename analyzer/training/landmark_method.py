@@ -70,16 +70,10 @@ class LandmarkMethod(KernelMethod):
     def imitate(
         self, inputs: Float32, target: Indices, weight: Float64, truth: Float64
     ) -> tuple[Machine, dict[str, NDArray[Any]], dict[str, Any]]:
-        """Fit to target probabilities of windows.
+        """Fit to target probabilities `truth` [shape=(n, C)] of windows [shape=(n, width)].
 
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-        target : np.ndarray [shape=(n,)], intp
-            Class for which a window may become a landmark; each class has a window.
-        weight : np.ndarray [shape=(n,)], float64
-        truth : np.ndarray [shape=(n, C)], float64
-            Probabilities of the classes.
+        `target` [shape=(n,)] is the class for which a window may become a landmark; each class has
+        a window.
         """
         classes = truth.shape[1]
         if self.landmarks < classes:
@@ -104,12 +98,9 @@ class LandmarkMethod(KernelMethod):
 
 
 class LandmarkMap:
-    """Landmark kernels, and the root that turns their products into the kernel.
+    """Landmark kernels, and the root of the inverse kernel matrix of landmarks [shape=(m, m)].
 
-    Attributes
-    ----------
-    root : np.ndarray [shape=(m, m)], float64
-        Inverse square root of the kernel matrix of the landmarks.
+    Products times the root give the kernel.
     """
 
     def __init__(self, arrays: Mapping[str, Array], parameters: LandmarkParameters) -> None:
@@ -135,15 +126,9 @@ def centres(  # noqa: PLR0913, PLR0917
     most: int,
     seed: int = 0,
 ) -> tuple[Float32, Indices]:
-    """Return k-means centres of the windows of each class, and their number.
+    """Return k-means centres of the windows [shape=(n, width)] of each class, and their number.
 
-    Parameters
-    ----------
-    inputs : np.ndarray [shape=(n, width)], float32
-    target : np.ndarray [shape=(n,)], intp
-    weight : np.ndarray [shape=(n,)], float64
-    most : int
-        Maximum number of centres; each class with a window has at least one.
+    There are at most `most` centres; each class with a window has at least one.
     """
     scaled = Scaler(scaler)(inputs)
     windows = np.bincount(target)

@@ -16,19 +16,7 @@ _ROUNDING = 0.01  # of the standard deviation
 
 
 def spread_over_classes(target: Indices, weight: Float64, most: int, seed: int) -> Indices:
-    """Choose windows at random, highest weights first, but fewer of the large classes.
-
-    Parameters
-    ----------
-    target : np.ndarray [shape=(n,)], intp
-        Their classes.
-    weight : np.ndarray [shape=(n,)], float64
-
-    Returns
-    -------
-    np.ndarray [shape=(most,)], intp
-        Indices of the windows.
-    """
+    """Choose `most` windows at random, highest weights first, but fewer of the large classes."""
     shuffled = np.random.default_rng(_SEED + seed).permutation(len(target))
     shuffled = shuffled[np.argsort(-weight[shuffled], kind="stable")]
     order = np.argsort(target[shuffled], kind="stable")
@@ -39,18 +27,7 @@ def spread_over_classes(target: Indices, weight: Float64, most: int, seed: int) 
 
 
 def balanced(target: Indices, weight: Float64) -> Float64:
-    """Return window weights scaled inversely to the size of the class, as scikit-learn does.
-
-    Parameters
-    ----------
-    target : np.ndarray [shape=(n,)], intp
-        Numbers of their classes.
-    weight : np.ndarray [shape=(n,)], float64
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-    """
+    """Return weights scaled inversely to the size of the class, as scikit-learn does."""
     counts = np.bincount(target)
     costs = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
     weighted: Float64 = weight * costs[target]
@@ -68,13 +45,7 @@ def scaler_arrays(scaler: StandardScaler) -> dict[str, NDArray[Any]]:
 
 
 def rounded_to_steps(scaler: StandardScaler, steps: int | None) -> Pipeline:
-    """Return a scaler with the rounding of the trained SVM.
-
-    Parameters
-    ----------
-    steps : int or None
-        Steps per standard deviation; None disables rounding.
-    """
+    """Return a scaler with the rounding of the trained SVM, in steps per standard deviation."""
     if steps is None:
         return make_pipeline(scaler)
     rounding = FunctionTransformer(_rounded_to_steps, kw_args={"steps": steps})
@@ -86,16 +57,9 @@ def _rounded_to_steps(scaled: Float64, steps: int) -> Float64:
 
 
 def rounded(inputs: Float32) -> Float32:
-    """Round inputs to half precision, which halves the size of a model file.
+    """Round inputs [shape=(n, width)] to half precision, which halves the size of a model file.
 
-    Parameters
-    ----------
-    inputs : np.ndarray [shape=(n, width)], float32
-
-    Returns
-    -------
-    np.ndarray [shape=(n, width)], float32
-        Unchanged if the error would exceed a hundredth of the standard deviation of an input.
+    They stay unchanged if the error would exceed a hundredth of the standard deviation of an input.
     """
     with np.errstate(over="ignore"):
         half = inputs.astype(np.float16).astype(np.float32)
@@ -104,15 +68,9 @@ def rounded(inputs: Float32) -> Float32:
 
 
 def kept_inputs(model: Model) -> tuple[Float32, Indices] | None:
-    """Return the training inputs that a model has stored.
+    """Return the inputs [shape=(n, width)] and class indices that a model has stored, if any.
 
     An adapted model has those of its base.
-
-    Returns
-    -------
-    inputs : np.ndarray [shape=(n, width)], float32
-    target : np.ndarray [shape=(n,)], intp
-        Indices of the classes. None in place of both if the kind of classifier stores none.
     """
     arrays = model.arrays
     if "landmarks" in arrays:

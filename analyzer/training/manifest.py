@@ -22,38 +22,22 @@ SIZE_LIMIT = 64 << 20  # half a million clips; a larger file is no manifest
 
 @dataclass(frozen=True)
 class LabelledClip:
-    """One labelled recording.
-
-    Attributes
-    ----------
-    source, licence : str
-        Collection and licence; empty if the manifest has none.
-    start, end : float
-        Labelled part of the file in seconds; an infinite `end` is the end of the file.
-    """
+    """One labelled recording."""
 
     path: Path
     label: str
     source_group: str
-    source: str
-    licence: str
-    start: float = 0.0
-    end: float = math.inf
+    source: str  # collection; empty if the manifest has none
+    licence: str  # likewise
+    start: float = 0.0  # in seconds of the file
+    end: float = math.inf  # infinite for the end of the file
 
 
 class SkippedClip(NamedTuple):
-    """A clip that is excluded from training.
+    """A clip that is excluded from training."""
 
-    Attributes
-    ----------
-    reason : str
-        The same text for clips with the same problem.
-    clip : str
-        Identifies the clip, with details.
-    """
-
-    reason: str
-    clip: str
+    reason: str  # the same text for clips with the same problem
+    clip: str  # identifies the clip, with details
 
 
 def left_out_lines(left_out: Sequence[SkippedClip]) -> list[str]:
@@ -85,30 +69,16 @@ class _RowError(DataError):
 def read_manifest(
     path: Path, labels: Collection[str], left_out: list[SkippedClip] | None = None
 ) -> list[LabelledClip]:
-    """Read a manifest with the columns path, label, source_group.
+    """Read a manifest with the columns path, label, source_group: at least one clip, in its order.
 
-    Parameters
-    ----------
-    path : Path
-        CSV, UTF-8; its paths are relative to its folder. Optional columns are source,
-        licence, start and end; others are ignored.
-    labels : collection of str
-        Allowed labels; synonyms (`hearthlog.models.classes`) are allowed too.
-    left_out : list of SkippedClip, optional
-        Collects invalid lines, which raise an error by default.
+    The CSV is in UTF-8; its paths are relative to its folder. Optional columns are source, licence,
+    start and end; others are ignored. Synonyms (`hearthlog.models.classes`) of allowed labels are
+    allowed too. Invalid lines are collected in `left_out`, or raise an error without it.
 
-    Returns
-    -------
-    list of LabelledClip
-        In the order of the file; at least one.
-
-    Raises
-    ------
-    DataError
-        With file and line, if a column, a value or an audio file is missing, a label is unknown,
-        a start and an end are no part of a file, or the same clip, or part of it, is listed twice;
-        if the file lists no clip, or is no CSV in UTF-8; if it cannot be read, or is larger than
-        64 MiB.
+    Raise `DataError`, with file and line, if a column, a value or an audio file is missing, a label
+    is unknown, a start and an end are no part of a file, or the same clip, or part of it, is listed
+    twice; if the file lists no clip, or is no CSV in UTF-8; if it cannot be read, or is larger than
+    64 MiB.
     """
     lines = csv_records(path, read_text(path, "manifest", SIZE_LIMIT))
     first = next(lines, None)
@@ -224,15 +194,10 @@ class Scenario:
         return {label: name for name, labels in self.classes.items() for label in labels}
 
     def find(self, label: str, *, marked: bool = False) -> str | None:
-        """Return the class of a label.
+        """Return the class of a label; None if the label is ignored, or in no class.
 
         A class that lists the label itself takes precedence. Otherwise a class that lists a synonym
         (see `hearthlog.models.classes`) is used, unless two classes do.
-
-        Returns
-        -------
-        str or None
-            Name of the class; None if the label is ignored, or in no class.
         """
         if marked and label == sound.UNKNOWN:  # a reviewer could not decide
             return None
@@ -245,11 +210,8 @@ class Scenario:
     def with_unknown(self, sources: Iterable[tuple[str, str]]) -> "Scenario":
         """Return this scenario with a class `unknown` for all labels outside its classes.
 
-        Returns
-        -------
-        Scenario
-            Unchanged if it has class `unknown` or the maximum number of classes, or if fewer than
-            five sources have such labels.
+        Unchanged if it has class `unknown` or the maximum number of classes, or if fewer than five
+        sources have such labels.
         """
         listed = self.class_of.keys() | self.ignored
         others = {(label, group) for label, group in sources if not sound.meant_by(label, listed)}
@@ -299,19 +261,14 @@ def scenario_of(model: Model) -> Scenario:
 
 
 def load_scenario(name: str) -> Scenario:
-    """Return a built-in scenario, or read one from a TOML file.
+    """Return a built-in scenario, `bathroom` or `general`, or read one from a TOML file.
 
     The file has a table `[classes]`, `name = ["label", ...]`, and may have `ignore = ["label",
-    ...]` above it.
+    ...]` above it; its stem becomes the name.
 
     Raise `DataError` if there is no such scenario, or if the file cannot be read, is no TOML, has
     an unknown key, fewer than 2 classes or more than `MOST_CLASSES`, an invalid name of a class, or
     one label in two places, or if the labels of a class are no list of texts.
-
-    Parameters
-    ----------
-    name : str
-        `bathroom`, `general`, or the path of a `.toml` file, whose stem becomes the name.
     """
     if name in BUILTIN:
         return BUILTIN[name]

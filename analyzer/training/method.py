@@ -25,36 +25,17 @@ _PLACES = (10, 50)  # frames at which windows of an empty room begin
 
 
 class Examples(NamedTuple):
-    """Inputs of segments, unchanged and augmented, window by window.
+    """Inputs of segments, unchanged and augmented, window by window."""
 
-    Attributes
-    ----------
-    inputs : np.ndarray [shape=(versions, n, places, width)], float32
-        Of the windows in each segment; the first version is the unchanged one.
-    usable : np.ndarray [shape=(versions, n, places)], bool
-        Windows allowed for training; tests use all windows of the first version.
-    target : np.ndarray [shape=(n,)], intp
-    weight : np.ndarray [shape=(n,)], float64
-    more_inputs : np.ndarray [shape=(m, width)], float32
-        Inputs of further windows that are always in the training set.
-    more_target : np.ndarray [shape=(m,)], intp
-    """
-
-    inputs: Float32
-    usable: Bool
-    target: Indices
-    weight: Float64
-    more_inputs: Float32
-    more_target: Indices
+    inputs: Float32  # [shape=(versions, n, places, width)]; the first version is unchanged
+    usable: Bool  # [shape=(versions, n, places)]; training windows; tests use all of version 0
+    target: Indices  # [shape=(n,)]
+    weight: Float64  # [shape=(n,)]
+    more_inputs: Float32  # [shape=(m, width)]; further windows, always in the training set
+    more_target: Indices  # [shape=(m,)]
 
     def windows(self, seen: Indices | slice) -> tuple[Float32, Indices, Float64]:
-        """Return inputs, classes and weights of the training windows.
-
-        Parameters
-        ----------
-        seen : np.ndarray [shape=(m,)], intp, or slice
-            Indices of segments.
-        """
+        """Return inputs, classes and weights of the training windows of some segments."""
         usable = self.usable[:, seen]
         shape = usable.shape
         target = np.broadcast_to(self.target[seen][:, np.newaxis], shape)[usable]
@@ -66,17 +47,7 @@ class Examples(NamedTuple):
         )
 
     def decide(self, learned: "Learned", unseen: Indices, classes: int) -> Float64:
-        """Return decision values of segments: means over their windows.
-
-        Parameters
-        ----------
-        unseen : np.ndarray [shape=(m,)], intp
-            Indices of segments.
-
-        Returns
-        -------
-        np.ndarray [shape=(m, C)], float64
-        """
+        """Return decision values [shape=(m, C)] of `unseen` segments: means over their windows."""
         inputs = self.inputs[0, unseen]
         decisions = learned.decide(inputs.reshape(-1, inputs.shape[-1]), classes)
         means: Float64 = decisions.reshape(*inputs.shape[:2], classes).mean(axis=1)
@@ -253,18 +224,10 @@ def _usable(
 
 
 def loud_windows(power: Float64, window_frames: int, least: Float64 | None = None) -> Bool:
-    """Return which windows are at most 6 dB below their segment.
+    """Return which windows [shape=(n, places)] are at most 6 dB below their segment.
 
-    Parameters
-    ----------
-    power : np.ndarray [shape=(n, f)], float64
-        Mean squares of the frames of each segment.
-    least : np.ndarray [shape=(n, 1)], float64, optional
-        Additional minimum power of a window.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, places)], bool
+    `power` [shape=(n, f)] has mean squares of the frames of each segment; `least` [shape=(n, 1)] is
+    an additional minimum power of a window.
     """
     places = window_places(power.shape[1], window_frames)
     windows = [power[:, place : place + window_frames].mean(axis=1) for place in places]

@@ -43,16 +43,10 @@ _MOST_SILENT = 2000  # of silence, mostly below the gate
 
 
 class Candidates(NamedTuple):
-    """Segments that may keep the labels of the model.
-
-    Attributes
-    ----------
-    target : np.ndarray [shape=(n,)], intp
-        Their classes.
-    """
+    """Segments that may keep the labels of the model."""
 
     recordings: list[Recording]
-    target: Indices
+    target: Indices  # [shape=(n,)]; their classes
 
 
 def confirmed_segments(
@@ -104,20 +98,11 @@ def labelled_segments(
 def chosen(
     candidates: Iterable[Candidates], model: Model, least: float = SURE, fewest: int = FEWEST
 ) -> list[Recording]:
-    """Choose segments of each class with high model probability, evenly spaced if possible.
+    """Choose up to 60 segments of each class with high model probability, evenly if possible.
 
-    Parameters
-    ----------
-    least : float
-        Minimum probability.
-    fewest : int
-        Minimum number of a class: filled up with the most probable segments.
-
-    Returns
-    -------
-    list of Recording
-        At most 60 of a class, all with this label by the model. Silence below the gate of the
-        model, which needs no training, is used only if other silence is scarce.
+    `least` is the minimum probability; `fewest`, the minimum number of a class, is reached with the
+    most probable segments. Silence below the gate of the model, which needs no training, is used
+    only if other silence is scarce.
     """
     recordings, target = _joined(candidates)
     if not recordings:
@@ -169,10 +154,7 @@ def _classes_of(sound: HomeSound, labelling: Labelling, classes: Sequence[str]) 
 def _cut(
     sound: HomeSound, target: Indices, classes: Sequence[str], segment_frames: int
 ) -> Candidates:
-    """Cut segments by the class at their centre (silence: throughout), away from marks.
-
-    Segments contain no frame of class -1.
-    """
+    """Cut segments by the class at their centre (silence: throughout), away from marks and -1."""
     marks = [(mark.start, mark.end) for mark in sound.marks]
     away = ~sound.inside(marks, _ASIDE) & ~sound.inside(sound.drawn)
     silence = classes.index(SILENCE) if SILENCE in classes else -2
@@ -208,8 +190,7 @@ def _probabilities(
 ) -> tuple[Float64, Bool]:
     """Return the model's probabilities of segments, and which are below its gate.
 
-    Probabilities are over the training windows: all of silence, else windows at most 6 dB below the
-    segment.
+    They are over the training windows: all of silence, else those at most 6 dB below the segment.
     """
     classifier = Classifier(model)
     features, inputs = classifier.feature_set, classifier.inputs
@@ -272,12 +253,7 @@ def unreviewed_silence(
 ) -> Iterator[Candidates]:
     """Cut silence out of some logs of the last two weeks.
 
-    Raise `LogError` if there is no log.
-
-    Parameters
-    ----------
-    scenario : str, optional
-        Scenario of the labels; empty for the sounds of the home.
+    The scenario is empty for the sounds of the home. Raise `LogError` if there is no log.
     """
     recent = _recent(folders)
     for place in np.linspace(len(recent) - 1, 0, min(len(recent), _SILENT_LOGS)).round():
@@ -288,21 +264,10 @@ def unreviewed_silence(
 def unreviewed_sounds(
     folders: Sequence[Path], model: Model, names: Collection[str], scenario: str = ""
 ) -> list[Recording]:
-    """Choose sounds of some classes with a very high model probability.
+    """Choose up to 60 one-second sounds of each class with a very high model probability.
 
-    The logs are those of the last two weeks with the longest labelled time of these classes.
-
-    Raise `LogError` if there is no log.
-
-    Parameters
-    ----------
-    scenario : str, optional
-        Scenario of the labels; empty for the sounds of the home.
-
-    Returns
-    -------
-    list of Recording
-        Of one second each, at most 60 of a class.
+    The logs are those of the last two weeks with the longest labelled time of these classes. The
+    scenario is empty for the sounds of the home. Raise `LogError` if there is no log.
     """
     recent = _recent(folders)
     amounts = np.array([_labelled_time(log, names, scenario) for log in recent], np.int64)

@@ -22,33 +22,21 @@ Integers = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class ClassScores:
-    """Scores of one class; None if undefined, such as the recall of an absent class.
-
-    Attributes
-    ----------
-    f1_interval : tuple of float, or None
-        95 %, bootstrap over groups; None with a single group.
-    """
+    """Scores of one class; None if undefined, such as the recall of an absent class."""
 
     precision: float | None
     recall: float | None
     f1: float | None
-    f1_interval: Interval | None
+    f1_interval: Interval | None  # 95 %, bootstrap over groups; None with a single group
     support: int
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of classified segments.
-
-    Attributes
-    ----------
-    macro_f1_interval : tuple of float, or None
-        95 %, bootstrap over groups; None with a single group.
-    """
+    """Scores of classified segments."""
 
     macro_f1: float
-    macro_f1_interval: Interval | None
+    macro_f1_interval: Interval | None  # 95 %, bootstrap over groups; None with a single group
     macro_precision: float
     macro_recall: float
     per_class: dict[str, ClassScores]
@@ -60,34 +48,20 @@ class Scores:
 
 @dataclass(frozen=True)
 class Bin:
-    """Segments with the probability of the winning class in one of 15 equal ranges.
-
-    Attributes
-    ----------
-    confidence : float
-        Mean probability of the winning class.
-    """
+    """Segments with the probability of the winning class in one of 15 equal ranges."""
 
     bin: int
-    confidence: float
+    confidence: float  # mean probability of the winning class
     accuracy: float
     count: int
 
 
 @dataclass(frozen=True)
 class F1Difference:
-    """Macro F1 of a second model minus that of a first on the same segments.
-
-    Attributes
-    ----------
-    macro_f1 : float
-        Positive if the second model is better.
-    interval : tuple of float, or None
-        95 %, paired bootstrap over groups; None with a single group.
-    """
+    """Macro F1 of a second model minus that of a first on the same segments."""
 
     macro_f1: float
-    interval: Interval | None
+    interval: Interval | None  # 95 %, paired bootstrap over groups; None with a single group
 
 
 def score(
@@ -97,18 +71,10 @@ def score(
     classes: Sequence[str],
     weight: Counts | None = None,
 ) -> Scores:
-    """Compute the scores of predicted classes.
+    """Compute the scores of predicted classes [shape=(n,)].
 
-    Raise `DataError` if there is no segment.
-
-    Parameters
-    ----------
-    target, predicted : np.ndarray [shape=(n,)], int
-        Indices of the true and predicted classes.
-    group : np.ndarray [shape=(n,)], int
-        Numbers of the source groups, which are the resampling units of the intervals.
-    weight : np.ndarray [shape=(n,)], int64, optional
-        Number of segments that a row represents, at least 0; 1 by default.
+    Raise `DataError` if there is no segment. The source groups are the resampling units of the
+    intervals. `weight` is the number of segments that a row represents, at least 0; 1 by default.
     """
     confusions = _confusions(target, predicted, group, len(classes), weight)
     confusion = confusions.sum(axis=0)
@@ -146,16 +112,8 @@ def difference(
 ) -> F1Difference:
     """Compute the macro F1 of model b minus that of model a on the same segments.
 
-    Raise `DataError` if there is no segment.
-
-    Parameters
-    ----------
-    target : np.ndarray [shape=(n,)], int
-        Indices of the true classes.
-    probabilities_a, probabilities_b : np.ndarray [shape=(n, C)], float
-        Of the two models; the class with the highest probability is the predicted one.
-    group : np.ndarray [shape=(n,)], int
-        Numbers of the source groups, which are the resampling units of the interval.
+    The class with the highest of the probabilities [shape=(n, C)] is the predicted one; source
+    groups are the resampling units of the interval. Raise `DataError` if there is no segment.
     """
     first, second = (
         _confusions(target, probabilities.argmax(axis=1), group, len(classes))
@@ -174,41 +132,15 @@ def difference(
 def calibration_error(probabilities: NDArray[np.floating], target: Integers) -> float:
     """Compute the expected calibration error of the winning class, over 15 bins of equal width.
 
-    Parameters
-    ----------
-    probabilities : np.ndarray [shape=(n, C)], float
-        Class probabilities, 0 to 1; at least one row.
-    target : np.ndarray [shape=(n,)], int
-        Indices of the true classes.
-
-    Returns
-    -------
-    float
-        0 (calibrated) to 1.
-
-    References
-    ----------
-    Guo et al., "On Calibration of Modern Neural Networks", 2017.
+    It is 0 (calibrated) to 1. The probabilities [shape=(n, C)] have at least one row. Source: Guo
+    et al., "On Calibration of Modern Neural Networks", 2017.
     """
     place, confidence, right = _binned(probabilities, target)
     return float(np.abs(np.bincount(place, right - confidence)).sum() / len(target))
 
 
 def reliability(probabilities: NDArray[np.floating], target: Integers) -> list[Bin]:
-    """Compute confidence and accuracy of a model by bins; empty bins are dropped.
-
-    Parameters
-    ----------
-    probabilities : np.ndarray [shape=(n, C)], float
-        Class probabilities, 0 to 1.
-    target : np.ndarray [shape=(n,)], int
-        Indices of the true classes.
-
-    Returns
-    -------
-    list of Bin
-        By confidence, ascending.
-    """
+    """Compute confidence and accuracy of probabilities [shape=(n, C)] by non-empty bins."""
     place, confidence, right = _binned(probabilities, target)
     count = np.bincount(place, minlength=_BINS)
     sure = np.bincount(place, confidence, minlength=_BINS)

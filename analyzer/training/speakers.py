@@ -35,10 +35,8 @@ _LEAST_TIMES = 2
 def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterator[Recording]:
     """Read the marks of the voices and of the scenario; each log is a source.
 
-    Enrolled spans of logs are one source if they are less than half an hour apart.
-
-    Raise `LogError` or `DataError` as
-    `hearthlog.analyzer.training.home_recordings.home_recordings` does.
+    Enrolled spans of logs are one source if they are less than half an hour apart. Raise `LogError`
+    or `DataError` as `hearthlog.analyzer.training.home_recordings.home_recordings` does.
     """
     cut: list[Recording] = []
     for folder in folders:
@@ -113,14 +111,9 @@ def speakers_scenario(recordings: Sequence[Recording]) -> Scenario:
 
 
 def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32, Indices]:
-    """Return the training windows of a sound model as silence or unknown of the scenario.
+    """Return the training windows [shape=(n, width)] of a sound model as silence or unknown.
 
     Raise `DataError` if the model has not stored training inputs of the kind that the method uses.
-
-    Returns
-    -------
-    (np.ndarray [shape=(n, width)], np.ndarray [shape=(n,)])
-        Inputs of windows, and the numbers of their classes.
     """
     description = model.description
     from hearthlog.analyzer.training.learned_inputs import (  # noqa: PLC0415  needs scikit-learn

@@ -24,16 +24,10 @@ from hearthlog.schemas.arrays import Float32, Float64, Indices
 class SvmMethod(KernelMethod):
     """Support vector machine with RBF kernel and balanced class weights.
 
-    Support vector machines are the classifiers of "A ROS framework for audio-based activity
-    recognition", section 4.
-
-    Attributes
-    ----------
-    steps : int or None
-        Rounding steps of inputs per standard deviation; None disables rounding.
+    Source: "A ROS framework for audio-based activity recognition", section 4.
     """
 
-    steps: int | None = 50
+    steps: int | None = 50  # rounding steps of inputs per standard deviation; None disables it
 
     def learn(
         self, inputs: Float32, target: Indices, weight: Float64

@@ -82,19 +82,12 @@ def clip_embedder(method: Method) -> ClipEmbedder | None:
 def method_named(name: str) -> Method:
     """Return a method by name.
 
-    Parameters
-    ----------
-    name : str
-        `embedding`, `room`, `room21`, `bands`, `paper`, `svm`, the name of an entry point in the
-        group `hearthlog.methods`, or the name of a network with a card.
+    A name is `embedding`, `room`, `room21`, `bands`, `paper`, `svm`, the name of an entry point in
+    the group `hearthlog.methods`, or the name of a network with a card.
 
-    Raises
-    ------
-    DataError
-        If no method has this name, or both a network and a method have it.
-    ModelError
-        If the entry point cannot be imported, or is no method of this name, or if the card is
-        invalid.
+    Raise `DataError` if no method has this name, or both a network and a method have it;
+    `ModelError` if the entry point cannot be imported, or is no method of this name, or if the card
+    is invalid.
     """
     if is_network(name):
         if _METHODS.has(name):
@@ -112,20 +105,11 @@ _DURATION_SECONDS = 10.0  # of a class outside the table of classes
 
 
 def default_transitions(classes: Sequence[str]) -> Float64:
-    """Return transition probabilities of classes from their expected durations.
+    """Return transition probabilities [shape=(C, C)] of two or more classes from their durations.
 
-    A sound is mostly followed by silence, if that is a class, and seldom by another sound: most
-    changes from one sound to another are errors within one of them.
-
-    Parameters
-    ----------
-    classes : sequence of str
-        Names of the C classes, at least two; a class outside `hearthlog.models.classes` lasts 10 s.
-
-    Returns
-    -------
-    np.ndarray [shape=(C, C)], float64
-        Probability of the column's class in the frame after a frame of the row's class.
+    A value is for the column's class in the frame after a frame of the row's class. A sound is
+    mostly followed by silence, if that is a class, and seldom by another sound: most changes from
+    one sound to another are errors within one of them.
     """
     leave = 1.0 / np.maximum(expected_durations(classes) / FRAME_SECONDS, 1.0)
     is_sound = np.array([class_name(name) != SILENCE for name in classes])
@@ -137,18 +121,7 @@ def default_transitions(classes: Sequence[str]) -> Float64:
 
 
 def expected_durations(classes: Sequence[str]) -> Float64:
-    """Return the expected durations of classes.
-
-    Parameters
-    ----------
-    classes : sequence of str
-        Names of the C classes; a class outside `hearthlog.models.classes` lasts 10 s.
-
-    Returns
-    -------
-    np.ndarray [shape=(C,)], float64
-        In seconds.
-    """
+    """Return durations in seconds; a class outside `hearthlog.models.classes` lasts 10 s."""
     rows = map(find_class, classes)
     return np.array([_DURATION_SECONDS if row is None else row.seconds for row in rows])
 
@@ -157,17 +130,9 @@ _MERGED_WITHIN = 60 * NANOSECONDS
 
 
 def merged_spans(spans: Int64) -> list[list[int]]:
-    """Merge spans of time that are less than a minute apart.
+    """Merge spans [shape=(n, 2)], in any order, that are less than a minute apart (in ns of UTC).
 
-    Parameters
-    ----------
-    spans : np.ndarray [shape=(n, 2)], int64
-        Starts and ends in nanoseconds of UTC, in any order.
-
-    Returns
-    -------
-    list of [start, end]
-        Sorted; the nearest spans are merged too if a description cannot hold all of them.
+    The nearest spans are merged too if a description cannot hold all of them.
     """
     if not len(spans):
         return []
@@ -195,26 +160,15 @@ def train_model(  # noqa: PLR0913, PLR0917
 ) -> Model:
     """Train a model; calibrate and score it on folds that never split a source group.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        Scenario of the data.
-    progress : callable
-        Receives the completed share of the fits, 0 to 1.
-    smoothing : str
-        `hmm` or `merge`, as in field `method` of `Smoothing`.
-    others : (np.ndarray [shape=(k, width)], np.ndarray [shape=(k,)]), optional
-        Inputs of further windows, always in the training set, and their classes, which may have
-        segments of one source group, or none.
+    `progress` receives the completed share of the fits, 0 to 1. `smoothing` is `hmm` or `merge`, as
+    in field `method` of `Smoothing`. `others` has inputs [shape=(k, width)] of further windows,
+    always in the training set, and their classes, which may have segments of one source group, or
+    none.
 
-    Raises
-    ------
-    DataError
-        If a class outside `others` comes from fewer than two source groups, if no division
-        into folds leaves training data for every class, if all segments are equal, or if the
-        method wants augmented copies and its feature set has none.
-    ModelError
-        If the feature set of the method is not installed.
+    Raise `DataError` if a class outside `others` comes from fewer than two source groups, if no
+    division into folds leaves training data for every class, if all segments are equal, or if the
+    method wants augmented copies and its feature set has none; `ModelError` if the feature set of
+    the method is not installed.
     """
     check_varied(data)
     taught = frozenset() if others is None else frozenset(others[1].tolist())

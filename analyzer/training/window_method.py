@@ -36,13 +36,7 @@ class WindowMethod(Method):
         return ("scikit-learn",)
 
     def fit(self, examples: Examples, seen: Indices | slice = slice(None)) -> "LearnedMachine":
-        """Train on some segments.
-
-        Parameters
-        ----------
-        seen : np.ndarray [shape=(m,)], intp, or slice
-            Indices of the training segments; all by default.
-        """
+        """Train on the windows of `seen` segments, by index; all by default."""
         inputs, target, weight = examples.windows(seen)
         if len(inputs) > self.most_windows:
             kept = spread_over_classes(target, weight, self.most_windows, self.seed)
@@ -107,13 +101,7 @@ def as_room(kind: ClassifierKind) -> dict[str, Any]:
 
 
 class LearnedMachine:
-    """A classifier that decides with the recorder's own code.
-
-    Parameters
-    ----------
-    classes : np.ndarray [shape=(c,)], intp
-        Indices of the trained classes; also an attribute.
-    """
+    """A classifier that decides with the recorder's own code, of trained classes [shape=(c,)]."""
 
     def __init__(
         self,
