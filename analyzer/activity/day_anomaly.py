@@ -371,19 +371,9 @@ def _left_out(table: Float64, weekend: Bool, figures: Sequence[DayFigure]) -> Fl
 
 
 def rarity(own: Float64, compared: Compared) -> float:
-    """Return the return period of the deviations.
+    """Return the return period in days, at least 1, of deviations of some days [shape=(k, f)].
 
     Beyond the score that three of ten days exceed, scores are assumed to fall off exponentially.
-
-    Parameters
-    ----------
-    own : np.ndarray [shape=(k, f)], float64
-        Deviations of one day or of successive days.
-
-    Returns
-    -------
-    float
-        In days, 1 or more.
     """
     length = len(own)
     others = sliding_window_view(compared.others, length, axis=0)

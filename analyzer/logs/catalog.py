@@ -121,18 +121,11 @@ _TABLES = "folders", "files", "labels"
 
 
 class Catalog:
-    """The catalogue of a folder: rows of its logs, in memory.
+    """The catalogue of a folder, from an SQLite file and its digest; empty by default.
 
-    Raise `sqlite3.Error` or `ValueError` if the data is no catalogue, or is damaged.
-
-    Parameters
-    ----------
-    data : bytes, optional
-        An SQLite file, and its digest; by default, the catalogue is empty.
-    unusable : sequence of str
-        Errors of the file.
-    tables : sequence of str
-        The tables to check; the others must not be read.
+    It has the rows of its logs, in memory, and `unusable`, errors of the file. Only `tables` are
+    checked; the others must not be read. Raise `sqlite3.Error` or `ValueError` if the data is no
+    catalogue, or is damaged.
     """
 
     def __init__(
@@ -426,16 +419,10 @@ def find_spans(
 ) -> LogSpans:
     """Find the logs of some folders with their first and last log times.
 
-    Raise `LogError` if there is no such log, or none in a folder.
-
-    Parameters
-    ----------
-    span_of : callable
-        Returns first and last log time of a log without a current catalogue row; None drops the
-        log.
-    start, end : int, optional
-        Log times in nanoseconds of UTC, from `start` on, before `end`: outside of this span,
-        catalogue rows of finished logs are trusted without a check.
+    `span_of` returns first and last log time of a log without a current catalogue row; None drops
+    the log. Outside of the span from `start` on, before `end` (log times in nanoseconds of UTC),
+    catalogue rows of finished logs are trusted without a check. Raise `LogError` if there is no
+    such log, or none in a folder.
     """
     catalogs: list[Catalog] = []
     unknown: dict[str, Path] = {}
@@ -477,14 +464,7 @@ class HomeTotals:
 
 @dataclass(frozen=True)
 class LabelAmount:
-    """Minutes, segments and events of one label in one home.
-
-    Attributes
-    ----------
-    events : int
-        Segments of all microphones of a recorder with pauses of at most ten seconds are one
-        event, as everywhere.
-    """
+    """Minutes, segments and events of one label in one home."""
 
     home: str
     kind: str  # kind of the source files: `log`, `relabel`, `review`
@@ -492,7 +472,7 @@ class LabelAmount:
     label: str
     minutes: float
     segments: int
-    events: int
+    events: int  # of all microphones of a recorder; pauses of at most ten seconds
     scenario: str = ""  # empty for the sounds of the home
 
 
@@ -510,11 +490,8 @@ def homes(catalog: Catalog) -> list[HomeTotals]:
 def label_amounts(catalog: Catalog) -> list[LabelAmount]:
     """Return the label totals of each home, by kind of labelling, scenario and model.
 
-    Returns
-    -------
-    list of LabelAmount
-        The sounds of the homes, then the scenarios; each sorted by home, kind, scenario, model
-        and descending minutes.
+    The sounds of the homes come first, then the scenarios; each sorted by home, kind, scenario,
+    model and descending minutes.
     """
     rows = catalog.database.execute(
         # An event may go on in the next log of its recorder.

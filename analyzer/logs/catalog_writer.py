@@ -82,13 +82,8 @@ class LogInventory:
 def read_contents(path: Path, labelling: str) -> LogInventory:
     """Read the inventory of a log, without decoding its features.
 
-    Raise `LogError` if the log cannot be read, or a required part is damaged.
-
-    Parameters
-    ----------
-    labelling : str
-        `live`, `relabel` or `review`; only segments of this labelling, and of its scenarios, are
-        counted.
+    Only segments of the labelling, `live`, `relabel` or `review`, and of its scenarios, are
+    counted. Raise `LogError` if the log cannot be read, or a required part is damaged.
     """
     span = time_span(path)
     with LogFile(path) as file:
@@ -289,10 +284,7 @@ def _labels(contents: LogInventory, scenario: str) -> Iterator[dict[str, Any]]:
 
 
 def _model(record: Mapping[str, str], scenario: str) -> str:
-    """Return the models that labelled a scenario, of all microphones, comma-separated.
-
-    Empty if a person labelled the scenario.
-    """
+    """Return the models of a scenario, of all microphones, comma-separated; empty for a person."""
     models = {one.model for one in recorded_scenarios(record) if one.name == scenario}
     return ", ".join(sorted(models))
 
@@ -308,22 +300,10 @@ def write_catalog(
 ) -> Catalog:
     """Build the catalogue of a folder, and replace the changed parts of an older one.
 
-    Parameters
-    ----------
-    before : Catalog, optional
-        Existing catalogue: unchanged files are not read again, except damaged ones. By default
-        all files are read.
-    progress : callable, optional
-        Called with the share of the files that is done, 0 to 1.
-
-    Raises
-    ------
-    LogError
-        If there is no log, or the catalogue cannot be written.
-    WorkerError
-        If workers are lost; the catalogue then has the files read so far.
-    KeyboardInterrupt
-        If interrupted; the catalogue then has the files read so far.
+    Unchanged files of `before` are not read again, except damaged ones. `progress` receives the
+    share of the files that is done, 0 to 1. Raise `LogError` if there is no log, or the catalogue
+    cannot be written; `WorkerError` if workers are lost, or `KeyboardInterrupt` if interrupted: the
+    catalogue then has the files read so far.
     """
     listing = list_logs(folder)
     if not listing.logs:

@@ -71,24 +71,11 @@ def clips_of(columns: Columns) -> Iterator[LoggedClip]:
 def read_clips(
     path: Path, name: str, start: int | None = None, end: int | None = None
 ) -> Iterator[tuple[int, int, Float32]]:
-    """Read the clips of one topic of a log.
+    """Yield start (ns of UTC), rate (samples per second) and samples (-1 to 1) of a topic's clips.
 
-    Raise `LogError` if the log is damaged, if the topic holds no clips, or as `clips_of` does.
-
-    Parameters
-    ----------
-    start, end : int, optional
-        Log times in nanoseconds of UTC: messages from `start` on, before `end`. By default there
-        is no limit.
-
-    Yields
-    ------
-    start : int
-        Time of the first sample, in nanoseconds of UTC.
-    rate : int
-        Samples per second.
-    samples : np.ndarray [shape=(n,)], float32
-        In full scale, -1 to 1; the mean of all channels.
+    The samples are the mean of all channels. Messages are from log time `start` on, before `end`,
+    in nanoseconds of UTC; by default there is no limit. Raise `LogError` if the log is damaged, if
+    the topic holds no clips, or as `clips_of` does.
     """
     for clip in _clips(path, name, start, end):
         yield clip.start, clip.rate, _mono(clip)
@@ -108,10 +95,7 @@ def _clips(path: Path, name: str, start: int | None, end: int | None) -> Iterato
 
 
 def kept_time(layers: Iterable[Path], name: str, start: int, end: int) -> Spans:
-    """Return the time spans with recorded audio.
-
-    Raise `LogError` as `read_clips` does.
-    """
+    """Return the time spans with recorded audio; raise `LogError` as `read_clips` does."""
     times = [
         (clip.start, clip.end)
         for layer in layers
@@ -122,19 +106,10 @@ def kept_time(layers: Iterable[Path], name: str, start: int, end: int) -> Spans:
 
 
 def kept_sound(layers: Sequence[Path], name: str, start: int, end: int) -> tuple[int, Float32]:
-    """Return the recorded audio of a span of time, with silence where there is none.
+    """Return rate and samples (-1 to 1) of the recorded audio of a span, with silence elsewhere.
 
-    Returns
-    -------
-    rate : int
-        Samples per second of the first clip; 0 without any clip.
-    samples : np.ndarray [shape=(n,)], float32
-        -1 to 1. Clips with another rate are skipped.
-
-    Raises
-    ------
-    LogError
-        As `read_clips` does.
+    The rate is that of the first clip, in samples per second; 0 without any clip. Clips with
+    another rate are skipped. Raise `LogError` as `read_clips` does.
     """
     rate, sound = 0, np.empty(0, np.float32)
     for layer in layers:
@@ -159,14 +134,9 @@ def wav_bytes(samples: Float32, rate: int) -> bytes:
 
 
 def play_sound(samples: Float32, rate: int, *, wait: bool = False) -> None:
-    """Play sound on the default output of the machine.
+    """Play sound on the default output of the machine, and `wait` for its end.
 
     Raise `LogError` if there is no output, or PortAudio is missing.
-
-    Parameters
-    ----------
-    wait : bool, optional
-        Whether to return at the end of the sound.
     """
     try:
         import sounddevice  # noqa: PLC0415  PortAudio may be missing

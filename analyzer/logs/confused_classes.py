@@ -30,13 +30,8 @@ _OF_HOME = 2  # classes that a home must have taught a model, to tell them apart
 def common_names(description: Mapping[str, Any]) -> dict[str, str]:
     """Return the common name of each class of water, if a model does not tell them apart.
 
-    A model does not if, by its own test, it finds less than half of the sounds of one of them,
-    unless its home has taught it two of them.
-
-    Parameters
-    ----------
-    description : mapping
-        Of a model, as in `model.json` of a log.
+    A model, described as in `model.json` of a log, does not if, by its own test, it finds less than
+    half of the sounds of one of them, unless its home has taught it two of them.
     """
     with suppress(AttributeError, KeyError, TypeError, ValueError):
         water = [name for name in description["classes"] if class_name(name) in WATER]

@@ -54,12 +54,8 @@ class HomeLogs:
     ) -> list[HomeLog]:
         """List the logs, or the layers of one name, that may cover a span of time.
 
-        Parameters
-        ----------
-        start, end : int or None
-            Nanoseconds of UTC: from `start` on, before `end`; None for no limit.
-        layer : str
-            `review` or `relabel-<model>`; empty for logs.
+        The span is from `start` on, before `end`, in nanoseconds of UTC; None is no limit. `layer`
+        is `review` or `relabel-<model>`; empty for logs.
         """
         return [
             entry
@@ -72,10 +68,7 @@ class HomeLogs:
     def latest_models(self) -> list[LabelledBy]:
         """List the models that labelled the latest log of each recorder, without duplicates.
 
-        Returns
-        -------
-        list of LabelledBy
-            Models of all microphones of a recorder; empty texts for a microphone without a model.
+        They are of all microphones of a recorder; empty texts for a microphone without a model.
         """
         by_node: dict[str, list[Path]] = {}
         for entry in self.between():
@@ -122,13 +115,7 @@ class HomeLogs:
         return latest_records(entry.path for entry in self.between())
 
     def days(self, zone: tzinfo) -> list[date]:
-        """List the days with logs.
-
-        Returns
-        -------
-        list of date
-            Days from the first to the last message of each log; ascending.
-        """
+        """List the days from the first to the last message of each log, ascending."""
         begun = {local_time(entry.start, zone).date() for entry in self.between()}
         days = set(begun)
         for entry in self.between():
@@ -153,13 +140,7 @@ class HomeLogs:
         return complete[-1] if complete else days[-1]
 
     def end(self) -> int | None:
-        """Return the log time of the last message of the logs.
-
-        Returns
-        -------
-        int or None
-            Nanoseconds of UTC; None if no log has a readable message.
-        """
+        """Return the log time of the last readable message in nanoseconds of UTC, if any."""
         for entry in reversed(self.between()):
             try:
                 span = time_span(entry.path)
@@ -208,12 +189,9 @@ def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
 
 
 def days_in_words(days: Sequence[date]) -> str:
-    """Format days, with runs of days joined: `2026-03-01 to 2026-03-04, 2026-03-09`.
+    """Format ascending days, with runs joined: `2026-03-01 to 2026-03-04, 2026-03-09`.
 
-    Parameters
-    ----------
-    days : sequence of date
-        Ascending. Of more than five runs, the text has the first and the last four.
+    Of more than five runs, the text has the first and the last four.
     """
     numbered = enumerate(days)
     runs = [list(run) for _, run in groupby(numbered, lambda pair: pair[1].toordinal() - pair[0])]
@@ -222,15 +200,7 @@ def days_in_words(days: Sequence[date]) -> str:
 
 
 def check_day(logs: HomeLogs, first: date, last: date, zone: tzinfo) -> None:
-    """Check that there is a log on at least one of some days.
-
-    Raise `DataError` if there is no log on any of these days.
-
-    Parameters
-    ----------
-    first, last : date
-        Range of days, both included.
-    """
+    """Raise `DataError` if there is no log on any of the days from `first` to `last`, included."""
     days = logs.days(zone)
     if any(first <= day <= last for day in days):
         return
@@ -270,13 +240,7 @@ _MOST = 4  # maximum number of changes in a text
 
 
 def network_changes(logs: Iterable[HomeLog], zone: tzinfo) -> list[str]:
-    """Describe when the embedding network of each microphone changed.
-
-    Returns
-    -------
-    list of str
-        One line for each microphone with a change.
-    """
+    """Describe, a line each, when the embedding network of each microphone changed, if it did."""
     spaces: dict[tuple[str, str], list[tuple[int, EmbeddingSpace | None]]] = {}
     for log in logs:
         with suppress(LogError), LogFile(log.path) as file:

@@ -119,12 +119,8 @@ def all_classes(
 ) -> tuple[str, ...]:
     """List the possible labels: class names stated by logs, then labels that occur.
 
-    Raise `LogError` if there are more than 100.
-
-    Parameters
-    ----------
-    named : iterable of sequence of str
-        Names of the probabilities, per label channel.
+    `named` are the names of the probabilities, per label channel. Raise `LogError` if there are
+    more than 100.
     """
     classes = tuple(dict.fromkeys([*(name for names in named for name in names), *labels]))
     if len(classes) > MOST_CLASSES:
@@ -133,14 +129,9 @@ def all_classes(
 
 
 def check_labelling(topic: str, starts: Int64, labels: Iterable[str]) -> None:
-    """Check that labels are valid class names, and that no segment begins before 1970.
+    """Raise `LogError` if a label is no valid class name, or the first start is before 1970.
 
-    Raise `LogError` if a label is no valid class name, or the first start is negative.
-
-    Parameters
-    ----------
-    starts : np.ndarray [shape=(n,)], int64
-        Nanoseconds of UTC, ascending.
+    Starts are nanoseconds of UTC, ascending.
     """
     for label in labels:
         if not CLASS_NAME.fullmatch(label):
@@ -187,17 +178,8 @@ class Labellings:
     def microphone(self, name: str | None) -> str:
         """Return the named microphone, or the only one.
 
-        Parameters
-        ----------
-        name : str or None
-            None for the only one.
-
-        Raises
-        ------
-        LogError
-            If there are no segments.
-        DataError
-            If there are several microphones and `name` is None, or if no microphone has this name.
+        Raise `LogError` if there are no segments; `DataError` if there are several microphones and
+        `name` is None, or if no microphone has this name.
         """
         names = {topic.microphone for topic in self._topics()}
         there = ", ".join(sorted(names))
@@ -215,38 +197,16 @@ class Labellings:
         return name or names.pop()
 
     def names(self, microphone: str) -> list[str]:
-        """List the labellings of a microphone.
-
-        Parameters
-        ----------
-        microphone : str
-            Name of the microphone.
-
-        Returns
-        -------
-        list of str
-            `live` first, then the others in alphabetical order.
-        """
+        """List the labellings of a microphone: `live`, then the others in alphabetical order."""
         names = {t.labelling for t in self._topics() if t.microphone == microphone}
         return sorted(names, key=lambda name: (name != LIVE, name))
 
     def find(self, microphone: str, text: str) -> str:
-        """Find a labelling by its full or short name.
+        """Find `live`, `review`, `scenario/<name>` or `relabel/<model>` by its full or short name.
 
-        Raise `DataError` if the microphone has no such labelling, or if a scenario and a model
-        share the name.
-
-        Parameters
-        ----------
-        microphone : str
-        text : str
-            `live`, `review`, `scenario/<name>`, `relabel/<model>`, the name of a scenario or of a
-            model, or `relabel` if there is only one.
-
-        Returns
-        -------
-        str
-            `live`, `review`, `scenario/<name>` or `relabel/<model>`.
+        A short name is that of a scenario or of a model, or `relabel` if there is only one. Raise
+        `DataError` if the microphone has no such labelling, or if a scenario and a model share the
+        name.
         """
         names = self.names(microphone)
         layers = [name for name in names if name.startswith(f"{RELABEL}/")]
@@ -271,22 +231,14 @@ class Labellings:
         end: int | None = None,
         progress: Progress = ignore_progress,
     ) -> NamedLabelling:
-        """Read the segments of a labelling.
+        """Read the segments of a labelling, as named by `microphone` and `find`, cut to a span.
 
-        Unreadable parts of a damaged log are skipped and added to `losses`.
+        The span is from `start` to `end` in nanoseconds of UTC; by default there is no limit.
+        `progress` receives the share of the logs that is done, 0 to 1. Unreadable parts of a
+        damaged log are skipped and added to `losses`.
 
         Raise `LogError` if there is no segment in this span of time, if segments overlap, if the
         first begins before 1970, or if labels are too many or no valid class names.
-
-        Parameters
-        ----------
-        microphone, name : str
-            As returned by `microphone` and `find`.
-        start, end : int, optional
-            Nanoseconds of UTC: segments are cut to the span from `start` to `end`. By default there
-            is no limit.
-        progress : callable, optional
-            Called with the share of the logs that is done, 0 to 1.
         """
         topic = labelling_topic(microphone, name, "segment")
         labelling = self._labelling(topic, start, end, progress)
@@ -302,20 +254,10 @@ class Labellings:
     def with_topic(
         self, topic: str, start: int | None = None, end: int | None = None
     ) -> list[LabelledFile]:
-        """List the logs that have a topic and may have messages in a span of time.
+        """List, in order of time, the logs that have a topic and may have messages in a span.
 
-        Parameters
-        ----------
-        topic : str
-            Topic of segments or labels.
-        start, end : int, optional
-            Log times in nanoseconds of UTC: from `start` on, before `end`. By default there is no
-            limit.
-
-        Returns
-        -------
-        list of LabelledFile
-            In order of time.
+        The topic is of segments or labels; log times are nanoseconds of UTC, from `start` on,
+        before `end`. By default there is no limit.
         """
         return [
             log
@@ -326,23 +268,11 @@ class Labellings:
         ]
 
     def unfinished(self, topics: Sequence[str]) -> list[Path]:
-        """List the unfinished logs with one of the given topics.
-
-        Parameters
-        ----------
-        topics : sequence of str
-            Topics of segments.
-        """
+        """List the unfinished logs with one of the given topics of segments."""
         return [log.path for log in self.logs if not log.complete and log.segments & set(topics)]
 
     def lose(self, error: LogError) -> None:
-        """Append the text of an error to `losses`, without duplicates.
-
-        Parameters
-        ----------
-        error : LogError
-            Reason why a log could not be read.
-        """
+        """Append the text of an error to `losses`, without duplicates."""
         if str(error) not in self.losses:
             self.losses.append(str(error))
 
@@ -388,17 +318,8 @@ class Labellings:
 def find_labellings(*paths: Path) -> Labellings:
     """Find the labellings of logs and their layers, or of folders of logs.
 
-    Raise `LogError` if there is no log, if no log can be read, or if no log has a message.
-
-    Parameters
-    ----------
-    *paths : Path
-        Logs, or folders of logs.
-
-    Returns
-    -------
-    Labellings
-        Its `losses` name the unreadable logs.
+    Its `losses` name the unreadable logs. Raise `LogError` if there is no log, if no log can be
+    read, or if no log has a message.
     """
     opened = list(map_logs(_opened, sorted(find_with_layers(paths))))
     logs = [log for log in opened if isinstance(log, LabelledFile)]

@@ -54,18 +54,7 @@ class Chain(NamedTuple):
 
 
 def with_layers(path: Path) -> list[Path]:
-    """List a log and the layers next to it.
-
-    Parameters
-    ----------
-    path : Path
-        A log, or a folder of logs.
-
-    Returns
-    -------
-    list of Path
-        The log, then its layers by name; for a folder, which contains the layers, only the folder.
-    """
+    """List a log, then the layers next to it by name; only the folder for a folder of logs."""
     if not path.is_file():
         return [path]
     siblings = (each for each in path.parent.iterdir() if each.name.startswith(f"{stem(path)}."))
@@ -85,15 +74,10 @@ def find_with_layers(paths: Iterable[Path]) -> list[Path]:
 def find_timed_files(
     paths: Iterable[Path], start: int | None, end: int | None, losses: list[str]
 ) -> list[TimedFile]:
-    """Find the logs and layers with messages in a span of time.
+    """Find the logs and layers that may cover the time from `start` on, before `end`.
 
-    Raise `LogError` if there is no such log, or none in a folder.
-
-    Parameters
-    ----------
-    start, end : int, optional
-        Nanoseconds of UTC: files that may cover the time from `start` on, before `end`. None for
-        no limit.
+    Times are nanoseconds of UTC; None is no limit. Raise `LogError` if there is no such log, or
+    none in a folder.
     """
     files = []
     for path in find_with_layers(paths):
@@ -138,20 +122,10 @@ def latest_records(logs: Iterable[Path]) -> Iterator[Mapping[str, str]]:
 
 
 def zone_of(paths: Iterable[Path], name: str | None) -> tzinfo:
-    """Find the time zone of a home.
+    """Find the time zone of a home by IANA name, such as `Europe/Vienna`.
 
-    Parameters
-    ----------
-    name : str or None
-        IANA name of the zone, such as `Europe/Vienna`; None for the zone recorded in the latest
-        log with one, or UTC.
-
-    Raises
-    ------
-    DataError
-        If there is no such zone.
-    LogError
-        If there is no log.
+    None is for the zone recorded in the latest log with one, or UTC. Raise `DataError` if there is
+    no such zone, `LogError` if there is no log.
     """
     return home_zone(name, latest_records([log for path in paths for log in find_logs(path)]))
 
@@ -216,13 +190,9 @@ class Coverage:
     ends: Sequence[int]
 
     def split(self, start: int, end: int) -> list[tuple[Path, int, int]]:
-        """Divide a span of time among the logs.
+        """Divide a span of time among the logs: log, start and end (nanoseconds of UTC), in order.
 
-        Returns
-        -------
-        list of (Path, int, int)
-            Log, start and end (nanoseconds of UTC) of each part, in order of time. Empty if more
-            than a frame of the span is in no log.
+        Empty if more than a frame of the span is in no log.
         """
         parts: list[tuple[Path, int, int]] = []
         covered = start
@@ -255,15 +225,10 @@ def find_coverage(path: Path) -> dict[str, Coverage]:
 
 
 def coverage_of(spans: Sequence[tuple[int, int, Path]]) -> Coverage:
-    """Build a coverage from the spans of logs.
+    """Build a coverage from starts and ends (nanoseconds of UTC) of the frames of logs, in order.
 
     The end of a log is moved to the start of the next one if the pause is at most a frame, or if
     the logs overlap.
-
-    Parameters
-    ----------
-    spans : sequence of (int, int, Path)
-        Start and end (nanoseconds of UTC) of the frames of each log, in order of time.
     """
     starts = [start for start, _, _ in spans]
     ends = [end for _, end, _ in spans]

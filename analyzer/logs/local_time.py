@@ -15,14 +15,9 @@ Span = tuple[int, int]
 
 
 def home_zone(name: str | None, records: Iterable[Mapping[str, str]] = ()) -> tzinfo:
-    """Return the time zone of a home.
+    """Return the time zone of a home: the named one, the first in `hearthlog` records, or UTC.
 
     Raise `DataError` if there is no such zone.
-
-    Parameters
-    ----------
-    records : iterable of mapping of str to str
-        `hearthlog` records of logs; the first zone in them is used, else UTC.
     """
     if name is not None:
         return _zone(name, "use a name such as Europe/Vienna, or UTC")
@@ -52,30 +47,13 @@ def day_span(day: date, zone: tzinfo) -> Span:
 
 
 def at_hour(day: date, hour: int, zone: tzinfo) -> int:
-    """Return the time of a full local hour, in nanoseconds of UTC.
-
-    Parameters
-    ----------
-    hour : int
-        0 to 23.
-    """
+    """Return the time of a full local hour, 0 to 23, in nanoseconds of UTC."""
     local = datetime(day.year, day.month, day.day, hour, tzinfo=zone)
     return int(local.timestamp()) * NANOSECONDS
 
 
 def local_time(nanoseconds: int, zone: tzinfo) -> datetime:
-    """Return the local date and time.
-
-    Parameters
-    ----------
-    nanoseconds : int
-        Nanoseconds of UTC.
-
-    Returns
-    -------
-    datetime
-        In `zone`, without fractions of a second.
-    """
+    """Return the local date and time of nanoseconds of UTC, without fractions of a second."""
     return datetime.fromtimestamp(nanoseconds // NANOSECONDS, UTC).astimezone(zone)
 
 
@@ -85,20 +63,12 @@ def evening_before(day: date, zone: tzinfo) -> int:
 
 
 class Today(NamedTuple):
-    """The current local day and the last night, in nanoseconds of UTC.
-
-    Attributes
-    ----------
-    midnight : int
-        Start of the day.
-    night, morning : int
-        Start of the last night, at 22:00 of this day or the day before, and its end at 7:00.
-    """
+    """The current local day and the last night, in nanoseconds of UTC."""
 
     now: int
-    midnight: int
-    night: int
-    morning: int
+    midnight: int  # start of the day
+    night: int  # start of the last night, at 22:00 of this day or the day before
+    morning: int  # its end at 7:00
 
 
 def today(now: int, zone: tzinfo) -> Today:

@@ -95,11 +95,8 @@ class Listing(NamedTuple):
 def list_logs(folder: Path, known: Mapping[str, int] = MappingProxyType({})) -> Listing:
     """List the logs in a folder with size and modification time, without opening them.
 
-    Parameters
-    ----------
-    known : mapping of str to int
-        Change times of folders by name, as in `Listing`; local folders only. Logs of unchanged
-        folders are not listed.
+    `known` has change times of folders by name, as in `Listing`; local folders only. Logs of
+    unchanged folders are not listed.
     """
     found = _list_local(folder, known) if is_local(folder) else _list_stored(folder)
     found.logs.sort(key=_NAME)

@@ -62,23 +62,14 @@ _FIRST: Mapping[str, Collection[str]] = {
 
 
 class Configuration(BaseModel):
-    """Recorder settings that shape its log.
-
-    Attributes
-    ----------
-    max_bag_duration : int
-        Seconds in a file; 1 to 86,400.
-    flush_seconds, sync_seconds : float
-        Maximum seconds lost by a killed process and by a power cut; 1 to 3600.
-    statistics_every : int
-        Frames between messages of statistics; at least 1, the value for logs without this setting.
-    """
+    """Recorder settings that shape its log."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
 
-    max_bag_duration: int = Field(default=3600, ge=1, le=86_400)
-    flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)
-    sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)
+    max_bag_duration: int = Field(default=3600, ge=1, le=86_400)  # seconds in a file
+    flush_seconds: float = Field(default=1.0, ge=1.0, le=3600)  # maximum loss of a killed process
+    sync_seconds: float = Field(default=5.0, ge=1.0, le=3600)  # maximum loss by a power cut
+    # frames between messages of statistics; 1 in logs without it
     statistics_every: int = Field(default=1, ge=1, le=1 << 32)
 
 
@@ -104,14 +95,10 @@ class RecorderInfo:
 
 
 def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
-    """Read the recorder description of each microphone of a log.
+    """Read the recorder description of each microphone of a log, sorted by microphone.
 
-    Raise `LogError` if the log is damaged or has invalid values.
-
-    Returns
-    -------
-    list of RecorderInfo
-        Sorted by microphone; empty if the log has no such topic, which is normal for layers.
+    Empty if the log has no such topic, which is normal for layers. Raise `LogError` if the log is
+    damaged or has invalid values.
     """
     with LogFile(path) as file:
         if not file.channels:
@@ -307,14 +294,11 @@ NO_MODEL = LabelledBy("", "")
 
 
 def models_of(log: Path) -> Mapping[str, LabelledBy]:
-    """Read which models labelled the microphones of a log.
+    """Read which models labelled the microphones of a log, sorted by microphone.
 
-    Returns
-    -------
-    mapping of str to LabelledBy
-        By microphone, sorted. If no microphone names a model, the model of the `hearthlog` record
-        under an empty name. Empty if there is no model, if the log is damaged, or if it has several
-        microphones and no message of them yet.
+    If no microphone names a model, the model of the `hearthlog` record has an empty name. Empty if
+    there is no model, if the log is damaged, or if it has several microphones and no message of
+    them yet.
     """
     models: dict[str, LabelledBy] = {}
     with suppress(LogError), LogFile(log) as file:
@@ -332,10 +316,7 @@ def models_of(log: Path) -> Mapping[str, LabelledBy]:
 def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
     """Read which model labelled a microphone of a log or layer, as `models_of`.
 
-    Parameters
-    ----------
-    scenario : str, optional
-        Name of the scenario; empty for the sounds of the home.
+    The scenario is empty for the sounds of the home.
     """
     if scenario:
         return scenario_models(log).get((microphone, scenario), NO_MODEL)
@@ -344,12 +325,9 @@ def model_of(log: Path, microphone: str, scenario: str = "") -> LabelledBy:
 
 
 def scenario_models(log: Path) -> Mapping[tuple[str, str], LabelledBy]:
-    """Read which models labelled the scenarios of a log.
+    """Read which models labelled the scenarios of a log, by microphone and scenario.
 
-    Returns
-    -------
-    mapping of (str, str) to LabelledBy
-        By microphone and scenario; empty if there is none, or the log is damaged.
+    Empty if there is none, or the log is damaged.
     """
     of_scenarios: dict[tuple[str, str], LabelledBy] = {}
     with suppress(LogError), LogFile(log) as file:
@@ -372,16 +350,13 @@ class Trouble(NamedTuple):
 
 
 class MicrophoneHealth(NamedTuple):
-    """Health of a microphone at a time (ns of UTC): the worst level and all problems.
-
-    `floor_dbfs` is the noise floor of the room, NaN if unknown.
-    """
+    """Health of a microphone at a time: the worst level and all problems."""
 
     microphone: str
-    time: int
+    time: int  # in nanoseconds of UTC
     level: int
     text: str
-    floor_dbfs: float
+    floor_dbfs: float  # noise floor of the room, NaN if unknown
 
 
 def gaps_of(node: str, columns: Columns) -> Iterator[Trouble]:
@@ -423,11 +398,8 @@ def _floor(statuses: Sequence[Any]) -> float:
 def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
     """Yield the problems of diagnostic statuses, each until its status changes.
 
-    Parameters
-    ----------
-    end : int
-        Nanoseconds of UTC. The last problem of a name ends with the last status of that name, or
-        here if that is earlier.
+    The last problem of a name ends with the last status of that name, or at `end` (nanoseconds of
+    UTC) if that is earlier.
     """
     for name, same in groupby(sorted(statuses), lambda status: status.name):
         own = list(same)
@@ -439,10 +411,7 @@ def troubles_of(statuses: Iterable[Status], end: int) -> Iterator[Trouble]:
 def lasting(texts: Sequence[tuple[int, str | None]], end: int) -> Iterator[tuple[int, int, str]]:
     """Yield each text with its span: until the next different text, the last until `end`.
 
-    Parameters
-    ----------
-    texts : sequence of (int, str or None)
-        Time (nanoseconds of UTC) and text, in order of time; None for no text.
+    Times are nanoseconds of UTC, in order; the text None is no text.
     """
     changes = [(next(same)[0], text) for text, same in groupby(texts, lambda pair: pair[1])]
     ends = [*(time for time, _ in changes[1:]), end]

@@ -41,13 +41,8 @@ def decode_types(
 ) -> list[Columns]:
     """Decode the messages of the given types and drop all others.
 
-    Raise `LogError` if a message does not match the type of its channel.
-
-    Parameters
-    ----------
-    types : mapping of str to collection of str
-        Paths of the fields to decode, by type name; `is_compatible` defines which fields a type
-        may have.
+    `types` has the paths of the fields to decode, by type name; `is_compatible` defines which
+    fields a type may have. Raise `LogError` if a message does not match the type of its channel.
     """
     decoded: list[Columns] = []
     try:
@@ -158,19 +153,10 @@ class LogSelection:
     ) -> Iterator[list[RawMessages]]:
         """Read the messages of the selection, still encoded, in order of time.
 
-        Raise `LogError` if a log can no longer be read.
-
-        Parameters
-        ----------
-        progress : callable, optional
-            Called with the share of the time span that is done, 0 to 1.
-        once : bool
-            Skip chunks that repeat an earlier chunk of their log byte for byte.
-
-        Yields
-        ------
-        list of RawMessages
-            As `iterate_messages` yields them; damaged chunks are skipped with a warning.
+        They are as from `iterate_messages`; damaged chunks are skipped with a warning, and so are,
+        with `once`, chunks that repeat an earlier chunk of their log byte for byte. `progress`
+        receives the share of the time span that is done, 0 to 1. Raise `LogError` if a log can no
+        longer be read.
         """
         first, last = self.span
         damages = Damages()
@@ -215,13 +201,7 @@ class LogSelection:
         ]
 
     def only(self, topics: Collection[str]) -> "LogSelection":
-        """Return the selection limited to some topics.
-
-        Parameters
-        ----------
-        topics : collection of str
-            Names of the topics to keep.
-        """
+        """Return the selection limited to some topics, by name."""
         left = {topic: same for topic, same in self.channels.items() if topic in topics}
         return replace(self, topics=frozenset(topics), channels=left)
 
@@ -272,20 +252,11 @@ def select(
 ) -> LogSelection:
     """Find the logs with messages in a span of time, and their topics.
 
-    A damaged log is left out with a warning, unless there is no other.
-
+    Paths are of logs or folders of logs. Patterns are names of topics, with `*` for any text; all
+    topics by default. The log times are nanoseconds of UTC, from `start` on, before `end`; by
+    default there is no limit. A damaged log is left out with a warning, unless there is no other.
     Raise `LogError` if there is no such log, if all logs are damaged, or if a pattern matches no
     topic.
-
-    Parameters
-    ----------
-    paths : iterable of Path
-        Logs, or folders of logs.
-    patterns : sequence of str
-        Names of topics, with `*` for any text; all topics by default.
-    start, end : int, optional
-        Log times in nanoseconds of UTC: from `start` on, before `end`. By default there is no
-        limit.
     """
     damages: dict[Path, LogError] = {}
 
@@ -401,19 +372,10 @@ _MOST_NAMES = 256
 
 
 def array_names(metadata: Mapping[str, str], field: str) -> list[str]:
-    """Return the names that a channel gives to the elements of an array.
+    """Return the names that a channel gives to the elements of an array such as `values`, in order.
 
-    Parameters
-    ----------
-    metadata : mapping of str to str
-        Metadata of the channel; its `<field>_names` is a JSON list of texts.
-    field : str
-        Path of the array in the message, such as `values`.
-
-    Returns
-    -------
-    list of str
-        In the order of the elements; empty if names are missing, not printable or not unique.
+    The metadata field `<field>_names` is a JSON list of texts. Empty if names are missing, not
+    printable or not unique.
     """
     names = _names(metadata, field)
     fit = all(name.isprintable() for name in names) and len(set(names)) == len(names)
@@ -421,15 +383,10 @@ def array_names(metadata: Mapping[str, str], field: str) -> list[str]:
 
 
 def checked_array_names(path: Path, columns: Columns, field: str) -> tuple[str, ...]:
-    """Return the names of the elements of an array, exactly one per element.
+    """Return the names of the elements of an array such as `values`, exactly one per element.
 
     Raise `LogError` if the field is missing, if there are no names or more than 256, if names are
     not unique, or if the number of names differs from the number of elements.
-
-    Parameters
-    ----------
-    field : str
-        Path of the array in the message, such as `values`.
     """
     where = f"{path}: {columns.topic}"
     names = _names(columns.metadata, field)

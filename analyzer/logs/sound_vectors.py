@@ -35,35 +35,18 @@ class Bearings(NamedTuple):
 
 
 def as_vectors(azimuths: Float32, confidences: Float32) -> Float64:
-    """Convert directions to vectors that can be added.
+    """Convert directions (radians) to vectors [shape=(n, 2)] that can be added: ahead and left.
 
-    Parameters
-    ----------
-    azimuths : np.ndarray [shape=(n,)], float32
-        In radians.
-    confidences : np.ndarray [shape=(n,)], float32
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 2)], float64
-        Ahead and left; the length is the confidence.
+    The length is the confidence.
     """
     turned = azimuths.astype(np.float64)
     return np.stack([np.cos(turned), np.sin(turned)], axis=1) * confidences[:, np.newaxis]
 
 
 def degrees_of(vectors: Float64) -> Float64:
-    """Return the azimuths of vectors, in degrees.
+    """Return the azimuths of vectors [shape=(n, 2)] ahead and left, in degrees, -180 to 180.
 
-    Parameters
-    ----------
-    vectors : np.ndarray [shape=(n, 2)], float64
-        Ahead and left; NaN gives NaN.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-        -180 to 180; 90 is left.
+    90 is left; NaN gives NaN.
     """
     ahead, left = vectors.T
     return np.rad2deg(np.arctan2(left, ahead))
@@ -72,17 +55,10 @@ def degrees_of(vectors: Float64) -> Float64:
 def mean_bearings(times: Int64, vectors: Float64, starts: Int64, ends: Int64) -> Bearings:
     """Compute the mean direction of the sound in each span.
 
-    The circular mean and standard deviation are those of Mardia and Jupp, "Directional Statistics",
-    2000, weighted by the confidence.
-
-    Parameters
-    ----------
-    times : np.ndarray [shape=(m,)], int64
-        Starts of the located blocks, ascending, in nanoseconds of UTC.
-    vectors : np.ndarray [shape=(m, 2)], float64
-        As returned by `as_vectors`.
-    starts, ends : np.ndarray [shape=(n,)], int64
-        The spans, which may overlap. A block belongs to each span that contains its start.
+    `times` [shape=(m,)] are the starts of the located blocks, ascending, in nanoseconds of UTC;
+    `vectors` [shape=(m, 2)] are as from `as_vectors`. Spans may overlap; a block belongs to each
+    span that contains its start. The circular mean and standard deviation are those of Mardia and
+    Jupp, "Directional Statistics", 2000, weighted by the confidence.
     """
     first, last = np.searchsorted(times, starts), np.searchsorted(times, ends)
     weights = np.hypot(*vectors.T)
@@ -135,19 +111,10 @@ def mean_embeddings(
 ) -> tuple[EmbeddingSpace | None, Float32]:
     """Return the mean embedding components of spans, weighted by the overlap with each window.
 
-    Parameters
-    ----------
-    columns : Columns or None
-        Embeddings of one log, with stamps and values; None if it has no embeddings.
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-
-    Returns
-    -------
-    space : EmbeddingSpace or None
-        Means are comparable within the same space; None for embeddings without a source.
-    means : np.ndarray [shape=(n, k)], float32
-        In steps of the logged integers; NaN for a span without a window.
+    `columns` are the embeddings of one log, with stamps and values; None if it has no embeddings.
+    Starts and ends are nanoseconds of UTC. Means [shape=(n, k)] are in steps of the logged
+    integers, NaN for a span without a window; they are comparable within the same space, which is
+    None for embeddings without a source.
     """
     none = np.empty((len(starts), 0), np.float32)
     if columns is None or columns.type != message_types.EMBEDDING or not len(columns):

@@ -59,28 +59,14 @@ NONE = Spans(np.empty(0, np.int64), np.empty(0, np.int64))
 
 
 def one(start: int, end: int) -> Spans:
-    """Return a single span.
-
-    Parameters
-    ----------
-    start, end : int
-        Nanoseconds of UTC; the end is after the start.
-    """
+    """Return a single span in nanoseconds of UTC; the end is after the start."""
     return Spans(np.array([start]), np.array([end]))
 
 
 def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
-    """Return the first span of each group of spans at most a pause apart.
+    """Return the first row of each group of spans at most a pause (ns) apart; starts ascend.
 
-    Parameters
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        Nanoseconds; the starts ascend.
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], intp
-        Rows of the spans that begin more than a pause after the end of all earlier spans.
+    Those begin more than a pause after the end of all earlier spans.
     """
     if not len(starts):
         return np.empty(0, np.intp)
@@ -89,15 +75,7 @@ def first_of_groups(starts: Int64, ends: Int64, pause: int) -> Rows:
 
 
 def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
-    """Merge spans that overlap or are at most a pause apart.
-
-    Parameters
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        Nanoseconds, in any order.
-    pause : int, optional
-        Nanoseconds; 0 merges adjacent spans.
-    """
+    """Merge spans, in any order, that overlap or are at most a pause (ns) apart; 0 if adjacent."""
     order = np.argsort(starts, kind="stable")
     starts, ends = starts[order], ends[order]
     firsts = first_of_groups(starts, ends, pause)
@@ -105,30 +83,17 @@ def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
 
 
 def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Rows, Rows]:
-    """Concatenate ranges of consecutive numbers.
+    """Concatenate ranges of consecutive numbers, given the first number and length of each.
 
-    Parameters
-    ----------
-    firsts, counts : np.ndarray [shape=(n,)], int
-        First number and length of each range.
-
-    Returns
-    -------
-    rows, numbers : np.ndarray [shape=(counts.sum(),)]
-        Range of each number, and the numbers: `firsts[0]`, `firsts[0] + 1` … of row 0, then row 1.
+    Return the range (row) of each number, and the numbers: `firsts[0]`, `firsts[0] + 1` … of row 0,
+    then row 1.
     """
     rows = np.repeat(np.arange(len(counts)), counts)
     return rows, np.arange(counts.sum()) + np.repeat(firsts - (np.cumsum(counts) - counts), counts)
 
 
 def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
-    """Intersect spans with other spans.
-
-    Returns
-    -------
-    of_a, of_b : np.ndarray [shape=(n,)], intp
-        Rows of `a` and of `b` that contain each piece.
-    """
+    """Intersect spans with other spans; return the rows of `a` and of `b` with each piece, too."""
     low = np.searchsorted(b.ends, a.starts, side="right")
     high = np.searchsorted(b.starts, a.ends, side="left")
     of_a, of_b = ranges(low, np.maximum(high - low, 0))
@@ -161,19 +126,9 @@ def without(a: Spans, b: Spans) -> Spans:
 
 
 def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
-    """Cut spans to the parts outside of other spans.
+    """Cut spans `a`, ascending by start and by end, to the parts outside of other spans, in order.
 
-    Parameters
-    ----------
-    a : Timed
-        Ascending by start and by end.
-
-    Returns
-    -------
-    spans : Spans
-        The parts of `a` outside of `b`, in the order of `a`.
-    of_a : np.ndarray [shape=(n,)], intp
-        Row of `a` for each part.
+    Return the row of `a` for each part, too.
     """
     if not len(a.starts) or not len(b.starts):
         return Spans(a.starts, a.ends), np.arange(len(a.starts))
@@ -185,18 +140,7 @@ def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
 
 
 def rows_at(spans: Timed, times: Int64) -> Int64:
-    """Find the span that contains each time.
-
-    Parameters
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        Nanoseconds of UTC, in any order.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], int64
-        Rows of `spans`; -1 for a time outside of all spans.
-    """
+    """Return the row of the span that contains each time (nanoseconds of UTC), or -1."""
     if not len(spans.starts):
         return np.full(len(times), -1)
     rows = np.searchsorted(spans.starts, times, side="right") - 1
@@ -206,12 +150,8 @@ def rows_at(spans: Timed, times: Int64) -> Int64:
 def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
     """Cut the time wherever a span of any layer begins or ends.
 
-    Parameters
-    ----------
-    layers : sequence of Timed
-        At least one; the spans of a layer ascend and do not overlap.
-    every : int, optional
-        Nanoseconds: cut also at multiples of this, unless 0; every layer must then have a span.
+    There is at least one layer; the spans of a layer ascend and do not overlap. Cut also at
+    multiples of `every` nanoseconds, unless 0; every layer must then have a span.
     """
     edges = [times for spans in layers for times in (spans.starts, spans.ends)]
     if every:
@@ -223,18 +163,7 @@ def overlay(layers: Sequence[Timed], every: int = 0) -> Overlay:
 
 
 def lengths(spans: Spans, edges: Int64) -> Int64:
-    """Return the length of the spans between successive edges.
-
-    Parameters
-    ----------
-    edges : np.ndarray [shape=(n + 1,)], int64
-        Nanoseconds of UTC, ascending.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], int64
-        Nanoseconds.
-    """
+    """Return the length of the spans between n + 1 ascending edges, in nanoseconds."""
     sums = np.concatenate([[0], np.cumsum(spans.ends - spans.starts)])
     begun = np.searchsorted(spans.starts, edges, side="right")
     before = sums[np.maximum(begun - 1, 0)]

@@ -51,14 +51,9 @@ class TopicSummary:
         return (self.messages - 1) * NANOSECONDS / (last - first) if last > first else 0.0
 
     def add(self, count: int, size: int | None, span: Span | None) -> None:
-        """Add messages of this topic.
+        """Add messages of this topic; payload bytes before compression, or span, None if unknown.
 
-        Parameters
-        ----------
-        size : int or None
-            Payload bytes before compression; None if unknown.
-        span : (int, int) or None
-            First and last log time, in nanoseconds of UTC; None if unknown.
+        The span has the first and last log time, in nanoseconds of UTC.
         """
         self.messages += count
         self.bytes = None if self.bytes is None or size is None else self.bytes + size
@@ -121,13 +116,7 @@ class LogSummary:
         return self.raw_bytes / self.chunk_bytes if self.chunk_bytes else None
 
     def add(self, other: "LogSummary") -> None:
-        """Merge the summary of other files into this one.
-
-        Parameters
-        ----------
-        other : LogSummary
-            Summary of different files; not modified.
-        """
+        """Merge the summary of other files into this one; `other` is not modified."""
         for name in ("files", "unfinished", "layers", "gaps"):
             getattr(self, name).extend(getattr(other, name))
         for name in ("size", "chunks", "chunk_bytes", "raw_bytes"):
@@ -149,18 +138,7 @@ class LogSummary:
 
 
 def worse(one: Status | None, other: Status | None) -> Status | None:
-    """Return the status with the higher level; of equal levels the later one.
-
-    Parameters
-    ----------
-    one, other : Status or None
-        None for no status.
-
-    Returns
-    -------
-    Status or None
-        None if both are None.
-    """
+    """Return the status with the higher level; of equal levels the later one; None without any."""
     statuses = [status for status in (one, other) if status is not None]
     return max(statuses, key=lambda status: (status.level, status.time), default=None)
 

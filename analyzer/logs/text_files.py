@@ -32,12 +32,8 @@ def without_disarming(text: str) -> str:
 def read_text(path: Path, what: str, size_limit: int) -> str:
     """Read a text file in UTF-8, or in UTF-16 with a byte order mark.
 
-    Raise `DataError` if the file is missing, unreadable, too large, or in another encoding.
-
-    Parameters
-    ----------
-    size_limit : int
-        Maximum size in bytes.
+    Raise `DataError` if the file is missing, unreadable, larger than `size_limit` bytes, or in
+    another encoding.
     """
     raw = read_limited(path, what, size_limit, DataError)
     wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -60,20 +56,10 @@ def numbered_lines(path: Path, text: str) -> Iterator[tuple[int, str]]:
 
 
 def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[int, list[str]]]:
-    """Yield the non-blank records of CSV with their line numbers.
+    """Yield the non-blank records of CSV with the number of their first line, from 1.
 
     Raise `DataError` if the text is not CSV, has more than a million lines, or a record of more
     than 1 MiB.
-
-    Parameters
-    ----------
-    delimiter : str
-        Field separator.
-
-    Yields
-    ------
-    line : int
-        First line of the record, from 1.
     """
     for line, record in csv_rows(path, text, delimiter):
         if isinstance(record, csv.Error):
@@ -84,19 +70,10 @@ def csv_records(path: Path, text: str, delimiter: str = ",") -> Iterator[tuple[i
 def csv_rows(
     path: Path, text: str, delimiter: str, *, quoted: bool = True
 ) -> Iterator[tuple[int, list[str] | csv.Error]]:
-    """Yield the non-blank records of CSV, or the error of each malformed one.
+    """Yield non-blank records of CSV, or the error of each malformed one, with their first line.
 
-    Raise `DataError` if the text has more than a million lines, or a record of more than 1 MiB.
-
-    Parameters
-    ----------
-    delimiter : str
-        Field separator.
-
-    Yields
-    ------
-    line : int
-        First line of the record, from 1.
+    Lines count from 1. Raise `DataError` if the text has more than a million lines, or a record of
+    more than 1 MiB.
     """
     _check_lines(path, text)
     line, length = 1, 0
