@@ -53,23 +53,11 @@ def hinted_spans(
     reviewed: Spans,
     count: int,
 ) -> list[ReviewSpan]:
-    """Choose sounds with a network name that is a hint, and without such a label.
+    """Choose up to `count` sounds with a network name that is a hint, and without such a label.
 
-    Parameters
-    ----------
-    count : int
-        Maximum number.
-
-    Returns
-    -------
-    list of ReviewSpan
-        Spread over names and days, the clearest of each first. The score is the network's logit
-        minus the threshold of the name.
-
-    Raises
-    ------
-    DataError
-        If there are no embeddings, or no hint is left.
+    They are spread over names and days, the clearest of each first; the score is the network's
+    logit minus the threshold of the name. Raise `DataError` if there are no embeddings, or no hint
+    is left.
     """
     names = [name for name in audioset_names() if not name.is_event]
     hints, above = _named(sources, microphone, names)
@@ -170,18 +158,10 @@ _UNLABELLED = NANOSECONDS // 10  # maximum in a minute
 
 
 class RecordedMinutes(NamedTuple):
-    """Completely labelled minutes of the clock.
+    """Completely labelled minutes of the clock."""
 
-    Attributes
-    ----------
-    starts : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, ascending.
-    has_sound : np.ndarray [shape=(n,)], bool
-        Whether any label in it is not silence.
-    """
-
-    starts: Int64
-    has_sound: Bool
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC, ascending
+    has_sound: Bool  # [shape=(n,)]; whether any label in it is not silence
 
 
 def complete_minutes(labelling: Labelling) -> RecordedMinutes:
@@ -203,23 +183,11 @@ def complete_minutes(labelling: Labelling) -> RecordedMinutes:
 def draw_minutes(
     minutes: RecordedMinutes, count: int, drawn: Collection[int] = (), taken: Spans = NONE
 ) -> Int64:
-    """Draw minutes at random, three of four with a sound.
+    """Draw up to `count` minutes at random, three of four with a sound; return their starts.
 
-    The same minutes and the same earlier draws give the same result.
-
-    Parameters
-    ----------
-    count : int
-        Maximum number.
-    drawn : collection of int
-        Starts of the minutes drawn and reviewed before, in nanoseconds of UTC.
-    taken : Spans
-        Reviewed time, excluded from the draw.
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], int64
-        Starts, in the order of the draw.
+    They are in the order of the draw. `drawn` are starts of minutes drawn and reviewed before; all
+    are nanoseconds of UTC. `taken` is reviewed time, excluded from the draw. The same minutes and
+    the same earlier draws give the same result.
     """
     before = minutes.has_sound[np.isin(minutes.starts, list(drawn))]
     shuffled = np.random.default_rng([_SEED, len(drawn)]).permutation(len(minutes.starts))
@@ -244,25 +212,16 @@ def _length_in(spans: Spans, minutes: Int64) -> Int64:
 
 
 class ReviewedTime(NamedTuple):
-    """Marked or reviewed time of a microphone.
-
-    Attributes
-    ----------
-    random : frozenset of int
-        Starts of the spans drawn at random, in nanoseconds of UTC.
-    """
+    """Marked or reviewed time of a microphone."""
 
     spans: Spans
-    random: frozenset[int]
+    random: frozenset[int]  # starts of the spans drawn at random, in nanoseconds of UTC
 
 
 def reviewed_time(sources: Labellings, microphone: str, scenario: str = "") -> ReviewedTime:
     """Read the reviewed time of a microphone, by all reviewers, of all labellings of one scenario.
 
-    Parameters
-    ----------
-    scenario : str, optional
-        Its name; empty for the sounds of the home.
+    The scenario is empty for the sounds of the home.
     """
     times, random = [], set[int]()
     for log in sources.logs:
@@ -290,30 +249,15 @@ def changed_by(  # noqa: PLR0913, PLR0917
     count: int,
     progress: Progress = ignore_progress,
 ) -> list[ReviewSpan]:
-    """Choose spans that a model labels differently from the current model.
+    """Choose up to `count` spans that a model labels differently from the current model.
 
-    Parameters
-    ----------
-    side : NamedLabelling
-        The labelling to review. Spans are skipped where it differs from the current model, as it
-        may for older logs.
-    count : int
-        Maximum number.
-    progress : callable, optional
-        Called with the processed share of the sound, 0 to 1.
+    Spans of the labelling to review, `side`, are skipped where it differs from the current model,
+    as it may for older logs. `progress` receives the processed share of the sound, 0 to 1. Spans of
+    the largest changes come first, spread over changes and days, the longest of each first; the
+    score is minutes a day, if a day is recorded.
 
-    Returns
-    -------
-    list of ReviewSpan
-        Spans of the largest changes first, spread over changes and days, the longest of each first.
-        The score is minutes a day, if a day is recorded.
-
-    Raises
-    ------
-    DataError
-        If the model cannot be compared, or changes nothing that a person could judge.
-    ModelError
-        As `find_champion`, and if a feature set is not installed.
+    Raise `DataError` if the model cannot be compared, or changes nothing that a person could judge;
+    `ModelError` as `find_champion`, and if a feature set is not installed.
     """
     folder, after = model
     topic = labelling_topic(microphone, LIVE, "segment")

@@ -42,16 +42,10 @@ _NOT_PLAIN = re.compile(r"[^\w\s.,'()%-]")  # markup in names of foreign logs
 class CurrentSound:
     """Current sound of a microphone: the most probable class of the last second.
 
-    Attributes
-    ----------
-    label, confidence : str, float
-        The class, and its mean confidence; empty before the first label.
-    since, time : int
-        Start of the sound, and end of the newest label, in nanoseconds of UTC.
-    is_older : bool
-        Whether the sound may have begun before `since`: it was there in the first label.
-    level_dbfs : float
-        Mean level of the last second; NaN if unknown.
+    `label` and its mean `confidence` are empty before the first label; `since` is the start of the
+    sound, `time` the end of the newest label, in nanoseconds of UTC. `is_older` if the sound may
+    have begun before: it was there in the first label. `level_dbfs` is the mean level of the last
+    second; NaN if unknown.
     """
 
     def __init__(self, microphone: str) -> None:
@@ -107,10 +101,7 @@ class CurrentSound:
 class CurrentSounds:
     """Current sounds of the microphones of a folder of logs, within bounded memory.
 
-    Parameters
-    ----------
-    lose : callable
-        Called with a problem of the list of hidden classes.
+    `lose` is called with a problem of the list of hidden classes.
     """
 
     def __init__(self, folder: Path, lose: Callable[[object], None]) -> None:

@@ -91,29 +91,18 @@ def scenario_kind(labelling: str) -> LaneKind:
 
 
 class StateLane(NamedTuple):
-    """Additions to a lane: times at which it changes, and its new states.
-
-    Attributes
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, ascending.
-    states : list of (str or None)
-        None is no state.
-    """
+    """Additions to a lane: times at which it changes, and its new states."""
 
     kind: LaneKind
     microphone: str
-    times: Int64
-    states: list[str | None]
+    times: Int64  # [shape=(n,)], in nanoseconds of UTC, ascending
+    states: list[str | None]  # None is no state
 
 
 def state_lane(kind: LaneKind, microphone: str, spans: LabelledSpans) -> StateLane:
     """Convert spans into changes of a lane.
 
-    Returns
-    -------
-    StateLane
-        Each span begins with its text, and ends with None unless the next one follows at once.
+    Each span begins with its text, and ends with None unless the next one follows at once.
     """
     followed = np.append(spans.starts[1:], np.iinfo(np.int64).max)
     last = np.flatnonzero(spans.ends < followed)
@@ -124,14 +113,10 @@ def state_lane(kind: LaneKind, microphone: str, spans: LabelledSpans) -> StateLa
 
 
 def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
-    """Find the spans in which two labellings differ.
+    """Find the spans in which two labellings differ, with the labels of `other`.
 
-    Two names of one class (see `hearthlog.models.classes`) are no difference.
-
-    Returns
-    -------
-    LabelledSpans
-        With the labels of `other`; empty where only one of the two has a label.
+    Two names of one class (see `hearthlog.models.classes`) are no difference, nor is a label of
+    only one of the two.
     """
     if not len(one) or not len(other):
         return no_spans()
@@ -162,16 +147,10 @@ _MOST_LANES = 12  # of classes, if some were not heard at all
 
 
 class Lane(NamedTuple):
-    """A lane.
-
-    Attributes
-    ----------
-    labelling : str
-        The labelling it shows; empty for lanes shared by all labellings.
-    """
+    """A lane."""
 
     microphone: str
-    labelling: str
+    labelling: str  # empty for lanes shared by all labellings
     name: str
     spans: LabelledSpans
     colours: Mapping[str, Colour]
@@ -185,18 +164,10 @@ class Lane(NamedTuple):
 def timeline_lanes(timeline: Timeline, *, marking: bool = False) -> Iterator[Lane]:
     """Make the lanes of a timeline, microphone by microphone, from the top.
 
-    Parameters
-    ----------
-    marking : bool, optional
-        Whether there is a lane of the selected span.
-
-    Yields
-    ------
-    Lane
-        For each labelling a lane for each class except silence, the most important class first.
-        Then the lanes shared by all labellings: each scenario, differences from the first
-        labelling, the selected span, reviewed spans (also of scenarios), gaps, and trouble.
-        Nothing lies outside of the timeline: it would stretch the viewer's time ruler.
+    For each labelling there is a lane for each class except silence, the most important class
+    first. Then follow the lanes shared by all labellings: each scenario, differences from the first
+    labelling, the selected span (with `marking`), reviewed spans (also of scenarios), gaps, and
+    trouble. Nothing lies outside of the timeline: it would stretch the viewer's time ruler.
     """
     for microphone in timeline.microphones.values():
         for lane in _lanes_of(microphone, marking=marking):
@@ -242,13 +213,7 @@ def scenario_sounds(spans: LabelledSpans) -> LabelledSpans:
 def reviewed_lane(
     microphone: str, scenario: str, marks: LabelledSpans, reviewed: LabelledSpans
 ) -> Lane:
-    """Make the lane of reviewed spans.
-
-    Parameters
-    ----------
-    scenario : str
-        Its name; empty for the sounds of the home.
-    """
+    """Make the lane of reviewed spans; the scenario is empty for the sounds of the home."""
     name = f"{in_words(scenario)} reviewed" if scenario else REVIEWED
     marked = _lane_in_words(microphone, name, marks)
     texts = np.concatenate([np.full(len(reviewed), REVIEWED, object), marked.spans.texts])
@@ -337,15 +302,8 @@ _AROUND = 28 * 86_400 * NANOSECONDS
 def class_precision(timeline: Timeline, logs: HomeLogs) -> Checked:
     """Count the recorder's sounds, and the correct ones, in minutes drawn at random.
 
-    Parameters
-    ----------
-    logs : HomeLogs
-        Of its home; minutes up to four weeks before and after the timeline count.
-
-    Returns
-    -------
-    mapping
-        By microphone and displayed class name; without classes that have no sound in these minutes.
+    Minutes of the home up to four weeks before and after the timeline count. Counts are by
+    microphone and displayed class name; without classes that have no sound in these minutes.
     """
     start, end = timeline.grid.start - _AROUND, timeline.grid.end + _AROUND
     near = read_reviewed_labels(logs, LIVE, start, end, [], {RANDOM})
@@ -368,17 +326,9 @@ _QUIETEST = 1e-10  # mean square: -100 dB
 
 
 def decibel(energy: Any) -> Any:
-    """Return the level of a mean square, in dB relative to full scale: 10 log10(energy).
+    """Return the level of a mean square of samples from -1 to 1, in dBFS: 10 log10(energy).
 
-    Parameters
-    ----------
-    energy : float or np.ndarray
-        Mean square of samples from -1 to 1.
-
-    Returns
-    -------
-    float or np.ndarray
-        At least -100; 0 for a square wave of full scale.
+    It is at least -100, and 0 for a square wave of full scale.
     """
     return 10 * np.log10(np.maximum(energy, _QUIETEST))
 
@@ -447,17 +397,9 @@ Rows = Plot | LaneRows | StateRows | LogLines
 
 
 def read_rows(path: Path, columns: Columns) -> Iterator[Rows]:
-    """Extract the rows of lanes and plots from the messages of one topic.
+    """Extract the rows of lanes and plots from the messages, with `FIELDS`, of one topic.
 
-    Parameters
-    ----------
-    columns : Columns
-        With the `FIELDS` of its type.
-
-    Raises
-    ------
-    LogError
-        If a channel does not name its values, or names another number of them.
+    Raise `LogError` if a channel does not name its values, or names another number of them.
     """
     if not len(columns):
         return
@@ -509,12 +451,9 @@ def _microphone_rows(
 
 
 def shown_topic(name: str) -> TopicName | None:
-    """Parse a topic shown in a timeline.
+    """Parse a topic shown in a timeline; None for any other topic.
 
-    Returns
-    -------
-    TopicName or None
-        None for any other topic. Marks are read from their layers, not shown by topic.
+    Marks are read from their layers, not shown by topic.
     """
     topic = parse_topic(name)
     if topic is None or topic.kind not in _KINDS or is_review(topic.labelling):
@@ -532,19 +471,10 @@ def timeline_plots(timeline: Timeline) -> Iterator[Plot]:
 def features_image(
     microphone: MicrophoneTimeline, grid: TimelineGrid, shape: tuple[int, int]
 ) -> tuple[Float64, str]:
-    """Draw the features of a span without sound, one below the other, the energy last.
+    """Draw the features of a span without sound, one below the other, the energy last; add a text.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows, and columns from the start of the grid to its end.
-
-    Returns
-    -------
-    shades : np.ndarray, float64
-        0 (low, or nothing recorded) to 1.
-    text : str
-        What is shown.
+    `shape` has the rows, and the columns from the start of the grid to its end; shades are 0 (low,
+    or nothing recorded) to 1.
     """
     rows, columns = shape
     plot = microphone.plots.get((FEATURES, ""))

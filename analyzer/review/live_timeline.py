@@ -47,17 +47,9 @@ Update = Plot | StateLane | LogLines
 
 
 def last_time(folder: Path) -> int | None:
-    """Return the last log time of the most recently written log in a folder.
+    """Return the last log time (nanoseconds of UTC) of the most recently written log in a folder.
 
-    Returns
-    -------
-    int or None
-        In nanoseconds of UTC; None if no log has a message yet.
-
-    Raises
-    ------
-    LogError
-        If the folder does not exist.
+    None if no log has a message yet. Raise `LogError` if the folder does not exist.
     """
     if not folder.is_dir():
         raise LogError(f"{folder}: no such folder; name the one that `hearthlog record` writes to")
@@ -79,13 +71,7 @@ def last_time(folder: Path) -> int | None:
 
 
 class LiveTimeline:
-    """Converts messages into updates of lanes and plots.
-
-    Attributes
-    ----------
-    hidden : collection of str
-        Classes that no output shows; a lane has `unknown` in their place.
-    """
+    """Converts messages into updates of lanes and plots; `hidden` classes become `unknown`."""
 
     def __init__(self) -> None:
         self.hidden: Collection[str] = frozenset()
@@ -169,12 +155,9 @@ class LiveTimeline:
         return self._open.get(microphone, np.empty(0, np.int64))
 
     def _by_second(self, rows: Plot) -> tuple[Int64, Int64, Float64]:
-        """Average frames over each second, and insert a row of NaN where frames are missing.
+        """Average frames over each second; NaN where frames are missing.
 
-        Returns
-        -------
-        starts, middles : np.ndarray [shape=(m,)], int64
-        means : np.ndarray [shape=(m, k)], float64
+        Return starts and middles [shape=(m,)] and means [shape=(m, k)].
         """
         key, times = (rows.kind, rows.microphone, rows.names), rows.times
         before = np.append(self._ends.get(key, times[0]), times[:-1] + FRAME_NANOSECONDS)

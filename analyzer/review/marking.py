@@ -49,38 +49,18 @@ class Marking:
     _reviewed: dict[Path, list[ReviewedSpan]] = field(default_factory=dict)
 
     def mark(self, start: int, end: int, label: str, chosen: str = "") -> list[Mark]:
-        """Label a span of time, replacing its marks.
+        """Label a span in nanoseconds of UTC, replacing its marks; cut it to the logs.
 
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC; parts before or after all logs are cut off.
-        chosen : str, optional
-            As in `ReviewedSpan`, if the span counts as reviewed; otherwise empty.
-
-        Raises
-        ------
-        DataError
-            If a part of the span was not recorded, or the label is invalid.
-        LogError
-            If a layer is damaged or cannot be written; that layer is unchanged then.
+        `chosen` is as in `ReviewedSpan`, if the span counts as reviewed; otherwise empty. Raise
+        `DataError` if a part of the span was not recorded, or the label is invalid; `LogError` if a
+        layer is damaged or cannot be written: that layer is unchanged then.
         """
         return self._write(start, end, [(start, end, label)], chosen)
 
     def review(self, start: int, end: int, chosen: str) -> None:
-        """Record a span as reviewed: its unmarked labels are correct.
+        """Record a span, cut to the logs, as reviewed: its unmarked labels are correct.
 
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC; parts before or after all logs are cut off.
-
-        Raises
-        ------
-        DataError
-            If a part of the span was not recorded.
-        LogError
-            If a layer is damaged or cannot be written; that layer is unchanged then.
+        The span is in nanoseconds of UTC. Raise `DataError` and `LogError` as `mark` does.
         """
         now = time.time_ns()
         changes = [self._change(*piece, now, chosen) for piece in self._pieces(start, end)]
@@ -89,19 +69,9 @@ class Marking:
         self._done.append(changes)
 
     def confirm(self, start: int, end: int) -> list[Mark]:
-        """Mark a span with its current labels, replacing its marks.
+        """Mark a span in nanoseconds of UTC, cut to the logs, with its labels, replacing its marks.
 
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC; parts before or after all logs are cut off.
-
-        Raises
-        ------
-        DataError
-            If the labelling has no label in this span, or a part of the span was not recorded.
-        LogError
-            If a layer is damaged or cannot be written; that layer is unchanged then.
+        Raise `DataError` if the labelling has no label in this span, else errors as `mark` does.
         """
         segments = self.labelled
         first = int(np.searchsorted(segments.ends, start, "right"))
@@ -118,49 +88,20 @@ class Marking:
         return self._write(start, end, labels)
 
     def delete(self, start: int, end: int) -> list[Mark]:
-        """Delete the marks of a span of time, which then no longer counts as reviewed.
+        """Delete the marks of a span, cut to the logs, which then no longer counts as reviewed.
 
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC; parts before or after all logs are cut off.
-
-        Returns
-        -------
-        list of Mark
-            Empty, since there are no new marks.
-
-        Raises
-        ------
-        DataError
-            If a part of the span was not recorded.
-        LogError
-            If a layer is damaged or cannot be written; that layer is unchanged then.
+        The span is in nanoseconds of UTC. Return no marks, since there are no new ones. Raise
+        `DataError` and `LogError` as `mark` does.
         """
         return self._write(start, end, [], deleted=True)
 
     def move(self, start: int, end: int) -> list[Mark]:
         """Move a mark to a span: the mark that overlaps it most, else the last one made.
 
-        Other marks in the span are replaced. A mark is written at its new place before it is
-        removed from the log of its old place.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC; parts before or after all logs are cut off.
-
-        Returns
-        -------
-        list of Mark
-            The mark at its new place, in the part of each log.
-
-        Raises
-        ------
-        DataError
-            If there is no such mark, it has these ends, or a part of the span was not recorded.
-        LogError
-            If a layer is damaged or cannot be written; that layer is unchanged then.
+        Other marks in the span, in nanoseconds of UTC and cut to the logs, are replaced. A mark is
+        written at its new place before it is removed from the log of its old place. Return the mark
+        at its new place, in the part of each log. Raise `DataError` if there is no such mark or it
+        has these ends, else errors as `mark` does.
         """
         old, pieces, now = self._mark_near(start, end), self._pieces(start, end), time.time_ns()
         if (old[0].start, old[-1].end) == (pieces[0][1], pieces[-1][2]):
@@ -216,17 +157,9 @@ class Marking:
         return made[-1]
 
     def undo(self) -> tuple[int, int] | None:
-        """Undo the last change.
+        """Undo the last change; return its span in nanoseconds of UTC, or None without a change.
 
-        Returns
-        -------
-        (int, int) or None
-            Its span, in nanoseconds of UTC; None if there is nothing to undo.
-
-        Raises
-        ------
-        LogError
-            If a layer is damaged or cannot be written.
+        Raise `LogError` if a layer is damaged or cannot be written.
         """
         if not self._done:
             return None

@@ -36,18 +36,9 @@ _SEED = 20_261_123
 def sample(weights: Float64, most: int = MOST_CANDIDATES) -> tuple[Indices, Float64]:
     """Choose representative rows: with probability proportional to weight, spread over their order.
 
-    Parameters
-    ----------
-    weights : np.ndarray [shape=(n,)], float64
-        Not negative.
-
-    Returns
-    -------
-    rows : np.ndarray [shape=(m,)], intp
-        Ascending; all rows with a weight, if these are at most `most`. The same weights give the
-        same rows.
-    shares : np.ndarray [shape=(m,)], float64
-        Share of the sum of all weights that each row represents.
+    Weights [shape=(n,)] are not negative; the same weights give the same rows. Return rows
+    [shape=(m,)], ascending, all rows with a weight if these are at most `most`, and the share of
+    the sum of all weights that each row represents.
     """
     rows = np.flatnonzero(weights > 0.0)
     if len(rows) <= most:
@@ -63,26 +54,12 @@ def sample(weights: Float64, most: int = MOST_CANDIDATES) -> tuple[Indices, Floa
 # least 1 - 1 / e of the possible maximum (Nemhauser, Wolsey and Fisher, "An analysis of
 # approximations for maximizing submodular set functions", 1978).
 def cover(points: Float64, gamma: float, weights: Float64, eligible: Bool, count: int) -> Indices:
-    """Choose points that are similar to most of the weight of all points.
+    """Choose up to `count` points that are similar to most of the weight of all points.
 
-    Each step adds the point with the largest gain in the sum of weight times similarity to the
-    nearest chosen point. The similarity of x and y is exp(-gamma |x - y|^2).
-
-    Parameters
-    ----------
-    points : np.ndarray [shape=(n, width)], float64
-        A row that is not finite is similar to none.
-    weights : np.ndarray [shape=(n,)], float64
-        Not negative.
-    eligible : np.ndarray [shape=(n,)], bool
-        Points that may be chosen.
-    count : int
-        Maximum number.
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], intp
-        In the order of choice, without points of no gain.
+    Each step adds the eligible point with the largest gain in the sum of weight times similarity to
+    the nearest chosen point. The similarity of x and y is exp(-gamma |x - y|^2); a point [shape=(n,
+    width)] that is not finite is similar to none. Weights are not negative. Points are in the order
+    of choice, without points of no gain.
     """
     similar = _similarities(points, gamma)
     nearest = np.zeros(len(points), np.float32)
@@ -122,26 +99,16 @@ _LONGEST_WEIGHED = 3 * NANOSECONDS
 
 @dataclass(frozen=True)
 class ReviewQueue:
-    """Spans to review, the best first.
-
-    Attributes
-    ----------
-    labels, others : list of str
-        Main label of each span in the labelling, and in the other one; empty without one.
-    uncertainty, disagreement, novelty : np.ndarray [shape=(n,)], float64
-        0 to 1.
-    has_uncertainty : bool
-        False if the logs have no probabilities.
-    """
+    """Spans to review, the best first."""
 
     spans: JudgeableSpans
-    labels: list[str]
-    others: list[str]
-    uncertainty: Float64
-    disagreement: Float64
-    novelty: Float64
+    labels: list[str]  # main label of each span in the labelling
+    others: list[str]  # likewise in the other labelling; empty without one
+    uncertainty: Float64  # [shape=(n,)], 0 to 1
+    disagreement: Float64  # [shape=(n,)], 0 to 1
+    novelty: Float64  # [shape=(n,)], 0 to 1
     candidates: int
-    has_uncertainty: bool
+    has_uncertainty: bool  # False if the logs have no probabilities
     ranking: str | None
 
     @property
@@ -175,34 +142,18 @@ def make_queue(  # noqa: PLR0913
     audible: Spans | None = None,
     progress: Progress = ignore_progress,
 ) -> ReviewQueue:
-    """Choose the spans that teach a model most, or whose labels are probably wrong.
+    """Choose up to `count` spans that teach a model most, or whose labels are probably wrong.
 
-    Parameters
-    ----------
-    other : NamedLabelling or None
-        Another labelling, to find disagreements; two names of one class are no disagreement.
-    count : int
-        Maximum number of spans.
-    ranking : str, optional
-        One of `RANKINGS`, to rank by it alone; by default by the weighted sum of uncertainty,
-        disagreement and novelty, without `border_pieces`. Mostly silent spans are not `uncertain`,
-        since there is nothing to judge. The most `useful` spans sound like most of the sounds that
-        the model is uncertain of, with rare classes preferred.
-    audible : Spans, optional
-        Time with kept sound: `useful` spans within it go first.
-    progress : callable, optional
-        Called with the share of the logs that is read, 0 to 1.
+    `other` is another labelling, to find disagreements; two names of one class are no disagreement.
+    `ranking` is one of `RANKINGS`, to rank by it alone; by default spans are ranked by the weighted
+    sum of uncertainty, disagreement and novelty, without `border_pieces`. Mostly silent spans are
+    not `uncertain`, since there is nothing to judge. The most `useful` spans sound like most of the
+    sounds that the model is uncertain of, with rare classes preferred; those within `audible`, time
+    with kept sound, go first. There is at most one span of each segment, except for `useful` spans.
+    `progress` receives the share of the logs that is read, 0 to 1.
 
-    Returns
-    -------
-    ReviewQueue
-        At most one span of each segment, except for `useful` spans.
-
-    Raises
-    ------
-    DataError
-        If nothing is left to review, there is nothing to rank by, or there are more than five
-        million spans.
+    Raise `DataError` if nothing is left to review, there is nothing to rank by, or there are more
+    than five million spans.
     """
     other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))
@@ -282,19 +233,11 @@ def _useful(
 
 
 def worth(spans: JudgeableSpans, uncertain: Float64) -> Float64:
-    """Weigh spans by their length and by the model's uncertainty.
+    """Weigh spans by their length and by the model's uncertainty [shape=(n,)], 0 to 1.
 
     The total weight of a class is proportional to the square root of its duration, so that rare
-    classes are included, and frequent ones more often.
-
-    Parameters
-    ----------
-    uncertain : np.ndarray [shape=(n,)], float64
-        0 to 1; if all are 0, all spans count as equally uncertain.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
+    classes are included, and frequent ones more often. If all uncertainties are 0, all spans count
+    as equally uncertain.
     """
     seconds = np.minimum(spans.ends - spans.starts, _LONGEST_WEIGHED) / NANOSECONDS
     of_class = np.bincount(spans.labels, seconds)[spans.labels]
@@ -344,23 +287,11 @@ def _best_of_each(scores: Float64, sources: Int64) -> Int64:
 
 
 def spread(scores: Float64, spans: JudgeableSpans, count: int) -> Int64:
-    """Choose the best spans, spread over days and classes.
+    """Choose the rows of up to `count` best spans, spread over days and classes.
 
     Each step adds the span with the highest score / sqrt((1 + c) (1 + d)), where c and d are the
-    numbers of spans of its class and of its day chosen already; the first of equal ones.
-
-    Parameters
-    ----------
-    scores : np.ndarray [shape=(n,)], float64
-    spans : JudgeableSpans
-        In any order, at least one.
-    count : int
-        Maximum number.
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], int64
-        Rows, in the order of choice.
+    numbers of spans of its class and of its day chosen already; the first of equal ones. Rows are
+    in the order of choice; spans, at least one, are in any order.
     """
     _, day = np.unique(spans.starts // DAY, return_inverse=True)
     label = spans.labels

@@ -46,16 +46,8 @@ _NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,20})?")
 class ReviewSpan(NamedTuple):
     """A span of time to review, and the reason.
 
-    Attributes
-    ----------
-    b, label_b : str
-        The other labelling and its label; both are empty if there is none, the label also where
-        the labelling has none.
-    score : float or None
-        None for unranked spans; for a change, the minutes a day with the same change; for a hint,
-        the logits above the threshold of the name.
-    reason : str
-        One of `REASONS`; `random` is a complete minute drawn at random.
+    The score is None for unranked spans; for a change, the minutes a day with the same change; for
+    a hint, the logits above the threshold of the name.
     """
 
     microphone: str
@@ -63,10 +55,10 @@ class ReviewSpan(NamedTuple):
     end: int
     a: str
     label_a: str
-    b: str
-    label_b: str
+    b: str  # the other labelling; empty if there is none
+    label_b: str  # empty where it has none
     score: float | None
-    reason: str
+    reason: str  # of `REASONS`; `random` is a complete minute drawn at random
 
     @property
     def proposed_label(self) -> str:
@@ -79,12 +71,9 @@ class ReviewSpan(NamedTuple):
 
 
 def disagreements(difference: LabellingDifference, microphone: str) -> list[ReviewSpan]:
-    """List the spans in which two labellings differ.
+    """List the spans in which two labellings differ, without scores.
 
-    Returns
-    -------
-    list of ReviewSpan
-        The longest first, at most `MOST_SPANS`; without scores.
+    They are at most `MOST_SPANS`, the longest first.
     """
     a, b, classes = difference.a, difference.b, difference.classes
     rows = zip(*(column[:MOST_SPANS].tolist() for column in difference.disagreements), strict=True)
@@ -95,18 +84,10 @@ def disagreements(difference: LabellingDifference, microphone: str) -> list[Revi
 
 
 def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[ReviewSpan]:
-    """List the spans of a queue, in its order.
+    """List the spans of a queue, in its order; `b` is the other labelling, or empty.
 
-    Parameters
-    ----------
-    b : str, optional
-        The other labelling of the comparison; empty without one.
-
-    Returns
-    -------
-    list of ReviewSpan
-        With the score, to three digits; the reason is the ranking, or the part with the largest
-        weight in the score. `useful` spans have no score.
+    They have the score, to three digits; the reason is the ranking, or the part with the largest
+    weight in the score. `useful` spans have no score.
     """
     reasons = queue.reasons.tolist()
     columns = queue.spans.starts, queue.spans.ends, queue.scores.round(3)
@@ -134,17 +115,9 @@ def random_minutes(minutes: Spans, side: NamedLabelling, microphone: str) -> lis
 
 
 def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
-    """Write spans as CSV, in their order, for `read_list`.
+    """Write up to `MOST_SPANS` spans as CSV, in their order, for `read_list`.
 
-    Parameters
-    ----------
-    spans : sequence of ReviewSpan
-        At most `MOST_SPANS`.
-
-    Raises
-    ------
-    LogError
-        If the file exists, or cannot be written.
+    Raise `LogError` if the file exists, or cannot be written.
     """
     assert len(spans) <= MOST_SPANS
     lines = [",".join(ReviewSpan._fields)]
@@ -156,17 +129,10 @@ def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
 
 
 def read_list(path: Path) -> list[ReviewSpan]:
-    """Read a list of spans.
+    """Read a list of spans in file order, at least one.
 
-    Returns
-    -------
-    list of ReviewSpan
-        In file order, at least one.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, is no list of spans, or is empty; the message has the line.
+    Raise `DataError` if the file cannot be read, is no list of spans, or is empty; the message has
+    the line.
     """
     header: list[str] = []
     spans: list[ReviewSpan] = []
@@ -247,16 +213,10 @@ class KeptSoundLayers(NamedTuple):
 
 
 class SoundFile(NamedTuple):
-    """Kept sound of a line of a label file, or of the lines of a minute.
+    """Kept sound of a line of a label file, or of the lines of a minute."""
 
-    Attributes
-    ----------
-    first, last : int
-        Line numbers, from 1.
-    """
-
-    first: int
-    last: int
+    first: int  # line number, from 1
+    last: int  # likewise
     start: int
     end: int
 
@@ -270,17 +230,9 @@ class SoundFile(NamedTuple):
 def find_kept_sound(
     logs: Path, microphone: str, limits: tuple[int | None, int | None], losses: list[str]
 ) -> KeptSoundLayers:
-    """Find the kept sound of a microphone.
+    """Find the kept sound of a microphone within limits in nanoseconds of UTC; None for no limit.
 
-    Parameters
-    ----------
-    limits : (int or None, int or None)
-        Start and end in nanoseconds of UTC; None for no limit.
-
-    Raises
-    ------
-    LogError
-        If there is no log.
+    Raise `LogError` if there is no log.
     """
     topic = labelling_topic(microphone, LIVE, "audio")
     start, end = 0 if limits[0] is None else limits[0], _EVER if limits[1] is None else limits[1]
@@ -383,17 +335,9 @@ def corrected_name(labelling: str) -> str:
 
 
 def check_scenario(path: Path, spans: Iterable[ReviewSpan], scenario: str, option: str) -> None:
-    """Check that all spans of a list belong to one scenario.
+    """Raise `DataError` if a span of a list does not belong to a scenario.
 
-    Parameters
-    ----------
-    scenario : str
-        Its name; empty for the sounds of the home.
-
-    Raises
-    ------
-    DataError
-        If a span belongs to another one.
+    The scenario is empty for the sounds of the home.
     """
     for span in spans:
         other = scenario_name(span.a)

@@ -81,30 +81,17 @@ def queue_spans(  # noqa: PLR0913, PLR0917
     progress: Progress = ignore_progress,
     audible: Spans | None = None,
 ) -> list[ReviewSpan]:
-    """Choose spans of a labelling for a review.
+    """Choose up to `count` spans of a labelling for a review; None is ten, or all of a list.
 
-    Parameters
-    ----------
-    queue : str
-        One of `QUEUES`, a list (`*.csv`) made by `hearthlog diff`, or a model whose changes are
-        requested: its name in the folder of models, or its file. Every fifth item of a `useful`
-        queue is a minute drawn at random, and every item of a `random` queue.
-    limits : (int or None, int or None)
-        Start and end in nanoseconds of UTC; None for no limit.
-    count : int or None
-        Maximum number; None for ten, or for all of a list.
-    progress : callable, optional
-        Called with the share of the logs that is read, 0 to 1.
+    `queue` is one of `QUEUES`, a list (`*.csv`) made by `hearthlog diff`, or a model whose changes
+    are requested: its name in the folder of models, or its file. Every fifth item of a `useful`
+    queue is a minute drawn at random, and every item of a `random` queue. Limits are nanoseconds of
+    UTC; None for no limit. `progress` receives the share of the logs that is read, 0 to 1.
 
-    Raises
-    ------
-    DataError
-        If there is nothing to review, or the list or model does not exist; for a scenario also
-        if random minutes or the changes of a model are requested.
-    ModelError
-        If the current model cannot be found or used.
-    LogError
-        If the labelling has no segment in these limits, or its segments overlap or are invalid.
+    Raise `DataError` if there is nothing to review, or the list or model does not exist; for a
+    scenario also if random minutes or the changes of a model are requested; `ModelError` if the
+    current model cannot be found or used; `LogError` if the labelling has no segment in these
+    limits, or its segments overlap or are invalid.
     """
     microphone, labelling = labelled
     scenario = scenario_name(labelling)

@@ -92,19 +92,11 @@ class Screen(Protocol):
 
 @dataclass
 class ReviewSession:
-    """Keyboard-driven review.
+    """Keyboard-driven review of items; empty where the reviewer chooses spans.
 
-    Parameters
-    ----------
-    look_closely : callable
-        Draws a span (start, end in nanoseconds of UTC) at the resolution of its frames.
-    listen : callable
-        Plays the kept sound of a span (start, end in nanoseconds of UTC); returns its length in
-        seconds, 0 without sound, and a line for the reviewer.
-    stop : callable
-        Stops the sound.
-    items : sequence of ReviewItem
-        The spans to review; empty where the reviewer chooses spans.
+    `look_closely` draws a span at the resolution of its frames; `listen` plays the kept sound of a
+    span, and returns its length in seconds, 0 without sound, and a line for the reviewer; `stop`
+    stops it. Spans have start and end in nanoseconds of UTC.
     """
 
     screen: Screen
@@ -193,11 +185,8 @@ class ReviewSession:
     def press(self, key: str) -> None:
         """Process one key; an error is shown to the reviewer and changes nothing.
 
-        Parameters
-        ----------
-        key : str
-            One of `keys`, Enter, or a space, which plays. Any other key except white space shows
-            the list of keys.
+        A key is one of `keys`, Enter, or a space, which plays. Any other key except white space
+        shows the list of keys.
         """
         try:
             self._press(key)
@@ -433,17 +422,9 @@ def listen(
 ) -> tuple[float, str]:
     """Start playback of the kept sound of a span of time.
 
-    Parameters
-    ----------
-    play : callable, optional
-        Plays samples of a rate; raises `LogError` if that is not possible.
-
-    Returns
-    -------
-    seconds : float
-        Length of the sound; 0 if nothing plays.
-    text : str
-        A line for the reviewer: the length of the sound, or why there is none.
+    `play` plays samples of a rate, and raises `LogError` if that is not possible. Return the length
+    of the sound in seconds, 0 if nothing plays, and a line for the reviewer: the length, or why
+    there is no sound.
     """
     rate, samples = sound_of(clips, start, end)
     if not len(samples):

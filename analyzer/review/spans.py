@@ -39,34 +39,18 @@ _MOST = 5_000_000
 
 @dataclass(frozen=True)
 class JudgeableSpans:
-    """Spans in time order, without overlaps.
+    """Spans in time order, without overlaps."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    labels : np.ndarray [shape=(n,)], int64
-        Indices of classes.
-    sources : np.ndarray [shape=(n,)], int64
-        Equal for spans cut from the same segment.
-    """
-
-    starts: Int64
-    ends: Int64
-    labels: Int64
-    sources: Int64
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC
+    ends: Int64  # likewise
+    labels: Int64  # [shape=(n,)]; indices of classes
+    sources: Int64  # [shape=(n,)]; equal for spans cut from the same segment
 
     def __len__(self) -> int:
         return len(self.starts)
 
     def take(self, rows: Int64) -> "JudgeableSpans":
-        """Return some of the spans.
-
-        Parameters
-        ----------
-        rows : np.ndarray [shape=(m,)], int64
-            In time order, otherwise the result is not in time order.
-        """
+        """Return some of the spans; rows must be in time order, or the result is not."""
         return JudgeableSpans(
             self.starts[rows], self.ends[rows], self.labels[rows], self.sources[rows]
         )
@@ -75,19 +59,10 @@ class JudgeableSpans:
 def judgeable_spans(segments: Events) -> JudgeableSpans:
     """Make spans that a person can judge: join flickering segments, and cut long ones.
 
-    Successive segments of less than a second each are joined, with the label of the longest. Spans
-    longer than ten seconds are cut into equal parts; spans shorter than half a second are dropped,
-    since nobody could judge them.
-
-    Parameters
-    ----------
-    segments : Events
-        In nanoseconds of UTC, in time order, one label at a time.
-
-    Raises
-    ------
-    DataError
-        If there are more than five million spans, as of a year and a half.
+    Segments are nanoseconds of UTC, in time order, one label at a time. Successive segments of less
+    than a second each are joined, with the label of the longest. Spans longer than ten seconds are
+    cut into equal parts; spans shorter than half a second are dropped, since nobody could judge
+    them. Raise `DataError` if there are more than five million spans, as of a year and a half.
     """
     lengths = segments.ends - segments.starts
     short = lengths < _FLICKER
@@ -109,19 +84,10 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
 
 
 def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Find spans shorter than a second next to another sound.
+    """Find spans shorter than a second next to another sound; `silent` labels are silence.
 
     Where one sound changes into the next the label wavers, and a person hears only the two. A sound
     as short that stands alone, such as a cough, can be judged.
-
-    Parameters
-    ----------
-    silent : np.ndarray [shape=(classes,)], bool
-        Which labels are silence.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], bool
     """
     touching = spans.starts[1:] == spans.ends[:-1]
     sounds = ~silent[spans.labels]
@@ -140,12 +106,8 @@ def without(segments: Events, reviewed: Spans) -> Events:
 def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
     """Compare spans with another labelling.
 
-    Returns
-    -------
-    labels : np.ndarray [shape=(n,)], int64
-        The other labelling's main label in each span; -1 for none.
-    differing : np.ndarray [shape=(n,)], float64
-        The share of each span with a different label, 0 to 1.
+    Return its main label in each span, -1 for none, and the share of each span with a different
+    label, 0 to 1.
     """
     own = Events(spans.starts, spans.ends, spans.labels)
     pieces = overlay([own, others]).in_all()
@@ -161,19 +123,9 @@ def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[
 
 
 class ModelUncertainty:
-    """Mean uncertainty, novelty and silence of spans, computed from batches of labels.
+    """Mean uncertainty and novelty (0 to 1), and probability of silence, of one or more spans.
 
-    Parameters
-    ----------
-    spans : JudgeableSpans
-        At least one.
-
-    Attributes
-    ----------
-    uncertainty, novelty : SpanMeans
-        0 to 1.
-    silence : SpanMeans
-        The probability of silence; 1 where nothing is above the noise floor.
+    They are computed from batches of labels; silence is 1 where nothing is above the noise floor.
     """
 
     def __init__(self, spans: JudgeableSpans, classes: Sequence[str]) -> None:
@@ -181,12 +133,9 @@ class ModelUncertainty:
         self.uncertainty, self.novelty, self.silence = (SpanMeans(len(spans)) for _ in range(3))
 
     def add(self, frames: Columns) -> None:
-        """Add the labels of frames; probabilities without names are skipped.
+        """Add label messages, in any order, with stamp, probabilities and novelty.
 
-        Parameters
-        ----------
-        frames : Columns
-            Label messages with stamp, probabilities and novelty, in any order.
+        Probabilities without names are skipped.
         """
         stamps, probabilities = frames["header.stamp"], frames["probabilities"]
         row = np.searchsorted(self._spans.starts, stamps, side="right") - 1
@@ -206,20 +155,10 @@ class ModelUncertainty:
 def uncertainty(probabilities: NDArray[np.floating], labelled: Int64) -> Float64:
     """Return (1 - p + q) / 2 for p of the label and q of the best other class.
 
-    Smoothing may choose another label than the most probable class, so the difference of the two
-    highest probabilities would be wrong.
-
-    Parameters
-    ----------
-    probabilities : np.ndarray [shape=(n, C)], float
-        Of each class, 0 to 1.
-    labelled : np.ndarray [shape=(n,)], int64
-        Columns of the labels; -1 for a label without a column, with p = 0.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-        0 (certain) to 1; 0.5 where another class is as probable as the label.
+    It is 0 (certain) to 1; 0.5 where another class is as probable as the label. Smoothing may
+    choose another label than the most probable class, so the difference of the two highest
+    probabilities [shape=(n, C)] would be wrong. `labelled` has columns of the labels; -1 for a
+    label without a column, with p = 0.
     """
     others = probabilities.astype(np.float64)
     rows = np.flatnonzero(labelled >= 0)
@@ -236,14 +175,7 @@ class SpanMeans:
         self._sums, self._counts = np.zeros(count), np.zeros(count)
 
     def add(self, row: Int64, values: Float64) -> None:
-        """Add values to their spans; values that are not finite are skipped.
-
-        Parameters
-        ----------
-        row : np.ndarray [shape=(n,)], int64
-            Row of the span of each value.
-        values : np.ndarray [shape=(n,)], float64
-        """
+        """Add values to the rows of their spans; values that are not finite are skipped."""
         finite = np.isfinite(values)
         row, values = row[finite], values[finite]
         if len(row):
@@ -271,18 +203,13 @@ _GAMMA = 0.5  # divided by the number of inputs, as in the starter models
 
 
 class SpanSounds(NamedTuple):
-    """One point per span.
+    """One point per span; the kernel of two points is exp(-gamma |x - y|^2).
 
-    Attributes
-    ----------
-    points : np.ndarray [shape=(n, width)], float64
-        Means of scaled inputs, followed by the embeddings of one network, 0 for a span without
-        any; NaN for a span without features.
-    gamma : float
-        The kernel of two points is exp(-gamma |x - y|^2).
+    A point has means of scaled inputs, followed by the embeddings of one network, 0 for a span
+    without any; NaN for a span without features.
     """
 
-    points: Float64
+    points: Float64  # [shape=(n, width)]
     gamma: float
 
 
@@ -291,15 +218,8 @@ def labelling_model(
 ) -> Model | None:
     """Find the model that labelled a microphone in the latest of some logs or layers.
 
-    Parameters
-    ----------
-    scenario : str, optional
-        Scenario of the model; empty for the sounds of the home.
-
-    Returns
-    -------
-    Model or None
-        None if its file is missing or unusable.
+    The scenario is empty for the sounds of the home. None if the file of the model is missing or
+    unusable.
     """
     with suppress(ModelError):
         path = find_model(models, model_of(logs[-1].path, microphone, scenario).model_sha256)
@@ -314,17 +234,11 @@ def span_sounds(
     model: Model | None,
     progress: Progress = ignore_progress,
 ) -> SpanSounds:
-    """Read the inputs and embeddings of spans.
+    """Read the inputs and embeddings of one or more spans.
 
-    Parameters
-    ----------
-    spans : JudgeableSpans
-        At least one.
-    model : Model or None
-        The model that labelled them. Without one, or if its feature set differs from that of the
-        logs, the points are means and standard deviations of the features, scaled by their spread.
-    progress : callable, optional
-        Called with the share of the spans that is read, 0 to 1.
+    Without the model that labelled them, or if its feature set differs from that of the logs, the
+    points are means and standard deviations of the features, scaled by their spread. `progress`
+    receives the share of the spans that is read, 0 to 1.
     """
     name, points = topic(microphone, "features"), np.empty((len(spans), 0))
     embedded: dict[EmbeddingSpace, Float64] = {}

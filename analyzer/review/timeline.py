@@ -45,18 +45,7 @@ class TimelineGrid:
         return edges[:-1] + (edges[1:] - edges[:-1]) // 2
 
     def find(self, times: Int64) -> NDArray[np.intp]:
-        """Find the share that contains each time.
-
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC.
-
-        Returns
-        -------
-        np.ndarray [shape=(n,)], int
-            0 to count - 1; the nearest share for a time outside the grid.
-        """
+        """Find the share with each time (ns of UTC), 0 to count - 1, or the nearest one."""
         places = (times - self.start) * (self.count / (self.end - self.start))
         return np.clip(places.astype(np.int64), 0, self.count - 1)
 
@@ -70,14 +59,7 @@ class GridMeans:
         self._counts = np.zeros(grid.count, np.int64)
 
     def add(self, times: Int64, values: NDArray[np.floating]) -> None:
-        """Add rows in time order; values that are not finite count as 0.
-
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC, at least one.
-        values : np.ndarray [shape=(n, width)], float
-        """
+        """Add rows, at least one, in order of time (ns of UTC); non-finite values count as 0."""
         share = self._grid.find(times)
         first = np.flatnonzero(np.diff(share, prepend=-1))
         if not np.isfinite(values).all():
@@ -94,18 +76,10 @@ class GridMeans:
 
 @dataclass(frozen=True)
 class HomeClock:
-    """Local wall clock of a home, as nanoseconds since 1970.
+    """Local wall clock of a home, as nanoseconds since 1970."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the axis, with the offset from UTC.
-    offset : int
-        Local time minus UTC, in nanoseconds.
-    """
-
-    name: str
-    offset: int
+    name: str  # of the axis, with the offset from UTC
+    offset: int  # local time minus UTC, in nanoseconds
 
     def shown(self, utc: Any) -> Any:
         """Convert UTC to local time, both in nanoseconds (int or np.ndarray of int64)."""
@@ -138,18 +112,11 @@ def _ahead(time: int, zone: tzinfo) -> timedelta:
 
 
 class LabelledSpans(NamedTuple):
-    """Spans of time, each with a text: a label, or a reason.
+    """Spans of time, each with a text: a label, or a reason."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, in time order.
-    texts : np.ndarray [shape=(n,)] of str
-    """
-
-    starts: Int64
-    ends: Int64
-    texts: NDArray[np.object_]
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC, in time order
+    ends: Int64  # likewise
+    texts: NDArray[np.object_]  # [shape=(n,)] of str
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -197,29 +164,15 @@ class PlotKind:
 
 
 class Plot(NamedTuple):
-    """Values of a plot, or an addition to it: logged rows, or what is drawn of their means.
-
-    Attributes
-    ----------
-    labelling : str
-        Empty if the plot belongs to none.
-    names : tuple of str
-        Of the drawn columns.
-    times : np.ndarray [shape=(n,)], int64
-        Starts of frames, or middles of spans, in nanoseconds of UTC.
-    values : np.ndarray [shape=(n, k)], float
-        NaN where nothing was recorded.
-    length : int
-        Of a span, in nanoseconds.
-    """
+    """Values of a plot, or an addition to it: logged rows, or what is drawn of their means."""
 
     kind: PlotKind
     microphone: str
-    labelling: str
-    names: tuple[str, ...]
-    times: Int64
-    values: NDArray[np.floating]
-    length: int = NANOSECONDS
+    labelling: str  # empty if the plot belongs to none
+    names: tuple[str, ...]  # of the drawn columns
+    times: Int64  # [shape=(n,)]; starts of frames, or middles of spans, in nanoseconds of UTC
+    values: NDArray[np.floating]  # [shape=(n, k)]; NaN where nothing was recorded
+    length: int = NANOSECONDS  # of a span, in nanoseconds
 
     @property
     def title(self) -> str:
@@ -253,35 +206,19 @@ PlotKey = tuple[PlotKind, str]  # with the labelling
 
 
 class LogLines(NamedTuple):
-    """Text lines logged by the recorder, in time order.
+    """Text lines logged by the recorder, in time order."""
 
-    Attributes
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    levels : np.ndarray [shape=(n,)], int
-        Levels of `rcl_interfaces/msg/Log`.
-    texts : np.ndarray [shape=(n,)] of str
-    """
-
-    times: Int64
-    levels: NDArray[np.integer]
-    texts: NDArray[np.object_]
+    times: Int64  # [shape=(n,)], in nanoseconds of UTC
+    levels: NDArray[np.integer]  # [shape=(n,)], of `rcl_interfaces/msg/Log`
+    texts: NDArray[np.object_]  # [shape=(n,)] of str
 
 
 class SoundClip(NamedTuple):
-    """Clip of kept sound.
-
-    Attributes
-    ----------
-    rate : int
-        Samples per second.
-    samples : np.ndarray [shape=(n,)], int16
-    """
+    """Clip of kept sound."""
 
     start: int
-    rate: int
-    samples: Int16
+    rate: int  # samples per second
+    samples: Int16  # [shape=(n,)]
 
     @property
     def end(self) -> int:
@@ -293,16 +230,10 @@ _SOUND_SCALE = np.float32(32768.0)
 
 
 def sound_of(clips: Sequence[SoundClip], start: int, end: int) -> tuple[int, Float32]:
-    """Return the kept sound of a span of time, without the holes.
+    """Return rate and samples (-1 to 1) of the kept sound of a span of time, without the holes.
 
-    Clips with a sample rate other than the first clip's are skipped.
-
-    Returns
-    -------
-    rate : int
-        Samples per second; 0 if no sound was kept.
-    samples : np.ndarray [shape=(n,)], float32
-        -1 to 1.
+    Clips with a sample rate other than the first clip's, in samples per second, are skipped; it is
+    0 if no sound was kept.
     """
     parts, rate = [np.empty(0, np.float32)], 0
     for clip in clips:
@@ -322,19 +253,10 @@ _RANGE = 55.0  # dB below the peak of a spectrogram that are visible
 def spectrogram(
     clips: Sequence[SoundClip], start: int, end: int, shape: tuple[int, int]
 ) -> Float64 | None:
-    """Compute the spectrogram of the kept sound of a span of time.
+    """Compute the spectrogram of the kept sound of a span in nanoseconds of UTC; None without any.
 
-    Parameters
-    ----------
-    start, end : int
-        In nanoseconds of UTC.
-    shape : (int, int)
-        Rows from 8 kHz down to 0, and columns from start to end.
-
-    Returns
-    -------
-    np.ndarray, float64, or None
-        0 (55 dB below the loudest value) to 1, and 0 where no sound was kept; None without sound.
+    `shape` has rows from 8 kHz down to 0, and columns from start to end. Values are 0 (55 dB below
+    the loudest) to 1, and 0 where no sound was kept.
     """
     rows, count = shape
     times = start + (np.arange(count) + 0.5) * ((end - start) / count)
@@ -372,20 +294,12 @@ class LabellingTimeline:
 
 @dataclass
 class MicrophoneTimeline:
-    """Logged data of a microphone.
-
-    Attributes
-    ----------
-    plots : mapping of (PlotKind, str) to Plot
-        Means on the grid, in the order of the views.
-    frames : mapping of (PlotKind, str) to list of Plot
-        Single frames; empty above three hours, see `read_frames`.
-    """
+    """Logged data of a microphone."""
 
     name: str
     labellings: list[LabellingTimeline]
-    plots: Mapping[PlotKey, Plot]
-    frames: Mapping[PlotKey, Sequence[Plot]]
+    plots: Mapping[PlotKey, Plot]  # means on the grid, in the order of the views
+    frames: Mapping[PlotKey, Sequence[Plot]]  # empty above three hours, see `read_frames`
     reviewed: LabelledSpans
     gaps: LabelledSpans
     troubles: LabelledSpans
@@ -400,13 +314,7 @@ class MicrophoneTimeline:
         return self.classes_of("")
 
     def classes_of(self, scenario: str) -> list[str]:
-        """Return the classes of a scenario, then other labels.
-
-        Parameters
-        ----------
-        scenario : str
-            Its name; empty for all labellings without a scenario.
-        """
+        """Return the classes of a scenario, or of all labellings without one, then other labels."""
         labellings = [one for one in self.labellings if scenario_name(one.name) == scenario]
         names = [name for one in labellings for name in one.classes]
         return list(dict.fromkeys([*names, *(t for one in labellings for t in one.spans.texts)]))
@@ -414,15 +322,9 @@ class MicrophoneTimeline:
 
 @dataclass
 class Timeline:
-    """Content of some logs, at the resolution of a screen.
+    """Content of some logs, at the resolution of a screen."""
 
-    Attributes
-    ----------
-    grid : TimelineGrid
-        Complete span, in shares one or two pixels wide.
-    """
-
-    grid: TimelineGrid
+    grid: TimelineGrid  # complete span, in shares one or two pixels wide
     microphones: Mapping[str, MicrophoneTimeline]
     lines: LogLines
     zone: str

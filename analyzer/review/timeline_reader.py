@@ -285,21 +285,10 @@ def read_timeline(
 ) -> Timeline:
     """Read logs, their layers and clips as a timeline.
 
-    Above about three days only a sample is read: some chunks of each log, evenly spaced.
-
-    Parameters
-    ----------
-    start, end : int, optional
-        In nanoseconds of UTC; by default from the first message to the last.
-    progress : callable, optional
-        Called with the share of the logs that is read, 0 to 1.
-
-    Raises
-    ------
-    LogError
-        If there is no log.
-    DataError
-        If this span of time is empty, or the time zone is unknown.
+    Start and end are nanoseconds of UTC; by default from the first message to the last. Above about
+    three days only a sample is read: some chunks of each log, evenly spaced. `progress` receives
+    the share of the logs that is read, 0 to 1. Raise `LogError` if there is no log; `DataError` if
+    this span of time is empty, or the time zone is unknown.
     """
     losses: list[str] = []
     files = find_timed_files(paths, start, None if end is None else end + _LATE, losses)
@@ -342,12 +331,9 @@ def read_timeline(
 def read_frames(
     timeline: Timeline, start: int | None = None, end: int | None = None
 ) -> Iterator[Timeline]:
-    """Read the frames of a timeline too long to keep them, one hour at a time.
+    """Read frames of a timeline too long to keep them, from start to end, one hour at a time.
 
-    Parameters
-    ----------
-    start, end : int, optional
-        In nanoseconds of UTC; by default the complete timeline.
+    Times are nanoseconds of UTC; by default the complete timeline.
     """
     start = timeline.grid.start if start is None else max(start, timeline.grid.start)
     end = timeline.grid.end if end is None else min(end, timeline.grid.end)

@@ -95,28 +95,14 @@ class Canvas:
         self.recording.log(entity, rr.TextDocument(text, media_type=media_type), static=True)
 
     def configure_states(self, entity: str, colours: Mapping[str, Colour]) -> None:
-        """Set the colours and displayed names of the states of a lane.
-
-        Parameters
-        ----------
-        colours : mapping of str to Colour
-            By state: red, green and blue, 0 to 255.
-        """
+        """Set the colours (RGB, 0 to 255) and displayed names of the states of a lane."""
         style = rr.StateConfiguration(
             values=list(colours), labels=[*map(in_words, colours)], colors=[*colours.values()]
         )
         self.recording.log(entity, style, static=True)
 
     def change_states(self, entity: str, times: Int64, states: Sequence[str | None]) -> None:
-        """Set the state of a lane at each time.
-
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC.
-        states : sequence of (str or None)
-            n of them; None is no state.
-        """
+        """Set the state of a lane, None for no state, at each time, in nanoseconds of UTC."""
         column = rr.StateChange.columns(state=pa.array(states, pa.string()))
         self.recording.send_columns(entity, [self._time_column(times)], column)
 
@@ -155,16 +141,9 @@ class Canvas:
     ) -> None:
         """Stack shares of one as bands: each is filled by a line that goes up and down in it.
 
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            Middles of spans, in nanoseconds of UTC.
-        shares : np.ndarray [shape=(n, k)], float
-            0 to 1; NaN where there is nothing.
-        length : int
-            Of a span, in nanoseconds.
-        strokes : int, optional
-            In each span: fewer than the pixels of a span leave holes between.
+        Times are middles of spans of `length`, in nanoseconds of UTC; shares [shape=(n, k)] are 0
+        to 1, or NaN where there is nothing. `strokes` of a span that are fewer than its pixels
+        leave holes between.
         """
         # Half a stroke is a line of its own for the viewer, which keeps something of each.
         upper = np.where(shares < _LEAST_SHARE, np.nan, np.cumsum(shares, axis=1))
@@ -182,18 +161,9 @@ class Canvas:
         length: int,
         colours: Sequence[Colour],
     ) -> None:
-        """Draw shares of one as rows from above, the brighter the larger a share is.
+        """Draw shares of one as rows from above in k colours, the brighter the larger a share is.
 
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            Middles of spans, in nanoseconds of UTC.
-        shares : np.ndarray [shape=(n, k)], float
-            0 to 1; NaN where there is nothing.
-        length : int
-            Of a span, in nanoseconds.
-        colours : sequence of Colour
-            k of them.
+        Times and shares are as of `add_bands`.
         """
         there = ~np.isnan(shares).all(axis=1)
         levels = np.rint(np.nan_to_num(shares[there]) * _SHADES)
@@ -225,15 +195,7 @@ class Canvas:
         self.recording.send_columns(entity, [self._time_column(stamps[order])], columns)
 
     def draw_lines(self, entity: str, times: Int64, values: NDArray[np.floating]) -> None:
-        """Draw a line for each column of values.
-
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC.
-        values : np.ndarray [shape=(n, k)], float
-            NaN interrupts a line.
-        """
+        """Draw a line for each column of values [shape=(n, k)]; NaN interrupts a line."""
         width = values.shape[1]
         for first in range(0, len(times), _ROWS_AT_ONCE):
             part = values[first : first + _ROWS_AT_ONCE]
@@ -246,12 +208,7 @@ class Canvas:
     ) -> None:
         """Draw frames as lines, interrupted where frames are missing.
 
-        A frame equal to both its neighbours is skipped.
-
-        Parameters
-        ----------
-        parts : iterable of Plot
-            Each with at least one frame.
+        A frame equal to both its neighbours is skipped. Each part has at least one frame.
         """
         for part in parts:
             times, values = _with_holes(part, names)
@@ -261,15 +218,7 @@ class Canvas:
             self.draw_lines(entity, times[kept], rounded[kept])
 
     def add_shades(self, entity: str, times: Int64, shade: NDArray[np.floating]) -> None:
-        """Draw squares of a heat map.
-
-        Parameters
-        ----------
-        times : np.ndarray [shape=(n,)], int64
-            In nanoseconds of UTC.
-        shade : np.ndarray [shape=(n, k)], float
-            0 (dark) to 1 (bright).
-        """
+        """Draw squares of a heat map; shades [shape=(n, k)] are 0 (dark) to 1 (bright)."""
         colours = _coloured(shade)
         count = shade.shape[1]
         heights = np.tile(np.arange(count, dtype=np.float64), len(times))
@@ -284,10 +233,7 @@ class Canvas:
     def show_image(self, entity: str, time: int, shade: NDArray[np.floating], text: str) -> None:
         """Show an image from a time (ns of UTC) on, with a text in the entity below.
 
-        Parameters
-        ----------
-        shade : np.ndarray [shape=(rows, columns)], float
-            0 (dark) to 1 (bright).
+        Shades [shape=(rows, columns)] are 0 (dark) to 1 (bright).
         """
         self.recording.set_time(
             self.clock.name, timestamp=np.datetime64(self.clock.shown(time), "ns")
@@ -304,16 +250,10 @@ class Canvas:
             self.recording.send_columns(entity, [self._time_column(lines.times)], column)
 
     def show_clips(self, entity: str, clips: Sequence[SoundClip], start: int) -> None:
-        """Add clips of sound at their starts, separated by a moment of silence.
+        """Add one or more clips in time order at their starts, separated by a moment of silence.
 
-        A viewer shows the latest data, however old, and an error before the first data.
-
-        Parameters
-        ----------
-        clips : sequence of SoundClip
-            At least one, in time order.
-        start : int
-            Start of the view, in nanoseconds of UTC.
+        `start` of the view is nanoseconds of UTC. A viewer shows the latest data, however old, and
+        an error before the first data.
         """
         rate = clips[0].rate
         silence = np.zeros(rate // 10, np.int16)

@@ -124,18 +124,10 @@ def lanes_entity(microphone: str, labelling: str) -> str:
 def draw(
     timeline: Timeline, canvas: Canvas, *, marking: bool = False
 ) -> dict[tuple[str, str], DrawnLane]:
-    """Draw a timeline, except single frames.
+    """Draw a timeline, except single frames; return the lanes that change, by microphone and name.
 
-    Returns
-    -------
-    dict of (str, str) to DrawnLane
-        The lanes that change, by microphone and name: those of reviewed spans, and of the selected
-        span.
-
-    Raises
-    ------
-    DataError
-        If the timeline's time zone is unknown.
+    Those are the lanes of reviewed spans, and of the selected span. Raise `DataError` if the
+    timeline's time zone is unknown.
     """
     changing = {}
     canvas.fill(NOTHING, timeline.grid.start, timeline.grid.end)
@@ -250,10 +242,7 @@ def draw_frames(
 ) -> None:
     """Draw the frames of a span: all probabilities, and the level five times a second.
 
-    Parameters
-    ----------
-    start, end : int, optional
-        In nanoseconds of UTC, for the first samples of frames; `end` is excluded. By default all.
+    Start and end (excluded) are nanoseconds of UTC, of the first samples of frames; by default all.
     """
     for microphone in timeline.microphones.values():
         for key, frames in microphone.frames.items():
@@ -348,14 +337,9 @@ Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
 
 
 class TimelineBlueprint(rrb.Blueprint):
-    """Blueprint with linked time axes that start at a range.
+    """Blueprint with linked time axes that start at a range of times, or seconds from the cursor.
 
-    Parameters
-    ----------
-    start, end : Boundary
-        Times, or seconds from the cursor.
-    lanes_share : float, optional
-        Share of the height that the lanes have.
+    The lanes have `lanes_share` of the height.
     """
 
     def __init__(
@@ -399,14 +383,9 @@ def lines_view() -> rrb.View:
 
 
 def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = False) -> rrb.View:
-    """Show plots of one kind, or of kinds with the same title, in one view.
+    """Show one or more plots of one kind, or of kinds with the same title, in one view.
 
-    Parameters
-    ----------
-    plots : sequence of Plot
-        At least one; the last of the plots with the most names sets the names.
-    entities : sequence of str
-        Entities of the plots, at least one.
+    The last of the plots with the most names sets the names.
     """
     plot = max(reversed(plots), key=lambda one: len(one.names))
     kind = plots[0].kind

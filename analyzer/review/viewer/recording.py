@@ -153,17 +153,9 @@ Plots = dict[str, list[Plot]]  # by entity: the first plot of each set of names
 class LiveServer:
     """Draws updates for all connected viewers, and keeps recent data for later viewers.
 
-    Lanes and lines are drawn at once, plots every few seconds.
-
-    Parameters
-    ----------
-    memory : str, optional
-        Maximum data kept for later viewers, as `20MB`; then the oldest is dropped.
-
-    Raises
-    ------
-    DataError
-        If it cannot listen there.
+    Lanes and lines are drawn at once, plots every few seconds. `memory` is the maximum data kept
+    for later viewers, as `20MB`; then the oldest is dropped. Raise `DataError` if it cannot listen
+    there.
     """
 
     def __init__(self, port: int, bind: str, minutes: float, memory: str = _MEMORY) -> None:

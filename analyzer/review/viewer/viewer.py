@@ -58,18 +58,12 @@ Blueprint = dict[str, Any]
 
 
 class ViewerState(NamedTuple):
-    """State reported by a viewer.
-
-    Attributes
-    ----------
-    cursor : int or None
-        The time cursor, in nanoseconds of the clock of the home.
-    """
+    """State reported by a viewer."""
 
     version: str
     views: int
     errors: list[str]
-    cursor: int | None
+    cursor: int | None  # in nanoseconds of the clock of the home
 
 
 class ViewerSize(NamedTuple):
@@ -87,13 +81,7 @@ _PANEL_HEIGHTS = 150.0, 250.0  # a quarter of the viewer, within these
 
 
 class Viewer(ABC):
-    """A viewer in a window or in a browser.
-
-    Parameters
-    ----------
-    address : str
-        URL of its page; empty if it opens itself.
-    """
+    """A viewer in a window or in a browser; the address of its page is empty if it opens itself."""
 
     def __init__(self, process: ViewerProcess, address: str = "") -> None:
         self.address = address
@@ -142,11 +130,8 @@ class Viewer(ABC):
     ) -> None:
         """Show buttons in the page of the viewer, if it has one.
 
-        Parameters
-        ----------
-        sound : callable, optional
-            Returns the sound of the current span as a WAV file, for the page to play; raises
-            `HearthlogError` if there is none.
+        `sound` returns the sound of the current span as a WAV file, for the page to play, or raises
+        `HearthlogError` if there is none.
         """
 
     def say(self, text: str) -> None:  # noqa: B027 - lines are printed in the terminal, too
@@ -200,10 +185,7 @@ class Viewer(ABC):
     def draw_frames(self, timeline: Timeline, start: int, end: int) -> None:
         """Draw every frame of a span of the timeline.
 
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC, for the first samples of frames; `end` is excluded.
+        Start and end (excluded) are nanoseconds of UTC, of the first samples of frames.
         """
         draw_frames(timeline, self._canvas, start, end)
         self._flush()
@@ -229,14 +211,9 @@ class Viewer(ABC):
     def redraw_marks(
         self, microphone: str, scenario: str, marks: LabelledSpans, reviewed: LabelledSpans
     ) -> None:
-        """Redraw the reviewed spans of a microphone.
+        """Redraw the reviewed spans of a microphone; earlier ones that are missing here are hidden.
 
-        Parameters
-        ----------
-        microphone, scenario : str
-            Their names; the scenario is empty for the sounds of the home.
-        marks, reviewed : LabelledSpans
-            All current ones; earlier drawn spans that are missing here are hidden.
+        The scenario is empty for the sounds of the home.
         """
         assert self._grid is not None
         lane = reviewed_lane(microphone, scenario, marks, reviewed)
@@ -277,16 +254,8 @@ class Viewer(ABC):
     def wait_until_drawn(self, is_over: Callable[[], bool] = bool) -> ViewerState | None:
         """Wait until the viewer has drawn its data; for a page, until somebody opens it.
 
-        Returns
-        -------
-        ViewerState or None
-            None if the wait was ended by `is_over`.
-
-        Raises
-        ------
-        DataError
-            If the viewer ends, if a window takes longer than a minute, or if the viewer's version
-            differs from the package's.
+        None if the wait was ended by `is_over`. Raise `DataError` if the viewer ends, if a window
+        takes longer than a minute, or if the viewer's version differs from the package's.
         """
         deadline = time.monotonic() + _WAIT_SECONDS
         while self.address or time.monotonic() < deadline:
@@ -307,17 +276,9 @@ class Viewer(ABC):
         raise DataError("Rerun's viewer does not show anything; use --save FILE.rrd")
 
     def selection(self) -> tuple[int, int] | None:
-        """Return the span selected on the time ruler.
+        """Return the span selected on the time ruler, if any, in nanoseconds of UTC.
 
-        Returns
-        -------
-        (int, int) or None
-            Start and end in nanoseconds of UTC; None without a selection.
-
-        Raises
-        ------
-        ConnectionError, TimeoutError
-            If the viewer does not answer.
+        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         return self._selection_in(self._blueprint())
 
@@ -363,12 +324,9 @@ class Viewer(ABC):
         """Return the size of the viewer; None if unknown."""
 
     def _align(self, blueprint: Blueprint) -> bool:
-        """Put the lanes beside their names and above the time ruler.
+        """Put the lanes beside their names and above the time ruler; return whether anything moved.
 
-        Returns
-        -------
-        bool
-            Whether the blueprint was changed, as the viewer has another size than before.
+        The viewer has another size than before then.
         """
         size, grid = self._size(), self._grid
         if size is None or grid is None or size == self._aligned:
@@ -439,18 +397,7 @@ class Viewer(ABC):
 
 
 def check_version(version: str) -> None:
-    """Raise DataError if a viewer's version differs from the package's.
-
-    Parameters
-    ----------
-    version : str
-        As reported by the viewer; empty if unknown.
-
-    Raises
-    ------
-    DataError
-        If it differs from the version of the installed `rerun` package.
-    """
+    """Raise `DataError` if a viewer's version, or empty, differs from the installed `rerun`'s."""
     if version != rr.__version__:
         raise DataError(
             f"the viewer is of Rerun {version or 'an unknown version'}, and hearthlog works with "

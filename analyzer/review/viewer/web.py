@@ -142,13 +142,7 @@ class Relay:
             del self.answers[number]
 
     def next(self) -> tuple[int, bytes]:
-        """Wait up to 20 seconds for the next request.
-
-        Returns
-        -------
-        number : int
-            Of the request; 0 if there is none.
-        """
+        """Wait up to 20 seconds for number and content of the next request; 0 if there is none."""
         with suppress(queue.Empty):
             while True:
                 number, request = self.requests.get(timeout=_POLL_SECONDS)
@@ -157,13 +151,7 @@ class Relay:
         return 0, b""
 
     def answer(self, number: int, content: bytes | None) -> None:
-        """Deliver the answer to a request.
-
-        Parameters
-        ----------
-        content : bytes or None
-            None if the viewer refused.
-        """
+        """Deliver the answer to a request; None if the viewer refused."""
         waiting = self.answers.get(number)
         if waiting is None or waiting.done():
             return
