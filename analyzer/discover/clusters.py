@@ -48,25 +48,13 @@ _Header = TypeVar("_Header", bound=BaseModel)
 
 @dataclass(frozen=True)
 class ClusterKind(Generic[_Header]):
-    """A kind of cluster: groups of sounds, or voices.
+    """A kind of cluster: groups of sounds, or voices."""
 
-    Attributes
-    ----------
-    noun, example : str
-        For messages: `group`, and a name of one, as `3=doorbell`.
-    verb : str
-        The command that finds them.
-    header : type
-        Header of their file.
-    largest : int
-        Limit of the file in bytes.
-    """
-
-    noun: str
-    verb: str
-    example: str
-    header: type[_Header]
-    largest: int
+    noun: str  # for messages, such as `group`
+    verb: str  # the command that finds them
+    example: str  # a name of one for messages, as `3=doorbell`
+    header: type[_Header]  # of their file
+    largest: int  # limit of the file in bytes
 
     @property
     def plural(self) -> str:
@@ -147,21 +135,12 @@ def are_numbers(numbers: NDArray[Any], names: Sequence[str]) -> bool:
 
 @dataclass(frozen=True)
 class Clusters:
-    """Groups or voices of a home.
+    """Groups or voices of a home."""
 
-    Attributes
-    ----------
-    numbers : np.ndarray [shape=(g,)], int64
-        Never reused.
-    names : list of str
-        Assigned by a person; empty for unnamed clusters.
-    id : str
-        Unique id of these clusters; identifies the file that a mark refers to.
-    """
-
-    numbers: Int64
+    numbers: Int64  # [shape=(g,)]; never reused
+    # assigned by a person; empty if unnamed
     names: list[str] = field(default_factory=list, kw_only=True)
-    id: str = field(default="", kw_only=True)
+    id: str = field(default="", kw_only=True)  # unique; identifies the file that a mark refers to
 
     def named(self, names: Mapping[int, str]) -> Self:
         """Return a copy with other names, by number."""
@@ -186,53 +165,28 @@ class Clusters:
 
 
 class NamedSpans(NamedTuple):
-    """Spans of time with the names of clusters, in time order.
+    """Spans of time with the names of clusters, in time order."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    texts : np.ndarray [shape=(n,)] of str
-    """
-
-    starts: Int64
-    ends: Int64
-    texts: NDArray[np.object_]
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC
+    ends: Int64  # likewise
+    texts: NDArray[np.object_]  # [shape=(n,)] of str
 
 
 @dataclass(frozen=True)
 class Occurrences:
-    """Sounds or turns of speech of a home, in the order of logs, and by time within a log.
+    """Sounds or turns of speech of a home, in the order of logs, and by time within a log."""
 
-    Attributes
-    ----------
-    logs : list of Path
-        One for each microphone in it.
-    log, microphone : np.ndarray [shape=(n,)], int64
-        Indices into the lists.
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC.
-    without : int
-        Number of logs without what is to be found.
-    """
-
-    logs: list[Path]
+    logs: list[Path]  # one for each microphone in it
     microphones: list[str]
-    log: Int64
-    microphone: Int64
-    starts: Int64
-    ends: Int64
+    log: Int64  # [shape=(n,)]; index into `logs`
+    microphone: Int64  # [shape=(n,)]; index into `microphones`
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC
+    ends: Int64  # likewise
     losses: list[str]
-    without: int
+    without: int  # number of logs without what is to be found
 
     def spans(self, of: Int64, texts: Sequence[str]) -> dict[str, NamedSpans]:
-        """Return the spans of each microphone.
-
-        Parameters
-        ----------
-        of : np.ndarray [shape=(n,)], int64
-            Row of `texts` of each occurrence; `NO_CLUSTER` leaves it out.
-        """
+        """Return the spans of each microphone; `of` is the row of `texts`, or `NO_CLUSTER`."""
         order, names = np.argsort(self.starts, kind="stable"), np.array(texts, object)
         found = {}
         for place, microphone in enumerate(self.microphones):
@@ -248,12 +202,9 @@ class Occurrences:
 
 
 def places(parts: Sequence[tuple[Path, str, Timed]]) -> tuple[list[Path], list[str], Int64, Int64]:
-    """Return the places of occurrences, read in parts of one log and microphone each.
+    """Return `logs`, `microphones`, `log` and `microphone` of `Occurrences`.
 
-    Returns
-    -------
-    tuple
-        As `logs`, `microphones`, `log` and `microphone` of `Occurrences`.
+    Each part is of one log and microphone.
     """
     microphones = list(dict.fromkeys(name for _, name, _ in parts))
     counts = np.array([len(spans.starts) for _, _, spans in parts], np.int64)

@@ -42,28 +42,14 @@ _ROUNDING = 1e-9  # error of squared distances computed by matrix products
 
 @dataclass(frozen=True)
 class Space:
-    """A descriptor space with examples of groups.
+    """A descriptor space with examples of groups."""
 
-    Attributes
-    ----------
-    mean, scale : np.ndarray [shape=(width,)], float64
-        Of the descriptors the space was fitted on.
-    axes : np.ndarray [shape=(d, width)], float64
-        Principal axes of the descriptors.
-    examples : np.ndarray [shape=(k, d)], float64
-        Points of example sounds.
-    of : np.ndarray [shape=(k,)], int64
-        Group row of each example, ascending.
-    radii : np.ndarray [shape=(g,)], float64
-        A sound within this distance of an example belongs to the group.
-    """
-
-    mean: Float64
-    scale: Float64
-    axes: Float64
-    examples: Float64
-    of: Int64
-    radii: Float64
+    mean: Float64  # [shape=(width,)]; of the descriptors the space was fitted on
+    scale: Float64  # [shape=(width,)]; likewise
+    axes: Float64  # [shape=(d, width)]; principal axes of the descriptors
+    examples: Float64  # [shape=(k, d)]; points of example sounds
+    of: Int64  # [shape=(k,)]; group row of each example, ascending
+    radii: Float64  # [shape=(g,)]; a sound so near to an example belongs to the group
 
     def points(self, descriptors: Float32) -> Float64:
         """Return the points of descriptors, shape (n, d)."""
@@ -108,32 +94,18 @@ class Groups(Clusters):
     """Groups in two spaces: features alone, and features with embeddings.
 
     A group has examples in both spaces, or in the feature space alone.
-
-    Attributes
-    ----------
-    embedding : EmbeddingSpace or None
-        Space of the embeddings in the descriptors; None without embeddings.
     """
 
     features: tuple[str, ...]
     space: Space
-    embedding: EmbeddingSpace | None = None
+    embedding: EmbeddingSpace | None = None  # space of the embeddings in the descriptors, if any
     embedded: Space | None = None
 
     def points(self, descriptors: Float32, embeddings: Float32) -> tuple[Float64, Float64]:
-        """Return the points of sounds in both spaces.
+        """Return the points of sounds in both spaces: [shape=(n, d)] and [shape=(n, e)].
 
-        Parameters
-        ----------
-        descriptors : np.ndarray [shape=(n, width)], float32
-        embeddings : np.ndarray [shape=(n, k)], float32
-            In the space of the groups' embeddings; NaN for a sound without.
-
-        Returns
-        -------
-        points : np.ndarray [shape=(n, d)], float64
-        embedded : np.ndarray [shape=(n, e)], float64
-            NaN for a sound without an embedding; no columns if the groups have none.
+        Embeddings [shape=(n, k)] are in the space of the groups' embeddings. A sound without is
+        NaN, also in its point; e is 0 if the groups have none.
         """
         points = np.empty((len(descriptors), len(self.space.axes)))
         width = 0 if self.embedded is None else len(self.embedded.axes)
@@ -171,13 +143,7 @@ def is_embedded(embeddings: Float32 | Float64) -> Bool:
 
 
 def make_space(descriptors: Float32) -> Space:
-    """Fit a space without groups to descriptors.
-
-    Parameters
-    ----------
-    descriptors : np.ndarray [shape=(n, width)], float32
-        At least two, not all equal.
-    """
+    """Fit a space without groups to at least two descriptors [shape=(n, width)], not all equal."""
     from sklearn.decomposition import PCA  # noqa: PLC0415
 
     x = descriptors.astype(np.float64)
@@ -195,13 +161,9 @@ def new_groups(
     embedding: EmbeddingSpace | None = None,
     embeddings: Float32 | None = None,
 ) -> Groups:
-    """Fit the spaces of some sounds, without groups.
+    """Fit the spaces of at least two sounds, not all equal, without groups.
 
-    Parameters
-    ----------
-    descriptors : np.ndarray [shape=(n, width)], float32
-        At least two, not all equal.
-    embeddings : np.ndarray [shape=(n, k)], float32, optional
+    Descriptors have shape (n, width), embeddings (n, k).
     """
     embedded = None
     if embedding is not None and embeddings is not None:
@@ -225,22 +187,12 @@ def add_groups(
     least: int = LEAST,
     embedded: Float64 | None = None,
 ) -> Groups:
-    """Add new HDBSCAN clusters as groups, largest first.
+    """Add new HDBSCAN clusters of `least` sounds or more as groups, largest first.
 
-    All points are clustered, since the points outside existing groups would cluster differently
-    alone.
-
-    Parameters
-    ----------
-    points : np.ndarray [shape=(n, d)], float64
-        In time order.
-    of : np.ndarray [shape=(n,)], int64
-        Group row of each point, or `NO_CLUSTER`. A cluster is new if most of its points have no
-        group.
-    least : int, optional
-        Minimum of sounds per group.
-    embedded : np.ndarray [shape=(n, d)], float64, optional
-        Points in the embedding space; clusters are then searched there.
+    All points [shape=(n, d)], in time order, are clustered, since the points outside existing
+    groups would cluster differently alone; points in the embedding space are used instead if there
+    are any. A cluster is new if most of its points have no group: `of` is the group row, or
+    `NO_CLUSTER`.
     """
     from sklearn.cluster import HDBSCAN  # noqa: PLC0415
 
@@ -300,21 +252,12 @@ def descriptor_width(names: Sequence[str]) -> int:
 
 
 def describe(values: Float32, names: Sequence[str], first: Int64, last: Int64) -> Float32:
-    """Return descriptors of sounds: feature mean, deviation and rate of change, and the length.
+    """Return descriptors [shape=(n, descriptor_width(names))] of sounds.
 
-    Parameters
-    ----------
-    values : np.ndarray [shape=(frames, f)], float32
-    names : sequence of str
-        Feature names. The energy weights the frames and is not part of the result.
-    first, last : np.ndarray [shape=(n,)], int64
-        Feature rows of each sound; `last` is exclusive.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, descriptor_width(names))], float32
-        Means, standard deviations and mean absolute differences of successive frames, each
-        feature by feature, and the binary logarithm of the number of frames.
+    They are means, standard deviations and mean absolute differences of successive frames, each
+    feature by feature, and the binary logarithm of the number of frames. Values [shape=(frames, f)]
+    are named; the energy weights the frames and is not part of the result. `first` and `last`
+    (exclusive) are the rows of each sound.
     """
     if not len(first):
         return np.empty((0, descriptor_width(names)), np.float32)

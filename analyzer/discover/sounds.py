@@ -61,26 +61,14 @@ _FIELDS = {"header.stamp", "values", "label", "confidence"}
 
 
 class SoundSpans(NamedTuple):
-    """Sounds of one microphone in one log.
+    """Sounds of one microphone in one log."""
 
-    Attributes
-    ----------
-    starts, ends : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, ascending.
-    first, last : np.ndarray [shape=(n,)], int64
-        Feature rows; `last` is exclusive.
-    labels : np.ndarray [shape=(n,)], str
-        Most frequent label of the sounding frames.
-    confidence : np.ndarray [shape=(n,)], float64
-        Mean confidence of the labels.
-    """
-
-    starts: Int64
-    ends: Int64
-    first: Int64
-    last: Int64
-    labels: NDArray[np.str_]
-    confidence: Float64
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC, ascending
+    ends: Int64  # likewise
+    first: Int64  # [shape=(n,)]; feature row
+    last: Int64  # [shape=(n,)]; exclusive
+    labels: NDArray[np.str_]  # [shape=(n,)]; most frequent label of the sounding frames
+    confidence: Float64  # [shape=(n,)]; mean of the labels
 
     def rows(self, rows: Bool) -> "SoundSpans":
         """Select rows."""
@@ -99,15 +87,7 @@ class SoundSpans(NamedTuple):
 def _find_sounds(
     stamps: Int64, label_stamps: Int64, labels: NDArray[np.object_], confidence: Float32
 ) -> SoundSpans:
-    """Return the sounds of a log: runs of labels other than silence.
-
-    Parameters
-    ----------
-    stamps : np.ndarray [shape=(m,)], int64
-        Of the frames with features, ascending.
-    label_stamps : np.ndarray [shape=(n,)], int64
-        Of the labels, ascending.
-    """
+    """Return the sounds of a log, runs of labels other than silence; all stamps ascend."""
     rows = np.minimum(np.searchsorted(stamps, label_stamps), max(len(stamps) - 1, 0))
     there = labels != SILENCE
     there &= stamps[rows] == label_stamps if len(stamps) else False
@@ -138,49 +118,30 @@ def _most_frequent(labels: NDArray[Any], sound: Int64, count: int) -> NDArray[np
 
 
 class LogSounds(NamedTuple):
-    """Sounds of one microphone in one log, with their descriptors.
-
-    Attributes
-    ----------
-    descriptors : np.ndarray [shape=(n, width)], float32
-    embedding : EmbeddingSpace or None
-        Space of the embeddings; None if the log has no embeddings.
-    embeddings : np.ndarray [shape=(n, k)], float32
-        NaN for a sound without an embedding.
-    lost : int
-        Number of sounds dropped because of NaN or infinite features.
-    """
+    """Sounds of one microphone in one log, with their descriptors."""
 
     microphone: str
     features: tuple[str, ...]
     spans: SoundSpans
-    descriptors: Float32
-    embedding: EmbeddingSpace | None
-    embeddings: Float32
-    lost: int
+    descriptors: Float32  # [shape=(n, width)]
+    embedding: EmbeddingSpace | None  # None if the log has no embeddings
+    embeddings: Float32  # [shape=(n, k)]; NaN for a sound without an embedding
+    lost: int  # number of sounds dropped because of NaN or infinite features
 
 
 @dataclass(frozen=True)
 class HomeSounds(Occurrences):
     """Sounds of a home.
 
-    Attributes
-    ----------
-    labels : np.ndarray [shape=(n,)], str
-    descriptors : np.ndarray [shape=(n, width)], float32
-        On disk.
-    embeddings : np.ndarray [shape=(n, k)], float32
-        On disk; NaN without an embedding, or with an embedding of another network or projection.
-    unfit : list of EmbeddingSpace or None
-        Of each log whose sounds have NaN; None without embeddings.
+    Embeddings are NaN without one, or with one of another network or projection.
     """
 
     features: tuple[str, ...]
-    labels: NDArray[np.str_]
-    descriptors: Float32
+    labels: NDArray[np.str_]  # [shape=(n,)]
+    descriptors: Float32  # [shape=(n, width)]; on disk
     embedding: EmbeddingSpace | None
-    embeddings: Float32
-    unfit: list[EmbeddingSpace | None]
+    embeddings: Float32  # [shape=(n, k)]; on disk
+    unfit: list[EmbeddingSpace | None]  # of each log whose sounds have NaN; None without embeddings
 
 
 @contextmanager
@@ -194,15 +155,9 @@ def read_sounds(  # noqa: PLR0913, PLR0917
 ) -> Iterator[HomeSounds]:
     """Read the sounds of a home; their descriptors stay on disk meanwhile.
 
-    Raise `DataError` if no log has features and labels.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Receives the share of the logs read, 0 to 1.
-    groups : Groups, optional
-        Groups to match: only embeddings of their space are read. Without groups, the space of
-        the last log with embeddings is used.
+    Only embeddings of the space of the groups to match are read; without groups, the space of the
+    last log with embeddings is used. `progress` receives the share of the logs read, 0 to 1. Raise
+    `DataError` if no log has features and labels.
     """
     entries = home.between(start, end)
     with (
@@ -344,22 +299,11 @@ def discover(
 ) -> tuple[Groups, Int64, Float64]:
     """Group sounds: assign existing groups, then find new groups among the others.
 
-    Raise `DataError` if the groups use other features, or there are too few sounds to group.
-
-    Parameters
-    ----------
-    groups : Groups or None
-        Groups of an earlier run, which stay unchanged; None for the first run.
-    least : int, optional
-        Minimum of sounds in a new group. Groups are searched in at most 20,000 sounds, drawn
-        deterministically.
-
-    Returns
-    -------
-    of : np.ndarray [shape=(n,)], int64
-        Group row of each sound; `NO_CLUSTER` for a sound without a group.
-    points : np.ndarray [shape=(n, d)], float64
-        Points of the sounds in the feature space.
+    Groups of an earlier run stay unchanged; None for the first run. `least` is the minimum of
+    sounds in a new group. Groups are searched in at most 20,000 sounds, drawn deterministically.
+    Return also the group row of each sound, `NO_CLUSTER` without a group, and the points [shape=(n,
+    d)] of the sounds in the feature space. Raise `DataError` if the groups use other features, or
+    there are too few sounds to group.
     """
     count = len(sounds.descriptors)
     if groups is not None and groups.features != sounds.features:
@@ -443,12 +387,8 @@ def group_spans(
 ) -> tuple[dict[str, NamedSpans], list[str]]:
     """Find the sounds of existing groups by microphone; no group is added.
 
-    Raise `DataError` if no log has features and labels, or the groups use other features.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Receives the share of the logs read, 0 to 1.
+    `progress` receives the share of the logs read, 0 to 1. Raise `DataError` if no log has features
+    and labels, or the groups use other features.
     """
     with read_sounds(home, ALL, start, end, progress, groups) as sounds:
         _, of, _ = discover(sounds, groups)
@@ -482,13 +422,8 @@ def name_groups(  # noqa: PLR0913, PLR0917
     """Mark the sounds of groups; existing marks of a group get its new name.
 
     Logs are read one at a time, so a box with little memory can name groups found by another.
-
-    Raise `LogError` if a review layer cannot be read or written.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Receives the share of the logs read, 0 to 1.
+    `progress` receives the share of the logs read, 0 to 1. Raise `LogError` if a review layer
+    cannot be read or written.
     """
     marked, losses = dict.fromkeys(names, Marked()), list(home.losses)
     logs = home.between()

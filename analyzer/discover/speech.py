@@ -61,11 +61,8 @@ def is_doubtful(segments: Columns) -> Bool:
 def speech_spans(segments: Columns, labels: Columns | None = None) -> Spans:
     """Return the spans of speech.
 
-    Parameters
-    ----------
-    labels : Columns, optional
-        Frame labels. A sound with a mean speech probability of 0.3 counts as speech, whatever
-        its label: reading aloud may be labelled as coughing.
+    With frame labels, a sound with a mean speech probability of 0.3 counts as speech, whatever its
+    label: reading aloud may be labelled as coughing.
     """
     starts = segments["header.stamp"]
     ends = starts + segments["duration"]
@@ -106,21 +103,11 @@ _TINY = 1e-12
 
 
 class SpeechFrames(NamedTuple):
-    """Frames of speech of one microphone in one log.
+    """Frames of speech of one microphone in one log."""
 
-    Attributes
-    ----------
-    frames : np.ndarray [shape=(n,)], int64
-        Start of each frame, in frames since 1970; ascending.
-    loudness : np.ndarray [shape=(n,)], float64
-        In dB.
-    turn : np.ndarray [shape=(n,)], int64
-        Turn index of each frame, from 0; ascending.
-    """
-
-    frames: Int64
-    loudness: Float64
-    turn: Int64
+    frames: Int64  # [shape=(n,)]; starts in frames since 1970; ascending
+    loudness: Float64  # [shape=(n,)], in dB
+    turn: Int64  # [shape=(n,)]; turn index of each frame, from 0; ascending
 
     def rows(self, rows: Bool) -> "SpeechFrames":
         """Select rows."""
@@ -128,15 +115,9 @@ class SpeechFrames(NamedTuple):
 
 
 def speech_frames(stamps: Int64, energy: Float32, starts: Int64) -> SpeechFrames:
-    """Return frames of speech in comparable form.
+    """Return frames of speech in comparable form; stamps (nanoseconds of UTC) ascend.
 
-    Parameters
-    ----------
-    stamps : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, ascending.
-    energy : np.ndarray [shape=(n,)], float32
-    starts : np.ndarray [shape=(turns,)], int64
-        Stamps of the first frame of each turn.
+    `starts` are stamps of the first frame of each turn.
     """
     loudness = 10.0 * np.log10(np.maximum(energy.astype(np.float64), _LEAST_ENERGY))
     frames = (stamps + FRAME_NANOSECONDS // 2) // FRAME_NANOSECONDS
@@ -144,16 +125,11 @@ def speech_frames(stamps: Int64, energy: Float32, starts: Int64) -> SpeechFrames
 
 
 def louder_elsewhere(speech: Sequence[SpeechFrames]) -> list[Bool]:
-    """Return which turns another microphone records louder.
+    """Return, for each microphone, which turns another microphone records louder.
 
-    A turn is dropped if the other microphone has speech in most of its frames, and the loudness
-    of both correlates by more than 0.7; turns below half a second need only the first condition.
-    Of equally loud turns the first microphone's is kept.
-
-    Returns
-    -------
-    list of np.ndarray [shape=(turns,)], bool
-        One per microphone.
+    A turn is dropped if the other microphone has speech in most of its frames, and the loudness of
+    both correlates by more than 0.7; turns below half a second need only the first condition. Of
+    equally loud turns the first microphone's is kept.
     """
     kept = list(speech)
     louder: list[Bool] = []
@@ -224,18 +200,11 @@ _NO_TURNS = _Turns(*(np.empty(0, np.int64) for _ in _Turns._fields))
 class HomeSpeech(Occurrences):
     """Turns of a home: speech without a pause, of the microphone that records it loudest.
 
-    Attributes
-    ----------
-    without : int
-        Number of logs without segments, or with speech but without the features for voices.
-    voice : np.ndarray [shape=(n,)], int64
-        Row of the conversation voice.
-    voices : VoiceEvidence
-        Of the voices of conversations.
+    `without` counts logs without segments, or with speech but without the features for voices.
     """
 
-    voice: Int64
-    voices: VoiceEvidence
+    voice: Int64  # [shape=(n,)]; row of the conversation voice
+    voices: VoiceEvidence  # of the voices of conversations
 
     @property
     def seconds(self) -> float:
@@ -255,10 +224,7 @@ def read_speech(
 ) -> HomeSpeech:
     """Read the speech of a home from the recorder's segments, log by log.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Receives the share of the logs read, 0 to 1.
+    `progress` receives the share of the logs read, 0 to 1.
     """
     reader = _Reader(start, end)
     entries = home.between(start or 0, end or NEVER)
@@ -373,19 +339,9 @@ def _is_segments(name: str) -> bool:
 
 
 def voices_of(values: Float32, names: Sequence[str]) -> tuple[Int64, VoiceEvidence]:
-    """Separate the voices in the features of a conversation.
+    """Separate the voices in the speech features [shape=(frames, f)] of a conversation.
 
-    Parameters
-    ----------
-    values : np.ndarray [shape=(frames, f)], float32
-        Features of speech.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], int64
-        Voice of each window, from 0.
-    VoiceEvidence
-        Of each voice.
+    Return the voice of each window, from 0, and the evidence of each voice.
     """
     points = voice_space().points(describe_speech(values, names))
     of = separate_voices(points, LEAST_WINDOWS)
@@ -397,11 +353,7 @@ def speech_voices(
 ) -> tuple[Int64, Int64, Int64, VoiceEvidence]:
     """Return the turns of a conversation: starts, ends and voices; and the voices.
 
-    Parameters
-    ----------
-    stamps : np.ndarray [shape=(frames,)], int64
-        Of frames of speech, in nanoseconds, ascending.
-    values : np.ndarray [shape=(frames, f)], float32
+    Stamps of frames of speech (ns) ascend; values have shape (frames, f).
     """
     of, voices = voices_of(values, names)
     return *_turns(stamps, _of_frames(of, len(stamps))), voices
@@ -441,17 +393,9 @@ def _turns(stamps: Int64, voice: Int64) -> tuple[Int64, Int64, Int64]:
 def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoices, Int64]:
     """Find the voices of a home in its conversations.
 
-    Raise `DataError` if there are no earlier voices and too little speech to separate voices.
-
-    Parameters
-    ----------
-    known : HomeVoices or None
-        Voices of an earlier run, which stay unchanged; None for the first run.
-
-    Returns
-    -------
-    of : np.ndarray [shape=(n,)], int64
-        Home voice row of each conversation voice; `NO_CLUSTER` if none matches.
+    Voices of an earlier run stay unchanged; None for the first run. Return also the home voice row
+    of each conversation voice; `NO_CLUSTER` if none matches. Raise `DataError` if there are no
+    earlier voices and too little speech to separate voices.
     """
     if known is None and speech.seconds < LEAST_SECONDS:
         raise DataError(
@@ -471,10 +415,7 @@ def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoice
 def spoken_spans(speech: HomeSpeech, voices: HomeVoices, of: Int64) -> dict[str, NamedSpans]:
     """Return the voice turns of each microphone; turns that match no voice are `no voice`.
 
-    Parameters
-    ----------
-    of : np.ndarray [shape=(n,)], int64
-        Result of `find_voices`.
+    `of` is from `find_voices`.
     """
     texts = [*voices.texts(VOICES), "no voice"]
     own = of[speech.voice]
@@ -528,21 +469,11 @@ _ENOUGH = 60 * NANOSECONDS
 
 
 def enrol_voice(home: Path, label: str, speech: HomeSpeech, rows: Int64) -> list[Enrolled]:
-    """Enrol one minute of a voice's longest turns in a training set of voices.
+    """Enrol one minute of a voice's longest turns, given by row, in a training set of voices.
 
-    The turns are spread over as many separate times as possible. Existing recordings count.
-
-    Parameters
-    ----------
-    rows : np.ndarray [shape=(n,)], int64
-        Turns of the voice.
-
-    Raises
-    ------
-    DataError
-        If no turn of the voice lasts two seconds.
-    LogError
-        If a log is damaged, or nothing can be written.
+    The turns are spread over as many separate times as possible. Existing recordings count. Raise
+    `DataError` if no turn of the voice lasts two seconds; `LogError` if a log is damaged, or
+    nothing can be written.
     """
     lengths = (speech.ends - speech.starts)[rows]
     enrolled: dict[Path, Enrolled] = {}

@@ -62,53 +62,31 @@ class Example(StrictModel):
 
 
 class GroupSummary(StrictModel):
-    """Summary of a group of similar sounds.
-
-    Attributes
-    ----------
-    name : str
-        Class assigned by a person; empty if unnamed.
-    days : int
-        Number of local days with such sounds.
-    hours : list of int
-        Number of sounds that began in each local hour of the day.
-    alike : float
-        Similarity: 0, as different as any sounds of the home; 1, identical.
-    labels : dict of str to float
-        Share of each of the most frequent labels, most frequent first.
-    """
+    """Summary of a group of similar sounds."""
 
     number: Annotated[int, Field(ge=1, le=MOST_NUMBER)]
-    name: ClusterName
+    name: ClusterName  # class assigned by a person; empty if unnamed
     times: Annotated[int, Field(ge=1, le=MOST_NUMBER)]
-    days: Annotated[int, Field(ge=1, le=MOST_NUMBER)]
+    days: Annotated[int, Field(ge=1, le=MOST_NUMBER)]  # local days with such sounds
+    # sounds that began in each local hour of the day
     hours: Annotated[list[_Count], Field(min_length=HOURS, max_length=HOURS)]
     seconds: Annotated[float, Field(ge=0.0, le=1e6)]
-    alike: _Share
+    alike: _Share  # similarity: 0, as different as any sounds of the home; 1, identical
+    # shares of the most frequent labels, most frequent first
     labels: Annotated[dict[_Text, _Share], Field(max_length=MOST_LABELS)]
     microphones: Annotated[list[_Text], Field(max_length=MOST_MICROPHONES)]
     examples: Annotated[list[Example], Field(min_length=1, max_length=3)]
 
 
 class VoiceSummary(StrictModel):
-    """Summary of a voice.
-
-    Attributes
-    ----------
-    name : str
-        Assigned by a person; empty if unnamed.
-    days : int
-        Number of local days with this voice.
-    hours : list of int
-        Number of turns that began in each local hour of the day.
-    """
+    """Summary of a voice."""
 
     number: int
-    name: str
+    name: str  # assigned by a person; empty if unnamed
     minutes: float
     turns: int
-    days: int
-    hours: list[int]
+    days: int  # local days with this voice
+    hours: list[int]  # turns that began in each local hour of the day
     examples: list[Example]
 
 
@@ -201,13 +179,7 @@ def summarise(
 def summarise_voices(
     speech: "HomeSpeech", voices: "HomeVoices", of: Int64, zone: tzinfo
 ) -> list[VoiceSummary]:
-    """Summarise the voices that speak, most speech first.
-
-    Parameters
-    ----------
-    of : np.ndarray [shape=(n,)], int64
-        Result of `find_voices`.
-    """
+    """Summarise the voices that speak, most speech first; `of` is from `find_voices`."""
     found = []
     for row, number in enumerate(voices.numbers.tolist()):
         rows = np.flatnonzero(of[speech.voice] == row)
@@ -255,15 +227,7 @@ _USUAL = 0.8  # share of the sounds within the busiest hours
 def busiest_hours(hours: list[int]) -> str:
     """Return the shortest span of the day with four fifths of the sounds, such as `07 to 09`.
 
-    Parameters
-    ----------
-    hours : list of int
-        Number of sounds that began in each hour of the day.
-
-    Returns
-    -------
-    str
-        Empty if the span exceeds half a day.
+    `hours` count the sounds that began in each hour. Empty if the span exceeds half a day.
     """
     twice = np.cumsum([0, *hours, *hours])
     for length in range(1, HOURS // 2 + 1):

@@ -32,18 +32,10 @@ _ROUNDS = 2
 
 
 class VoiceEvidence(NamedTuple):
-    """Sums of points of speech.
+    """Sums of points of speech."""
 
-    Attributes
-    ----------
-    counts : np.ndarray [shape=(n,)], float64
-        Number of points per row.
-    sums : np.ndarray [shape=(n, d)], float64
-        Sum of the points per row.
-    """
-
-    counts: Float64
-    sums: Float64
+    counts: Float64  # [shape=(n,)]; number of points per row
+    sums: Float64  # [shape=(n, d)]; sum of the points per row
 
     def rows(self, rows: Int64 | Bool) -> "VoiceEvidence":
         """Select rows."""
@@ -51,14 +43,7 @@ class VoiceEvidence(NamedTuple):
 
 
 def summed(points: Float64, of: Int64, count: int) -> VoiceEvidence:
-    """Sum points by row.
-
-    Parameters
-    ----------
-    points : np.ndarray [shape=(n, d)], float64
-    of : np.ndarray [shape=(n,)], int64
-        Row of each point, 0 to `count`; points with `count` are dropped.
-    """
+    """Sum points [shape=(n, d)] by row, 0 to `count`; points with `count` are dropped."""
     own = (of == np.arange(count)[:, np.newaxis]).astype(np.float64)
     return VoiceEvidence(own.sum(axis=1), own @ points)
 
@@ -69,10 +54,6 @@ def same_voice(one: VoiceEvidence, others: VoiceEvidence) -> Float64:
     Evidence is a mean of points; points of one voice have variance 1 around the voice's mean, and
     voice means have the variance `spread` of the voice space (the two-covariance model of Brümmer
     and de Villiers, Odyssey 2010).
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
     """
     return _ratio(_weighed(one), _weighed(others))
 
@@ -111,13 +92,7 @@ def _likelihood(counts: Float64, sums: Float64) -> Float64:
 
 
 def merged_voices(evidence: VoiceEvidence) -> Int64:
-    """Merge evidence that is likelier of one voice than of two, likeliest first.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], int64
-        Voice of each row, from 0.
-    """
+    """Merge evidence that is likelier of one voice than of two, likeliest first; number from 0."""
     counts, sums = evidence.counts.copy(), evidence.sums.copy()
     size = len(counts)
     of = np.arange(size)
@@ -149,18 +124,7 @@ def merged_voices(evidence: VoiceEvidence) -> Int64:
 
 
 def separate_voices(points: Float64, least: int) -> Int64:
-    """Separate the voices of a conversation.
-
-    Parameters
-    ----------
-    points : np.ndarray [shape=(n, d)], float64
-        Points of its windows, in time order.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], int64
-        Voice of each window, from 0.
-    """
+    """Return the voice, from 0, of each window [shape=(n, d)] of a conversation, in time order."""
     of = merged_voices(VoiceEvidence(np.ones(len(points)), points))
     for _ in range(_ROUNDS):
         counts = np.bincount(of)
@@ -205,21 +169,11 @@ _TINY = 1e-9
 
 
 class VoiceSpace(NamedTuple):
-    """A space in which windows of one voice scatter equally in all directions.
+    """A space in which windows of one voice scatter equally in all directions."""
 
-    Attributes
-    ----------
-    mean : np.ndarray [shape=(width,)], float64
-        Mean of speech descriptors.
-    axes : np.ndarray [shape=(d, width)], float64
-        Scaled so that the variance of one voice is 1 along each axis.
-    spread : np.ndarray [shape=(d,)], float64
-        Variance of voice means along each axis, descending.
-    """
-
-    mean: Float64
-    axes: Float64
-    spread: Float64
+    mean: Float64  # [shape=(width,)]; of speech descriptors
+    axes: Float64  # [shape=(d, width)]; the variance of one voice is 1 along each
+    spread: Float64  # [shape=(d,)]; variance of voice means along each axis, descending
 
     def points(self, described: Float64) -> Float64:
         """Return the points of window descriptors, shape (n, d)."""
@@ -245,17 +199,10 @@ def window_starts(frames: int) -> Int64:
 
 
 def describe_speech(values: Float32, names: Sequence[str]) -> Float64:
-    """Return window descriptors: means and deviations of speech features in loud frames.
+    """Return window descriptors [shape=(windows, 38)] of features of speech [shape=(frames, f)].
 
-    Parameters
-    ----------
-    values : np.ndarray [shape=(frames, f)], float32
-        Features of speech, at least one frame.
-
-    Returns
-    -------
-    np.ndarray [shape=(windows, 38)], float64
-        Means, and logarithms of standard deviations, of each window of `window_starts`.
+    They are means, and logarithms of standard deviations, of the loud frames in each window of
+    `window_starts`. There is at least one frame.
     """
     columns = [list(names).index(name) for name in _NAMES]
     length = min(WINDOW_FRAMES, len(values))
@@ -289,13 +236,7 @@ class HomeVoices(Clusters):
 
 
 def recognised(evidence: VoiceEvidence, known: VoiceEvidence) -> Int64:
-    """Return the likeliest existing voice of each row, if one voice is likelier than two.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], int64
-        `NO_CLUSTER` if none matches.
-    """
+    """Return the existing voice of each row if one is likelier than two, else `NO_CLUSTER`."""
     best = np.zeros(len(evidence.counts))
     of = np.full(len(best), NO_CLUSTER)
     for row in range(len(known.counts)):
