@@ -44,13 +44,7 @@ class Events:
         return self.taken(np.flatnonzero(self.labels == label))
 
     def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Events":
-        """Return a selection of the spans.
-
-        Parameters
-        ----------
-        rows : np.ndarray, bool [shape=(n,)] or int [shape=(m,)]
-            Boolean mask, or row numbers in their new order.
-        """
+        """Return a selection of the spans, by mask, or by row numbers in their new order."""
         return Events(self.starts[rows], self.ends[rows], self.labels[rows])
 
 
@@ -96,18 +90,11 @@ class Detections:
 def detect(
     reference: Events, predicted: Events, classes: Sequence[str], duration: int
 ) -> Detections:
-    """Score events by the second and by the event, and count false alarms.
+    """Score events, as from `laid_out`, by the second and by the event, and count false alarms.
 
-    The scores are those of sed_eval, on arrays: a day of labels has too many spans for a loop.
-
-    Raise `DataError` if too many events start together for a labelling.
-
-    Parameters
-    ----------
-    reference, predicted : Events
-        From 0 on, as returned by `laid_out`.
-    duration : int
-        Evaluated time in nanoseconds.
+    `duration` is the evaluated time in nanoseconds. The scores are those of sed_eval, on arrays: a
+    day of labels has too many spans for a loop. Raise `DataError` if too many events start together
+    for a labelling.
     """
     return Detections(
         segment_based(reference, predicted, classes),
@@ -117,16 +104,11 @@ def detect(
 
 
 def laid_out(events: Events, spans: Spans) -> Events:
-    """Clip events to spans of time, and place the spans one after the other as recordings.
+    """Clip events to spans, and place the spans one after the other as recordings, from 0 ns on.
 
     Every span starts on a full second, at least one second after the end of the previous span, so
-    that events of different spans are never compared.
-
-    Returns
-    -------
-    Events
-        In nanoseconds from 0 on, in the order of `events`; an event may be split into several
-        pieces.
+    that events of different spans are never compared. The order is that of `events`; an event may
+    be split into several pieces.
     """
     seconds = -((spans.starts - spans.ends) // NANOSECONDS) + 1
     places = (np.cumsum(seconds) - seconds) * NANOSECONDS
@@ -138,13 +120,8 @@ def laid_out(events: Events, spans: Spans) -> Events:
 def segment_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
     """Score by the second: a class is active in each second that one of its events touches.
 
-    These are the segment-based metrics of Mesaros et al., "Metrics for Polyphonic Sound Event
-    Detection", 2016, with segments of one second.
-
-    Parameters
-    ----------
-    reference, predicted : Events
-        From 0 on, as returned by `laid_out`.
+    Events are as from `laid_out`. These are the segment-based metrics of Mesaros et al., "Metrics
+    for Polyphonic Sound Event Detection", 2016, with segments of one second.
     """
     counts = []
     for label in range(len(classes)):
@@ -161,16 +138,10 @@ def _seconds(events: Events) -> Spans:
 def event_based(reference: Events, predicted: Events, classes: Sequence[str]) -> DetectionScores:
     """Score by the event; each event is matched with at most one other.
 
-    These are the event-based metrics of Mesaros et al. (2016). Two events match if their onsets are
-    at most 0.2 s apart, and their offsets at most 0.2 s or half the length of the reference's,
-    whichever is more. As many as possible are matched.
-
-    Raise `DataError` if too many events start together for a labelling.
-
-    Parameters
-    ----------
-    reference, predicted : Events
-        From 0 on, as returned by `laid_out`.
+    Events are as from `laid_out`. These are the event-based metrics of Mesaros et al. (2016). Two
+    events match if their onsets are at most 0.2 s apart, and their offsets at most 0.2 s or half
+    the length of the reference's, whichever is more. As many as possible are matched. Raise
+    `DataError` if too many events start together for a labelling.
     """
     counts = []
     for label in range(len(classes)):
@@ -202,19 +173,10 @@ def _matches(reference: Events, predicted: Events) -> int:
 def false_alarms_per_day(
     reference: Events, predicted: Events, classes: Sequence[str], duration: int
 ) -> dict[str, float]:
-    """Count predicted events that overlap no event of their class in the reference.
+    """Count predicted events that overlap no event of their class in the reference, by class.
 
-    Parameters
-    ----------
-    reference, predicted : Events
-        From 0 on, as returned by `laid_out`.
-    duration : int
-        Evaluated time in nanoseconds, more than 0.
-
-    Returns
-    -------
-    dict of str to float
-        By class, per 24 hours of evaluated time.
+    Counts are per 24 hours of `duration`, the evaluated time in nanoseconds, more than 0. Events
+    are as from `laid_out`.
     """
     alarms = (_false_alarms(reference.of(i), predicted.of(i)) for i in range(len(classes)))
     return {name: n * _DAY / duration for name, n in zip(classes, alarms, strict=True)}
@@ -265,13 +227,7 @@ class LabelRuns(NamedTuple):
     b: Int64
 
     def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "LabelRuns":
-        """Return a selection of the runs.
-
-        Parameters
-        ----------
-        which : np.ndarray, bool [shape=(n,)] or int [shape=(m,)]
-            Boolean mask, or row numbers in their new order.
-        """
+        """Return a selection of the runs, by mask, or by row numbers in their new order."""
         return LabelRuns(*(column[which] for column in self))
 
 
@@ -314,16 +270,10 @@ class LabellingDifference:
 
 
 def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> LabellingDifference:
-    """Compare two labellings where both have a label.
+    """Compare two labellings where both have a label, with Cohen's kappa.
 
-    Synonyms in b (see `hearthlog.models.classes`) take the names of a.
-
-    Raise `DataError` if they have no time in common.
-
-    Returns
-    -------
-    LabellingDifference
-        With Cohen's kappa; classes of a first, then classes only in b.
+    Synonyms in b (see `hearthlog.models.classes`) take the names of a. Classes of a come first,
+    then classes only in b. Raise `DataError` if they have no time in common.
     """
     b = b.called_as(a.classes)
     classes = list(dict.fromkeys([*a.classes, *b.classes]))
@@ -355,13 +305,8 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> LabellingDiffere
 def runs_of(pieces: Overlay, a: Events, b: Events) -> LabelRuns:
     """Merge successive pieces of two labellings with the same pair of labels.
 
-    Parameters
-    ----------
-    pieces : Overlay
-        Of `a` and `b`, where both have a span; at least one piece. Pieces of a run may be a frame
-        apart.
-    a, b : Events
-        The spans of its rows, with labels as indices of the same classes.
+    The pieces, at least one, are of `a` and `b`, where both have a span; those of a run may be a
+    frame apart. Labels are indices of the same classes.
     """
     label_a, label_b = a.labels[pieces.rows[0]], b.labels[pieces.rows[1]]
     new = np.ones(len(pieces.starts), bool)

@@ -203,16 +203,10 @@ class TopicLabelling:
 def read_labelling(path: Path, topic: str | None = None) -> TopicLabelling:
     """Read the segments of a log, or of a folder of logs, and of their layers.
 
-    `Labellings.read` skips a damaged log; here it is an error, because scores would not show the
-    gap.
-
-    Raise `LogError` if there is no log, if one is damaged, if there are no such segments, if they
+    The topic, such as `/mic/segment`, is by default that of the only microphone. `Labellings.read`
+    skips a damaged log; here it is an error, because scores would not show the gap. Raise
+    `LogError` if there is no log, if one is damaged, if there are no such segments, if they
     overlap, or if `topic` is None and there are several microphones.
-
-    Parameters
-    ----------
-    topic : str, optional
-        Topic of the segments, such as `/mic/segment`; by default that of the only microphone.
     """
     selection = select(with_layers(path))
     topic = _segment_topic(selection, topic)
@@ -243,18 +237,10 @@ def _segment_topic(selection: LogSelection, requested: str | None) -> str:
 def read_reference(source: str, path: Path, microphone: str, scenario: str = "") -> Labelling:
     """Read the reference for a log.
 
-    Parameters
-    ----------
-    scenario : str, optional
-        Scenario of the marks in the review layers; empty for the sounds of the home.
-
-    Raises
-    ------
-    DataError
-        If there is no such file, it is no label file, it has no label of the microphone or a time
-        that no log has, the logs have no features, or nobody has reviewed them.
-    LogError
-        If there is no log, or a log or a layer is damaged.
+    The scenario of the marks in the review layers is empty for the sounds of the home. Raise
+    `DataError` if there is no such file, it is no label file, it has no label of the microphone or
+    a time that no log has, the logs have no features, or nobody has reviewed them; `LogError` if
+    there is no log, or a log or a layer is damaged.
     """
     if source == REVIEW:
         marks = [mark for log in find_logs(path) for mark in read_marks(log, scenario)]

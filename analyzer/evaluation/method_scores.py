@@ -43,17 +43,11 @@ def evaluate_method(
 ) -> CrossValidation:
     """Cross-validate a training method.
 
-    Raise `DataError` if all segments are equal, if the method needs augmented copies and its
-    feature set has none, and as for `divide`.
-
-    Parameters
-    ----------
-    kind : str
-        Unit that is never on both sides of a fold: a `segment` (the paper's folds, optimistic since
-        segments of one recording are alike), a `source`, or a `collection`, which is like a new
-        home.
-    progress : callable
-        Receives the completed share of the folds, 0 to 1.
+    The `kind` is the unit that is never on both sides of a fold: a `segment` (the paper's folds,
+    optimistic since segments of one recording are alike), a `source`, or a `collection`, which is
+    like a new home. `progress` receives the completed share of the folds, 0 to 1. Raise `DataError`
+    if all segments are equal, if the method needs augmented copies and its feature set has none,
+    and as for `divide`.
     """
     check_varied(data)
     folds = divide(data, kind)
@@ -81,14 +75,10 @@ def _mixed(data: Dataset, method: Method, folds: Sequence[Fold], decisions: Floa
 def divide(data: Dataset, kind: Kind) -> list[Fold]:
     """Divide segments into folds of training and test segments.
 
-    Raise `DataError` if a class has fewer than five segments (`segment`) or comes from fewer than
-    two groups (`source`), if there is one collection (`collection`), or if a fold leaves too few
-    classes to learn from.
-
-    Parameters
-    ----------
-    kind : str
-        Unit that is never on both sides of a fold: a `segment`, a `source` or a `collection`.
+    The `kind` is the unit that is never on both sides of a fold: a `segment`, a `source` or a
+    `collection`. Raise `DataError` if a class has fewer than five segments (`segment`) or comes
+    from fewer than two groups (`source`), if there is one collection (`collection`), or if a fold
+    leaves too few classes to learn from.
     """
     if kind == "source":
         return group_folds(data)

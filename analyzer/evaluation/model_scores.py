@@ -78,13 +78,8 @@ def evaluate_model(
 ) -> ModelEvaluation:
     """Run a model on clips, and compare its output with their labels.
 
-    Raise `DataError` if the classes of the model are not those of the scenario, or no clip has a
-    segment.
-
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share of the clips, 0 to 1.
+    `progress` receives the completed share of the clips, 0 to 1. Raise `DataError` if the classes
+    of the model are not those of the scenario, or no clip has a segment.
     """
     require_trained(model)
     scenario = fitted(scenario, model)
@@ -119,15 +114,8 @@ def evaluate_model(
 def fitted(scenario: Scenario, model: Model) -> Scenario:
     """Return a scenario with classes in the order of a model's probabilities.
 
-    Parameters
-    ----------
-    model : Model
-        Class `unknown` of the model is added if the scenario lacks it.
-
-    Raises
-    ------
-    DataError
-        As for `check_classes`.
+    Class `unknown` of the model is added if the scenario lacks it. Raise `DataError` as for
+    `check_classes`.
     """
     check_classes(model, scenario)
     labels = {**scenario_of(model).classes, **scenario.classes}
@@ -152,12 +140,9 @@ def check_classes(model: Model, scenario: Scenario) -> None:
 
 
 def heads_of_segments(classifier: Classifier, data: Dataset) -> Float64 | None:
-    """Return the outputs of heads for segments, as input of `Classifier.classify`.
+    """Return the outputs of heads [shape=(n, C)], as input of `Classifier.classify`, if any.
 
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64, or None
-        NaN for segments without an embedding; None without heads.
+    They are NaN for segments without an embedding.
     """
     heads = classifier.embedding_heads
     if heads is None or not data.is_embedded.any():
@@ -173,19 +158,10 @@ def segment_probabilities(
     evidence: Float64 | None = None,
     by_heads: Float64 | None = None,
 ) -> Float64:
-    """Compute the probability of each class in each segment over all its windows.
+    """Return class probabilities [shape=(n, C)] of segments over all windows, with sum 1.
 
-    Parameters
-    ----------
-    inputs : np.ndarray [shape=(n, places, width)], float32
-        As from `of_segments`.
-    evidence, by_heads : np.ndarray [shape=(n, C)], float64, optional
-        As for `Classifier.classify`: from directions, and from heads.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
-        Geometric means over the windows, normalised to sum 1.
+    They are geometric means over the windows. Inputs [shape=(n, places, width)] are as from
+    `of_segments`; evidence of directions, and outputs of heads, as for `Classifier.classify`.
     """
     if evidence is not None:
         evidence = evidence.repeat(inputs.shape[1], axis=0)
@@ -201,12 +177,7 @@ class _Listener:
 
     Each recording is played in a quiet room, so that a label that starts late or outlasts the sound
     is an error. Silence is scored in the recording only; for a model without silence there is no
-    room.
-
-    Attributes
-    ----------
-    duration : int
-        Time of the recordings and of the room, in nanoseconds.
+    room. `duration` is the time of the recordings and of the room, in nanoseconds.
     """
 
     def __init__(self, classifier: Classifier, source: EmbeddingSource | None) -> None:
@@ -336,17 +307,9 @@ def compare_models(
 ) -> Comparison:
     """Run two models on the same segments of one second.
 
-    Sources in the training set of either model are excluded.
-
-    Raise `DataError` if the classes of a model are not those of the scenario, the models are for
-    different feature sets, or there is no segment.
-
-    Parameters
-    ----------
-    recordings : iterable of Recording
-        With features of the set of both models.
-    scenario : Scenario
-        With the classes of both.
+    Recordings have features of the set of both models, the scenario the classes of both. Sources in
+    the training set of either model are excluded. Raise `DataError` if the classes of a model are
+    not those of the scenario, the models are for different feature sets, or there is no segment.
     """
     for model in (a, b):
         require_trained(model)

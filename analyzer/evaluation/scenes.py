@@ -70,18 +70,10 @@ class Span(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """Sound with its true labels.
+    """Sound with its true labels."""
 
-    Attributes
-    ----------
-    samples : np.ndarray [shape=(n,)], float32
-        At 16 kHz, -1 to 1.
-    truth : list of Span
-        Successive spans without gaps; silence lies between the sounds.
-    """
-
-    samples: Float32
-    truth: list[Span]
+    samples: Float32  # [shape=(n,)]; at 16 kHz, -1 to 1
+    truth: list[Span]  # successive spans without gaps; silence lies between the sounds
 
     @property
     def sounds(self) -> list[Span]:
@@ -90,21 +82,9 @@ class Scene(NamedTuple):
 
 
 def background(seconds: float, level: float, colour: Colour, seed: int) -> Float32:
-    """Generate the noise of a scene.
+    """Generate the noise of a scene at 16 kHz: seconds, more than 0, of a level in dBFS.
 
-    Parameters
-    ----------
-    seconds : float
-        More than 0.
-    level : float
-        In dBFS.
-    seed : int
-        Not negative.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float32
-        Samples at 16 kHz.
+    The seed is not negative.
     """
     rng, noise = np.random.default_rng(seed), np.empty(int(seconds * SAMPLE_RATE), np.float32)
     for part in _parts(noise):
@@ -138,18 +118,10 @@ def compose(
 ) -> Scene:
     """Place clips over noise, 0.5, 2 or 6 s apart, at most 3 to 10 s of each.
 
-    Raise `DataError` if the scene is too short for a sound.
-
-    Parameters
-    ----------
-    clips : mapping of str to sequence
-        Clips by label; labels are equally likely. At least one label, each with a clip.
-    read : callable
-        Returns the samples of a clip at 16 kHz, at least one; one clip is in memory at a time.
-    noise : np.ndarray [shape=(n,)], float32
-        As from `background`; overwritten.
-    gain : float
-        Gain of the clips in dB.
+    There is at least one label, each with a clip; labels are equally likely. `read` returns the
+    samples of a clip at 16 kHz, at least one; one clip is in memory at a time. The noise, as from
+    `background`, is overwritten; `gain` of the clips is in dB. Raise `DataError` if the scene is
+    too short for a sound.
     """
     rng = random.Random(seed)  # noqa: S311  no secret
 
@@ -173,14 +145,8 @@ def compose_single(  # noqa: PLR0913, PLR0917
 ) -> Scene:
     """Place up to 120 single short sounds of one label over noise, 2 to 8 s apart.
 
-    Each is the loudest 0.3 s of a clip.
-
-    Raise `DataError` if the scene is too short for a sound.
-
-    Parameters
-    ----------
-    clips : sequence
-        At least one.
+    Each is the loudest 0.3 s of one of the clips, at least one. The noise is overwritten; `gain` is
+    in dB. Raise `DataError` if the scene is too short for a sound.
     """
     rng = random.Random(seed)  # noqa: S311  no secret
 
@@ -194,13 +160,7 @@ def compose_single(  # noqa: PLR0913, PLR0917
 
 
 def loudest(sound: Float32, seconds: float) -> Float32:
-    """Return the loudest part of a sound with fades at both ends.
-
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n,)], float32
-        Samples at 16 kHz.
-    """
+    """Return the loudest part of a sound at 16 kHz with fades at both ends."""
     count = int(seconds * SAMPLE_RATE)
     if len(sound) <= count:
         return sound
@@ -244,21 +204,13 @@ Clips = dict[str, list[LabelledClip]]
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Options of scene composition.
-
-    Attributes
-    ----------
-    floor : float
-        Level of the noise in dBFS.
-    gain : float
-        Gain of the clips in dB.
-    """
+    """Options of scene composition."""
 
     scenes: int = 3
     seconds: float = 1800.0
-    floor: float = -70.0
+    floor: float = -70.0  # of the noise, in dBFS
     colour: Colour = "white"
-    gain: float = 0.0
+    gain: float = 0.0  # of the clips, in dB
     seed: int = 10
 
 
@@ -274,38 +226,22 @@ class SceneScores:
 
 @dataclass(frozen=True)
 class SingleCoughs:
-    """Detection of single coughs of 0.3 s.
-
-    Attributes
-    ----------
-    found : float
-        Share of coughs that overlap a label of coughing.
-    """
+    """Detection of single coughs of 0.3 s."""
 
     coughs: int
-    found: float
+    found: float  # share of coughs that overlap a label of coughing
     median_seconds: float | None
     others: float
 
 
 @dataclass(frozen=True)
 class ScenesEvaluation:
-    """Scores of a model on scenes.
+    """Scores of a model on scenes."""
 
-    Attributes
-    ----------
-    scores : Scores
-        Of frames of 50 ms in all scenes; the groups are blocks of five minutes.
-    coughs : SingleCoughs or None
-        None without a class or a clip of coughing.
-    truth, found : Labelling
-        Of the first scene, for plots; in nanoseconds from its start.
-    """
-
-    scores: Scores
+    scores: Scores  # of frames of 50 ms; the groups are blocks of five minutes
     detections: Detections
     scenes: list[SceneScores]
-    coughs: SingleCoughs | None
+    coughs: SingleCoughs | None  # None without a class or a clip of coughing
     evaluated_seconds: float
     sounds: int
     clips: int
@@ -314,8 +250,8 @@ class ScenesEvaluation:
     lacking: tuple[str, ...]
     skipped: Mapping[str, int]
     left_out: Sequence[SkippedClip]
-    truth: Labelling
-    found: Labelling
+    truth: Labelling  # of the first scene, for plots; in nanoseconds from its start
+    found: Labelling  # likewise
 
 
 def evaluate_scenes(  # noqa: PLR0913, PLR0917
@@ -328,18 +264,10 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
 ) -> ScenesEvaluation:
     """Compose scenes, record them with a model, and compare its labels with the truth.
 
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share of the scenes, 0 to 1.
-
-    Raises
-    ------
-    DataError
-        If the classes of the model are not those of the scenario, if no clip can be placed, or if a
-        scene is too short for a sound.
-    LogError, OSError
-        If there is no room for a scene in the folder of temporary files.
+    `progress` receives the completed share of the scenes, 0 to 1. Raise `DataError` if the classes
+    of the model are not those of the scenario, if no clip can be placed, or if a scene is too short
+    for a sound; `LogError` or `OSError` if there is no room for a scene in the folder of temporary
+    files.
     """
     check_classes(model, scenario)
     by_label, skipped, left_out = _usable(clips, scenario)
