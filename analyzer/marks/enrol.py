@@ -61,25 +61,15 @@ class Enrolled:
 
 
 def enrol_file(home: Path, label: str, audio: Path, seconds: float | None = None) -> list[Enrolled]:
-    """Enrol an audio file, or its first seconds.
+    """Enrol an audio file, or its first seconds, at least 1.
 
     Frame times come from the file name or metadata, else they end now; earlier if needed, because
     enrolled logs of one class must not overlap.
 
-    Parameters
-    ----------
-    seconds : float, optional
-        Length to enrol, at least 1; by default the complete file.
-
-    Raises
-    ------
-    DataError
-        If the label is no valid class name, if there is less than a second of sound, or if the
-        sound is only silence and the label is not.
-    SourceError
-        If the file is missing, is no audio, or is shorter than a frame.
-    LogError
-        If an enrolled log is damaged, or the new one cannot be written.
+    Raise `DataError` if the label is no valid class name, if there is less than a second of sound,
+    or if the sound is only silence and the label is not; `SourceError` if the file is missing, is
+    no audio, or is shorter than a frame; `LogError` if an enrolled log is damaged, or the new one
+    cannot be written.
     """
     _check_label(label)
     length = audio_seconds(audio)
@@ -103,24 +93,13 @@ def enrol_microphone(
     seconds: float = SECONDS,
     listening: Callable[[], None] = lambda: None,
 ) -> list[Enrolled]:
-    """Enrol a live recording from a microphone.
+    """Enrol a live recording of at least a second from a microphone.
 
-    Parameters
-    ----------
-    device : str
-        As listed by `hearthlog devices`; empty for the default device.
-    seconds : float
-        Length of the recording; at least 1.
+    The device is as listed by `hearthlog devices`; empty for the default device.
 
-    Raises
-    ------
-    DataError
-        If the label is no valid class name, if there is less than a second of sound, or if the
-        sound is only silence and the label is not.
-    SourceError
-        If the microphone cannot be found or opened.
-    LogError
-        If the log cannot be written.
+    Raise `DataError` if the label is no valid class name, if there is less than a second of sound,
+    or if the sound is only silence and the label is not; `SourceError` if the microphone cannot be
+    found or opened; `LogError` if the log cannot be written.
     """
     _check_label(label)
     with closing(MicrophoneSource(device, waits=False)) as source:
@@ -140,21 +119,13 @@ def enrol_log(  # noqa: PLR0913, PLR0917
 ) -> Enrolled:
     """Enrol a time span of a log, or of a folder of logs, by copying its feature messages.
 
-    Parameters
-    ----------
-    start, end : int
-        Nanoseconds of UTC: the frames from `start` on, before `end`.
-    microphone : str, optional
-        Name of the microphone; by default the only one of the log.
+    The frames are those from `start` on, before `end`, in nanoseconds of UTC; the microphone is by
+    default the only one of the log.
 
-    Raises
-    ------
-    DataError
-        If the label is no valid class name, if the log has several microphones and none is named,
-        if it has no features with an energy, if there is less than a second of sound, or if the
-        sound is only silence and the label is not.
-    LogError
-        If there is no such log, if one is damaged, or if nothing can be written.
+    Raise `DataError` if the label is no valid class name, if the log has several microphones and
+    none is named, if it has no features with an energy, if there is less than a second of sound, or
+    if the sound is only silence and the label is not; `LogError` if there is no such log, if one is
+    damaged, or if nothing can be written.
     """
     _check_label(label)
     microphone = microphone or _only_microphone(log)

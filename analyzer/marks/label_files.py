@@ -35,15 +35,10 @@ _CONTROLS = dict.fromkeys(range(0x80, 0xA0), "\ufffd")  # C1 control characters,
 
 
 def read_rows(path: Path, choice: Choice) -> Iterator[FileLabel | LineError]:
-    """Yield the labels of a file, unconverted.
+    """Yield the labels of a file in its order, unconverted; a `LineError` for a line without one.
 
     Raise `DataError` if the file cannot be read, is too large or no label file, or has no columns
     or tiers to choose.
-
-    Yields
-    ------
-    FileLabel or LineError
-        In the order of the file; an error for each line that is no label.
     """
     format_ = find_format(path) or AUDACITY
     text = read_text(path, "label file", format_.size_limit)
@@ -122,11 +117,8 @@ def read_class_map(path: Path) -> dict[str, str]:
 def find_class_names(labels: Iterable[str], class_map: Mapping[str, str] | None) -> ClassNames:
     """Find the classes of labels; without a map, any valid name may be a new class.
 
-    Parameters
-    ----------
-    class_map : mapping of str to str or None
-        As `read_class_map` returns it. With a map, labels that are no valid names match only
-        classes of the map or of hearthlog.
+    With a map, as from `read_class_map`, labels that are no valid names match only classes of the
+    map or of hearthlog.
     """
     given = class_map or {}
     classes = set(given.values())
@@ -195,16 +187,9 @@ def import_labels(
 ) -> Imported:
     """Read a label file as non-overlapping marks, by covering log.
 
-    Parameters
-    ----------
-    agree : callable
-        Called once if labels match class names only by spelling; raises to reject them.
-
-    Raises
-    ------
-    DataError
-        With file and place, if the file cannot be read, is no label file or holds no labels; if
-        `options.strict`, also if a label cannot be a mark.
+    `agree` is called once if labels match class names only by spelling; it raises to reject them.
+    Raise `DataError`, with file and place, if the file cannot be read, is no label file or holds no
+    labels; if `options.strict`, also if a label cannot be a mark.
     """
     left_out, moved = SkippedLabels(strict=options.strict), Counter[str]()
     placed = list(_placed(path, coverage, options, left_out, moved))
@@ -226,16 +211,9 @@ def import_labels(
 def read_lines(path: Path, coverage: Mapping[str, Coverage], microphone: str) -> list[PlacedMark]:
     """Read a label file with labels that may overlap and may lie outside of recorded time.
 
-    Returns
-    -------
-    list of PlacedMark
-        In the order of the file, with line numbers, or places in formats without lines.
-
-    Raises
-    ------
-    DataError
-        With file and place, if the file cannot be read, is no label file or holds no labels, or if
-        a label cannot be a mark.
+    They are in the order of the file, with line numbers, or places in formats without lines. Raise
+    `DataError`, with file and place, if the file cannot be read, is no label file or holds no
+    labels, or if a label cannot be a mark.
     """
     placed = []
     for row in read_rows(path, Choice()):

@@ -56,16 +56,12 @@ Row = tuple[Any, ...]
 
 
 def read_rows(path: Path) -> dict[Key, list[Row]]:
-    """Read a review layer.
+    """Read a review layer by labelling and type.
 
-    Raise `LogError` if the layer cannot be read, is damaged or cut off, or holds other topics.
-
-    Returns
-    -------
-    dict of (str, str) to list of tuple
-        By labelling and type: microphone, start and end in nanoseconds of UTC; then label for
-        segments; label, reviewer, made, corrects and reason for marks; reviewer, made, corrects
-        and chosen for reviewed spans.
+    Rows have microphone, start and end in nanoseconds of UTC; then label for segments; label,
+    reviewer, made, corrects and reason for marks; reviewer, made, corrects and chosen for reviewed
+    spans. Raise `LogError` if the layer cannot be read, is damaged or cut off, or holds other
+    topics.
     """
     with LogFile(path) as file:
         complete = file.complete
@@ -174,22 +170,15 @@ class MarkedSpan(NamedTuple):
 class ReviewedSpan(NamedTuple):
     """A span that a reviewer has checked: labels without a mark in it are correct.
 
-    Attributes
-    ----------
-    reviewer : str
-        Empty if unknown.
-    made : int
-        Time of the review, in nanoseconds of UTC; 0 if unknown.
-    chosen : str
-        How the span was selected: `person`, `queue`, or `random`. Random spans are reserved to
-        measure label accuracy, and not used for training.
+    `chosen` is how the span was selected: `person`, `queue`, or `random`. Random spans are reserved
+    to measure label accuracy, and not used for training.
     """
 
     microphone: str
-    start: int
-    end: int
-    reviewer: str = ""
-    made: int = 0
+    start: int  # in nanoseconds of UTC
+    end: int  # likewise
+    reviewer: str = ""  # empty if unknown
+    made: int = 0  # time of the review, in nanoseconds of UTC; 0 if unknown
     corrects: str = LIVE
     chosen: str = PERSON
 
@@ -202,54 +191,26 @@ class Reviewed(NamedTuple):
 
 
 def read_review(log: Path) -> dict[str, Reviewed]:
-    """Read all marks and reviewed spans of a log.
+    """Read all marks and reviewed spans of a log, by scenario; empty without a review layer.
 
-    Raise `LogError` if the review layer cannot be read, is damaged or cut off, holds other topics,
-    or has marks that are invalid or overlap.
-
-    Returns
-    -------
-    dict of str to Reviewed
-        By scenario, with an empty name for the sounds of the home; empty if there is no review
-        layer.
+    The scenario is empty for the sounds of the home. Raise `LogError` if the review layer cannot be
+    read, is damaged or cut off, holds other topics, or has marks that are invalid or overlap.
     """
     return _read_layer(review_path(log))
 
 
 def read_marks(log: Path, scenario: str = "") -> list[Mark]:
-    """Read the marks of a log.
+    """Read the marks of a log by microphone and time, without overlaps; by default of no scenario.
 
-    Parameters
-    ----------
-    log : Path
-    scenario : str, optional
-        Name of a scenario, to read its marks instead of those of the sounds of the home.
-
-    Returns
-    -------
-    list of Mark
-        By microphone and time, without overlaps; empty if there is no review layer.
-
-    Raises
-    ------
-    LogError
-        As `read_review` does.
+    Empty if there is no review layer. Raise `LogError` as `read_review` does.
     """
     return read_review(log).get(scenario, _NOTHING).marks.copy()
 
 
 def read_reviewed(log: Path, scenario: str = "") -> list[ReviewedSpan]:
-    """Read the reviewed spans of a log.
+    """Read the reviewed spans of a log by microphone and time; they may overlap.
 
-    Returns
-    -------
-    list of ReviewedSpan
-        By microphone and time; they may overlap. Empty if there is no review layer.
-
-    Raises
-    ------
-    LogError
-        As `read_review` does.
+    Empty if there is no review layer. Raise `LogError` as `read_review` does.
     """
     return read_review(log).get(scenario, _NOTHING).reviewed.copy()
 
@@ -309,28 +270,14 @@ def write_marks(  # noqa: PLR0913
 ) -> Path:
     """Add marks to the review layer of a log; they replace overlapping older marks.
 
-    The layer is replaced atomically. Concurrent writers to the same folder wait for each other.
-    Marks of other scenarios, or of the sounds of the home, are kept.
+    Older marks in `deleted` are deleted or cut before the new marks are added; `not_reviewed` is
+    removed before `reviewed` is added. Marks of other scenarios, or of the sounds of the home, are
+    kept. The layer is replaced atomically. Concurrent writers to the same folder wait for each
+    other. Return the layer; without marks and reviewed spans the file does not exist.
 
-    Parameters
-    ----------
-    deleted : iterable of MarkedSpan
-        Spans in which older marks are deleted or cut, before the new marks are added.
-    not_reviewed : iterable of ReviewedSpan
-        Reviewed spans to remove from the layer, before `reviewed` is added.
-
-    Returns
-    -------
-    Path
-        The layer; without marks and reviewed spans the file does not exist.
-
-    Raises
-    ------
-    DataError
-        If the new marks overlap each other, or new marks or spans are invalid.
-    LogError
-        If there is no such log, if its layer cannot be read or is damaged, if the name of a
-        microphone or the scenario is invalid, or if the layer cannot be written.
+    Raise `DataError` if the new marks overlap each other, or new marks or spans are invalid;
+    `LogError` if there is no such log, if its layer cannot be read or is damaged, if the name of a
+    microphone or the scenario is invalid, or if the layer cannot be written.
     """
     new, looked_at = _checked(marks), _checked_reviewed(reviewed)
     if scenario:

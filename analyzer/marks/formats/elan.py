@@ -184,17 +184,9 @@ def _seconds(where: str, annotation: _Annotation, milliseconds: str | None) -> s
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Return an ELAN document with times since the first frame of any of its microphones.
+    """Return an ELAN document with times, in whole ms, since the first frame of any microphone.
 
-    Parameters
-    ----------
-    marks : sequence of Mark
-        At least one.
-
-    Returns
-    -------
-    str
-        The text of the file; its times are whole milliseconds.
+    There is at least one mark.
     """
     marks = [mark._replace(reviewer=mark.reviewer.translate(_NO_XML)) for mark in marks]
     zero = min(coverage[mark.microphone].starts[0] for mark in marks)

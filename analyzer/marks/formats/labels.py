@@ -26,10 +26,7 @@ def place_text(path: Path, place: int | str) -> str:
 class LineError(DataError):
     """A label of a file that cannot become a mark.
 
-    Parameters
-    ----------
-    alike : str, optional
-        Key under which labels of the same kind are counted together.
+    Labels of the same kind, with the same key `alike`, are counted together.
     """
 
     def __init__(self, where: str, kind: str, reason: str, alike: str = "") -> None:
@@ -39,13 +36,7 @@ class LineError(DataError):
 
 
 class SkippedLabels:
-    """Skipped labels of a file: the number and the first of each kind.
-
-    Parameters
-    ----------
-    strict : bool
-        Whether to raise an error instead of skipping.
-    """
+    """Skipped labels of a file: number and first of each kind; an error instead if `strict`."""
 
     def __init__(self, *, strict: bool) -> None:
         self._strict = strict
@@ -73,42 +64,24 @@ _SHOWN = 64  # characters of a text in an error
 
 
 class FileLabel(NamedTuple):
-    """A label as in the file: texts, empty if missing.
+    """A label as in the file: texts, empty if missing."""
 
-    Attributes
-    ----------
-    start, end : str
-        Seconds since `zero`, or ISO 8601.
-    made : str
-        Time at which the label was made, ISO 8601.
-    zero : str
-        ISO 8601; by default the first frame of the microphone.
-    length : str
-        Length of the labelled recording, in seconds.
-    """
-
-    start: str
-    end: str
+    start: str  # seconds since `zero`, or ISO 8601
+    end: str  # likewise
     label: str
     microphone: str = ""
     reviewer: str = ""
-    made: str = ""
+    made: str = ""  # time at which the label was made, ISO 8601
     corrects: str = ""
-    zero: str = ""
-    length: str = ""
+    zero: str = ""  # ISO 8601; by default the first frame of the microphone
+    length: str = ""  # of the labelled recording, in seconds
     place: int | str = 0
 
 
 class Choice(NamedTuple):
-    """Parts of a file to read as labels, if there are several.
+    """Parts of a file to read as labels, if there are several."""
 
-    Attributes
-    ----------
-    tiers : sequence of str
-        ELAN tiers; empty for all top tiers.
-    """
-
-    tiers: Sequence[str] = ()
+    tiers: Sequence[str] = ()  # of ELAN; empty for all top tiers
     columns: Mapping[str, str] = {}
 
 
@@ -138,11 +111,8 @@ def scan(
 ) -> Iterator[FileLabel | LineError]:
     """Parse the entries of a file, with their places.
 
-    Parameters
-    ----------
-    parse : callable
-        Returns the label of an entry, given its place for errors; None for an entry that is
-        skipped. Raises `LineError` for an entry that is no label.
+    `parse` returns the label of an entry, given its place for errors; None for an entry that is
+    skipped. It raises `LineError` for an entry that is no label.
     """
     for place, entry in entries:
         try:
@@ -166,17 +136,10 @@ def make_mark(
 ) -> PlacedMark:
     """Convert a label of a file to a mark.
 
-    Parameters
-    ----------
-    microphone : str or None
-        Microphone of labels that name none; not needed if there is only one.
-
-    Raises
-    ------
-    LineError
-        With file and place, if the microphone is not in the logs or must be named, if a time or a
-        name is invalid, if the label is empty or a point, ends before it starts or starts before
-        the first frame, or if the labelled recording has another length.
+    `microphone` is that of labels that name none; not needed if there is only one. Raise
+    `LineError`, with file and place, if the microphone is not in the logs or must be named, if a
+    time or a name is invalid, if the label is empty or a point, ends before it starts or starts
+    before the first frame, or if the labelled recording has another length.
     """
     where = place_text(path, label.place)
     if not label.label:
@@ -214,15 +177,10 @@ def with_point(number: str) -> str:
 
 
 def add_seconds(where: str, start: str, duration: str) -> str:
-    """Return the end of a label from its start and duration.
+    """Return the end of a label from its start and duration, decimal numbers of seconds.
 
-    Raise `LineError` if a value is no number, or has more than 10 digits before the point or 18
-    after it.
-
-    Parameters
-    ----------
-    start, duration : str
-        Decimal numbers of seconds, with or without an exponent.
+    They may have an exponent. Raise `LineError` if a value is no number, or has more than 10 digits
+    before the point or 18 after it.
     """
     return f"{_seconds(where, start) + _seconds(where, duration):f}"
 

@@ -26,14 +26,9 @@ _NO_TASK = "unreadable task"
 
 
 def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:  # noqa: ARG001
-    """Yield the items of a Label Studio JSON export or import file.
+    """Yield the items of a Label Studio JSON export or import file, in its order.
 
-    Raise `DataError` if the text is not JSON.
-
-    Yields
-    ------
-    FileLabel or LineError
-        In the order of the file; an error for each entry that is no task.
+    An entry that is no task is a `LineError`. Raise `DataError` if the text is not JSON.
     """
     try:
         # Numbers stay text, so that no digits are lost and no length is too large.
@@ -50,13 +45,7 @@ def read(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineErro
 
 
 def write(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Return Label Studio tasks, one per microphone.
-
-    Parameters
-    ----------
-    coverage : mapping of str to Coverage
-        By microphone; times are written as seconds since its first frame.
-    """
+    """Return Label Studio tasks, one per microphone; times are seconds since its first frame."""
     tasks = [
         _task(name, [mark for mark in marks if mark.microphone == name], coverage[name])
         for name in sorted({mark.microphone for mark in marks})

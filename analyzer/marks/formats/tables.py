@@ -54,16 +54,10 @@ def is_table(text: str) -> bool:
 def read_table(path: Path, text: str, choice: Choice) -> Iterator[FileLabel | LineError]:
     """Yield the rows of a table without duplicates, as Raven may repeat them per view and channel.
 
-    The field separator is the most frequent of tab, semicolon and comma in the first line. Unless
-    it is the comma, numbers may have decimal commas.
-
-    Raise `DataError` if required columns are missing or ambiguous, or if the text has too many or
-    too long lines.
-
-    Parameters
-    ----------
-    choice : Choice
-        Columns by name, or by number from 1 if the first line has no names.
+    Columns are chosen by name, or by number from 1 if the first line has no names. The field
+    separator is the most frequent of tab, semicolon and comma in the first line. Unless it is the
+    comma, numbers may have decimal commas. Raise `DataError` if required columns are missing or
+    ambiguous, or if the text has too many or too long lines.
     """
     first = _first_line(text)
     delimiter = max("\t;,", key=first.count)
@@ -160,17 +154,9 @@ _CSV_COLUMNS = ("start", "end", "label", "microphone", "reviewer", "made", "corr
 
 
 def write_csv(path: Path, marks: Sequence[Mark], coverage: Mapping[str, Coverage]) -> str:  # noqa: ARG001
-    """Return a CSV table with all fields of the marks.
+    """Return a CSV table with all fields of the marks, with times in UTC.
 
-    Parameters
-    ----------
-    coverage : mapping of str to Coverage
-        Not used: times are written in UTC.
-
-    Returns
-    -------
-    str
-        The text of the file; spreadsheet formulas are disarmed with an apostrophe.
+    Spreadsheet formulas are disarmed with an apostrophe.
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
