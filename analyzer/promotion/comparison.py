@@ -61,21 +61,13 @@ _MOST = 0.5  # of a sound
 
 
 class PairedAccuracy(NamedTuple):
-    """Sounds of known label, and those labelled correctly for most of their time by each model.
-
-    Attributes
-    ----------
-    before, after : int
-        Correct in the first model, in the second.
-    gained, lost : int
-        Correct in the second alone, in the first alone.
-    """
+    """Sounds of known label, and those labelled correctly for most of their time by each model."""
 
     sounds: int = 0
-    before: int = 0
-    after: int = 0
-    gained: int = 0
-    lost: int = 0
+    before: int = 0  # correct in the first model
+    after: int = 0  # correct in the second
+    gained: int = 0  # correct in the second alone
+    lost: int = 0  # correct in the first alone
 
     def plus(self, other: "PairedAccuracy") -> "PairedAccuracy":
         """Return the sums."""
@@ -86,19 +78,11 @@ NOTHING_KNOWN = PairedAccuracy()
 
 
 class NamedSounds(NamedTuple):
-    """Sounds to which a person and the first model each give a class of that model.
-
-    Attributes
-    ----------
-    right : int
-        With the same class.
-    classes : int
-        Classes that the person gives.
-    """
+    """Sounds to which a person and the first model each give a class of that model."""
 
     sounds: int = 0
-    right: int = 0
-    classes: int = 0
+    right: int = 0  # with the same class
+    classes: int = 0  # that the person gives
 
 
 NOTHING_NAMED = NamedSounds()
@@ -106,41 +90,22 @@ NOTHING_NAMED = NamedSounds()
 
 @dataclass(frozen=True, eq=False)
 class HomeComparison:
-    """Two models on the same recent time of a home.
-
-    Attributes
-    ----------
-    recorded : float
-        Total recorded minutes.
-    changes : LabelChanges
-        From the first model to the second, per mean day, or in total if less than a day is
-        recorded.
-    sure : np.ndarray [shape=(C, C)], float64
-        As `changes.minutes`, for the time in which the first model is sure.
-    random, marks : PairedAccuracy
-        Sounds of the minutes drawn at random; of other marks outside both training sets.
-    quiet : PairedAccuracy
-        Silences of the minutes drawn at random.
-    taught : frozenset of str
-        Classes that the second model has from marks of the home, and the first lacks.
-    known : mapping of (str, str, str) to int
-        Sounds of known label, including training sounds, by reviewed class, class of the first
-        model and class of the second; empty if the second was not trained here.
-    named : NamedSounds
-        Of the minutes drawn at random.
-    """
+    """Two models on the same recent time of a home."""
 
     minutes: float
-    recorded: float
-    changes: LabelChanges
-    sure: Float64
-    random: PairedAccuracy
-    marks: PairedAccuracy
+    recorded: float  # total minutes
+    changes: LabelChanges  # first to second model, per mean day, or in total below a day
+    sure: Float64  # [shape=(C, C)]; as `changes.minutes`, where the first model is sure
+    random: PairedAccuracy  # sounds of the minutes drawn at random
+    marks: PairedAccuracy  # sounds of other marks outside both training sets
     losses: list[str]
-    quiet: PairedAccuracy = NOTHING_KNOWN
+    quiet: PairedAccuracy = NOTHING_KNOWN  # silences of the minutes drawn at random
+    # classes of the second model from marks of the home, without those of the first
     taught: frozenset[str] = frozenset()
+    # sounds of known label, including training sounds, by reviewed class, class of the first model
+    # and class of the second; empty if the second was not trained here
     known: Mapping[tuple[str, str, str], int] = field(default_factory=dict)
-    named: NamedSounds = NOTHING_NAMED
+    named: NamedSounds = NOTHING_NAMED  # of the minutes drawn at random
 
 
 def gather_evidence(
@@ -151,14 +116,9 @@ def gather_evidence(
 ) -> HomeComparison:
     """Run two models over a sample of a home's recent time, and over its known sounds.
 
-    Raise `ModelError` if the feature set of the models, or a kind of classifier, is not installed.
-
-    Parameters
-    ----------
-    before, after : Model
-        Of the same feature set; the second would replace the first.
-    progress : callable, optional
-        Receives the completed share of the sound, 0 to 1.
+    The models have the same feature set; the second would replace the first. `progress` receives
+    the completed share of the sound, 0 to 1. Raise `ModelError` if the feature set of the models,
+    or a kind of classifier, is not installed.
     """
     losses: list[str] = []
     known = reference_sounds(logs, losses)
@@ -309,25 +269,17 @@ _ENDS = (0.025, 0.975)
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A champion and a candidate on the same time of a home.
-
-    Attributes
-    ----------
-    random, marks : PairedAccuracy
-        Known sounds of the minutes drawn at random, and other marks.
-    quiet : PairedAccuracy
-        Silences of the minutes drawn at random.
-    """
+    """A champion and a candidate on the same time of a home."""
 
     champion: str
     candidate: str
     candidate_sha256: str
     minutes: float
     changes: LabelChanges
-    random: PairedAccuracy
-    marks: PairedAccuracy
+    random: PairedAccuracy  # sounds of the minutes drawn at random
+    marks: PairedAccuracy  # sounds of other marks
     losses: list[str]
-    quiet: PairedAccuracy = NOTHING_KNOWN
+    quiet: PairedAccuracy = NOTHING_KNOWN  # silences of the minutes drawn at random
 
 
 def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> Trial:

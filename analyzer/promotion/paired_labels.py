@@ -33,25 +33,13 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 
 class PairedFrames(NamedTuple):
-    """Frames with labels of two models.
+    """Frames with labels of two models."""
 
-    Attributes
-    ----------
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
-    before, after : np.ndarray [shape=(n,)], int
-        Class indices of the segments of each model around the frames.
-    confidence : np.ndarray [shape=(n,)], float32
-        Probability of the first model's label.
-    weight : np.ndarray [shape=(n,)], float64
-        Number of frames of the home's time that each frame represents.
-    """
-
-    stamps: Int64
-    before: Indices
-    after: Indices
-    confidence: Float32
-    weight: Float64
+    stamps: Int64  # [shape=(n,)]; starts in nanoseconds of UTC
+    before: Indices  # [shape=(n,)]; class of the segment of the first model around the frame
+    after: Indices  # [shape=(n,)]; likewise of the second
+    confidence: Float32  # [shape=(n,)]; probability of the first model's label
+    weight: Float64  # [shape=(n,)]; frames of the home's time that each frame represents
 
 
 NO_FRAMES = PairedFrames(
@@ -72,10 +60,7 @@ def joined_frames(several: Sequence[PairedFrames]) -> PairedFrames:
 class TwoModels:
     """Two models of the same feature set, ready to label.
 
-    Attributes
-    ----------
-    classes : list of str
-        Classes of the first model, then other classes of the second.
+    `classes` are those of the first model, then other classes of the second.
     """
 
     def __init__(self, before: Model, after: Model) -> None:
@@ -123,19 +108,12 @@ class LabelChange(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LabelChanges:
-    """Two labellings of the same time.
-
-    Attributes
-    ----------
-    minutes : np.ndarray [shape=(C, C)], float64
-        With the row's class in the first labelling and the column's class in the second.
-    each : str, optional
-        ` a day` for minutes of a mean day; empty for the total recorded minutes.
-    """
+    """Two labellings of the same time."""
 
     classes: Sequence[str]
+    # [shape=(C, C)]; of the row's class in the first labelling, the column's in the second
     minutes: Float64
-    each: str = A_DAY
+    each: str = A_DAY  # ` a day` for minutes of a mean day; empty for the total recorded minutes
 
     @property
     def before(self) -> Float64:
@@ -169,15 +147,7 @@ def changes_of_frames(
     minutes: Float64,
     each: str = A_DAY,
 ) -> LabelChanges:
-    """Count the changes of frames.
-
-    Parameters
-    ----------
-    before, after : np.ndarray [shape=(n,)], int
-        Indices of the classes of the same frames in both labellings.
-    minutes : np.ndarray [shape=(n,)], float64
-        Minutes that each frame represents.
-    """
+    """Count the changes of frames, each of which represents some minutes, in two labellings."""
     counts = np.bincount(before * len(classes) + after, minutes, len(classes) ** 2)
     table = counts.reshape(len(classes), len(classes)).astype(np.float64)
     return LabelChanges(classes, table, each)
@@ -236,10 +206,7 @@ def label_parts(
 ) -> Iterator[PairedFrames]:
     """Label one part after the other; an unreadable part has no frames.
 
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share of the parts, 0 to 1.
+    `progress` receives the completed share of the parts, 0 to 1.
     """
     for i, part in enumerate(parts):
         try:
@@ -256,10 +223,7 @@ def changes_of_sample(
 ) -> LabelChanges:
     """Count the changes per mean day, or in total if less than a day is recorded.
 
-    Parameters
-    ----------
-    sure : float, optional
-        Minimum probability of the first model's label for a frame to count.
+    A frame counts if its label by the first model has a probability of `sure` or more.
     """
     share = frames.weight / max(frames.weight.sum(), 1.0)
     day = minutes_a_day(logs)
@@ -273,14 +237,11 @@ def changes_of_sample(
 class ChangedTime:
     """Spans in which two models differ, in the sample for the promotion check.
 
-    Attributes
-    ----------
-    spans : Events
-        In order of time; the label is the row of the first model's class in `changes` times
-        the number of classes, plus the column of the second model's class.
+    The label of a span is the row of the first model's class in `changes` times the number of
+    classes, plus the column of the second model's class.
     """
 
-    spans: Events
+    spans: Events  # in order of time
     changes: LabelChanges
     losses: list[str]
 
@@ -294,12 +255,8 @@ def find_changed_time(
 ) -> ChangedTime:
     """Run two models over the sample of a home's recent time, as `gather_evidence` does.
 
-    Raise `ModelError` if the feature set of the models, or a kind of classifier, is not installed.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Receives the completed share of the sound, 0 to 1.
+    `progress` receives the completed share of the sound, 0 to 1. Raise `ModelError` if the feature
+    set of the models, or a kind of classifier, is not installed.
     """
     losses: list[str] = []
     learned = learned_by(before, after, reference_sounds(logs, losses))

@@ -53,14 +53,7 @@ _MARKS_ALONE = 3  # marks that show a wrong class, if no sound of that class is 
 
 
 def damages(evidence: HomeComparison, champion: str) -> list[str]:
-    """Return descriptions of the damage by a model.
-
-    Returns
-    -------
-    list of str
-        A sentence for each damage, or one on too little sound for a decision; empty without
-        damage.
-    """
+    """Return a sentence for each damage by a model, or one on too little sound for a decision."""
     if evidence.minutes < LEAST_MINUTES:
         loss = f" ({evidence.losses[0]})" if evidence.losses else ""
         missing = math.ceil(LEAST_MINUTES - evidence.minutes)
@@ -104,13 +97,7 @@ def is_worse(right: PairedAccuracy) -> bool:
 
 
 def less_right(right: PairedAccuracy, name: str) -> str:
-    """Format the numbers of correct sounds of a model and of its comparison model.
-
-    Parameters
-    ----------
-    right : PairedAccuracy
-        Sounds of the minutes drawn at random.
-    """
+    """Format the numbers of correct sounds of a model and the other, in minutes drawn at random."""
     return (
         f"of {right.sounds} sounds of the minutes that were drawn at random it is right about "
         f"{right.after}, {name} about {right.before}"
@@ -275,20 +262,12 @@ _LONGEST = 400  # characters of a reason
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Result of the promotion check, with its evidence.
-
-    Attributes
-    ----------
-    model, champion : str
-        Names; empty for the champion if no model labels yet.
-    evidence : HomeComparison or None
-        None without anything to compare.
-    """
+    """Result of the promotion check, with its evidence."""
 
     judgement: Judgement
-    model: str
-    champion: str
-    evidence: HomeComparison | None
+    model: str  # name
+    champion: str  # name; empty if no model labels yet
+    evidence: HomeComparison | None  # None without anything to compare
 
 
 def judge(
@@ -296,15 +275,10 @@ def judge(
 ) -> Verdict:
     """Compare a model with the model that labels a home now, and store the result.
 
-    Raise `ModelError` if the model that labels now cannot be found or used, a feature set is not
-    installed, or the result cannot be written.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the model; its champion labels now, or else the model of the latest logs.
-    progress : callable, optional
-        Receives the completed share, 0 to 1.
+    The champion of `folder`, the folder of the model, labels now, or else the model of the latest
+    logs. `progress` receives the completed share, 0 to 1. Raise `ModelError` if the model that
+    labels now cannot be found or used, a feature set is not installed, or the result cannot be
+    written.
     """
     champion = find_champion(folder, home, model)
     evidence, reasons = None, list[str]()
@@ -338,22 +312,12 @@ def other_features(champion: Model, model: Model) -> str:
 
 
 def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | None:
-    """Find the model that labels a home now.
+    """Find the model that labels a home now; None if there are no logs with labels.
 
-    Raise `ModelError` if the model that labelled the latest log is missing.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of models with the champion, unless that is the checked model or is missing.
-    home : sequence of Path
-        Folders of logs; the fallback is the model of the latest log. Of several such models, the
-        one from which the checked model was adapted takes precedence.
-
-    Returns
-    -------
-    Model or None
-        None if there are no logs with labels.
+    It is the champion of the folder of models, unless that is the checked model or is missing; the
+    fallback is the model of the latest log. Of several such models, the one from which the checked
+    model was adapted takes precedence. Raise `ModelError` if the model that labelled the latest log
+    is missing.
     """
     with suppress(ModelError):
         champion = load(folder, CHAMPION)

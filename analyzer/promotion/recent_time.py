@@ -85,10 +85,7 @@ def sounding_time(logs: Sequence[RecentLog]) -> Spans:
 def learned_time(model: Model, marked: Spans) -> Spans:
     """Return the time of a home in a model's training set, as far as recorded.
 
-    Parameters
-    ----------
-    marked : Spans
-        Marks of the home; an adapted model without recorded times is assumed to have used them all.
+    An adapted model without recorded times is assumed to have used all `marked` time.
     """
     training = model.description.training_data
     if training.home_spans:
@@ -123,15 +120,10 @@ def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list
 
 
 def sample(parts: Sequence[LogSpan], count: int, longest: int, seed: int = _SEED) -> list[LogSpan]:
-    """Choose a limited number of spans of time.
+    """Choose a limited number of spans of time, `longest` ns or up to the end of their part.
 
     One span starts at a random moment in each of as many equal shares of the time, so that all days
     and times of day are covered. Deterministic for the same time.
-
-    Parameters
-    ----------
-    longest : int
-        Length of a span in nanoseconds; shorter at the end of its part.
     """
     lengths = np.array([part.end - part.start for part in parts], np.int64)
     total = int(lengths.sum())
@@ -177,30 +169,20 @@ _FOLLOWING = 3  # logs: a segment is in the one in which it ends
 
 
 class ReferenceSound(NamedTuple):
-    """A sound of known label.
-
-    Attributes
-    ----------
-    random : bool
-        Whether its time was drawn at random rather than chosen.
-    """
+    """A sound of known label."""
 
     start: int
     end: int
     label: str
-    random: bool
+    random: bool  # whether its time was drawn at random rather than chosen
     microphone: str
 
 
 def reference(log: Path, following: Sequence[Path] = ()) -> list[ReferenceSound]:
-    """Return the sounds of known label of a log.
+    """Return the sounds of known label, half a second or more, of a log; random time first.
 
-    Raise `LogError` if its review layer is damaged, or the reviewed labelling is missing.
-
-    Returns
-    -------
-    list of ReferenceSound
-        Of half a second or more, sorted by start; sounds of random time first.
+    They are sorted by start. Raise `LogError` if its review layer is damaged, or the reviewed
+    labelling is missing.
     """
     marks, drawn = read_marks(log), _drawn(read_reviewed(log))
     labellings = find_labellings(log, *following[:_FOLLOWING]) if drawn else Labellings([])
@@ -217,10 +199,7 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[ReferenceSound]
 def left_alone(log: Path) -> list[ReferenceSound]:
     """Return the sounds of a log with confirmed labels: reviewed, not at random, and unmarked.
 
-    Returns
-    -------
-    list of ReferenceSound
-        Of half a second or more, two seconds next to a mark; unreadable labels are skipped.
+    They last half a second or more, two seconds next to a mark; unreadable labels are skipped.
     """
     sounds: list[ReferenceSound] = []
     with suppress(DataError, LogError):
