@@ -180,19 +180,9 @@ class LogSelection:
                 )
 
     def topics_of(self, type_: str, fields: Collection[str]) -> list[str]:
-        """List the topics of a type whose channels all have the given fields.
+        """List the topics, in order of `channels`, of a type whose channels all have some fields.
 
-        Parameters
-        ----------
-        type_ : str
-            Name of a message type, such as in `message_types`.
-        fields : collection of str
-            Paths of the fields.
-
-        Returns
-        -------
-        list of str
-            In the order of `channels`.
+        The type is a name such as in `message_types`; fields are given by their paths.
         """
         return [
             topic

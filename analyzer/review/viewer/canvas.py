@@ -48,16 +48,10 @@ class Canvas:
     def draw_strips(
         self, entity: str, places: tuple[float, float], spans: Spans, name: str, colour: Colour
     ) -> None:
-        """Draw spans as strips that are at least some points wide, also from afar.
+        """Draw spans, at least one, in time order, as strips of a least width, also from afar.
 
-        Parameters
-        ----------
-        places : (float, float)
-            Middle and thickness, in units of the view.
-        spans : Spans
-            At least one, in time order.
-        colour : Colour
-            Red, green and blue, 0 to 255.
+        The width is some points. `places` are middle and thickness in units of the view; a colour
+        is red, green and blue, 0 to 255.
         """
         height, thickness = places
         style = rr.SeriesLines(

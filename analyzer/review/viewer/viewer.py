@@ -353,19 +353,9 @@ class Viewer(ABC):
             _container(blueprint, path)["row_shares"] = [*heights[:-1], below]
 
     def show(self, start: int, end: int, margin: int, *, select: bool = True) -> None:
-        """Show a span with a margin, put the cursor on its start, and select the span.
+        """Show a span with a margin (ns), put the cursor on its start; select the span or nothing.
 
-        Parameters
-        ----------
-        margin : int
-            On either side, in nanoseconds.
-        select : bool, optional
-            Whether the span is selected; otherwise nothing is.
-
-        Raises
-        ------
-        ConnectionError, TimeoutError
-            If the viewer does not answer.
+        Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         start, end = self._clock.shown(start), self._clock.shown(end)
         blueprint = self._blueprint()
