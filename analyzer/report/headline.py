@@ -77,10 +77,7 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
 def _by_sound(sounds: Sequence[tuple[str, bool]]) -> Iterator[str]:
     """Yield sentences of counts: what is known, and what is only labelled so.
 
-    Parameters
-    ----------
-    sounds : sequence of (str, bool)
-        Counts of a class in words, and whether a person reviewed all of it.
+    A count of a class in words comes with whether a person reviewed all of it.
     """
     yield from (f"{_capital(text)}." for text, is_known in sounds if is_known)
     if labelled := [text for text, is_known in sounds if not is_known]:
@@ -95,10 +92,7 @@ def is_quiet(day: DayMetrics) -> bool:
 def amount(name: str, count: Count, *, named: bool = True) -> str:
     """Return a number of events in words, as labelled: `two bouts of coughing`, `crying once`.
 
-    Parameters
-    ----------
-    named : bool, optional
-        Whether to name the class; else `two`, `once`.
+    Without the name of the class, just `two`, `once`.
     """
     several, number = several_in_words(name).lower(), number_in_words(count.labelled)
     if several.startswith("times of "):

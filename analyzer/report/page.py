@@ -65,23 +65,13 @@ from hearthlog.schemas.errors import listed
 
 
 class Cell(NamedTuple):
-    """Table cell.
-
-    Attributes
-    ----------
-    change : str
-        How the figure differs from other days.
-    note : str
-        In small letters below the text.
-    whole : bool
-        Whether line breaks are forbidden.
-    """
+    """Table cell."""
 
     text: str
-    change: str = ""
+    change: str = ""  # how the figure differs from other days
     colour: tuple[int, int, int] | None = None
-    whole: bool = False
-    note: str = ""
+    whole: bool = False  # whether line breaks are forbidden
+    note: str = ""  # in small letters below the text
 
 
 class PageTable(NamedTuple):
@@ -102,13 +92,7 @@ class PagePicture(NamedTuple):
 
 
 def fill_page(**parts: Any) -> str:
-    """Fill the template; all text is escaped.
-
-    Parameters
-    ----------
-    **parts
-        By the names of the template; all are required.
-    """
+    """Fill all names of the template; all text is escaped."""
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,
@@ -331,10 +315,7 @@ def _cell(
 ) -> Cell:
     """Return a figure, how it differs, and its usual range if there is a baseline.
 
-    Parameters
-    ----------
-    is_alone : bool, optional
-        Whether the head of the column cannot say which figures are as labelled.
+    If it `is_alone`, the head of the column cannot say which figures are as labelled.
     """
     value = figure.value(day)
     text = _text(value)

@@ -79,22 +79,12 @@ def make_report(  # noqa: PLR0913
 ) -> WrittenReport:
     """Write the report of a day or a week.
 
-    Parameters
-    ----------
-    page : Path
-        The HTML file; a picture has the same path with suffix `.png`. Neither may exist.
-    progress : callable, optional
-        Receives the share of the logs read, 0 to 1.
-    draw : callable, optional
-        Writes the picture, from the days of the report and those that they are compared with:
-        `save_timelines`, which needs matplotlib. By default there is only the page.
-
-    Raises
-    ------
-    DataError
-        If these days have no logs or no labels, or the labelling does not exist.
-    LogError
-        If segments are invalid, or a file exists or cannot be written.
+    The HTML file, and the picture of the same path with suffix `.png`, may not exist. `draw` writes
+    the picture, from the days of the report and those that they are compared with:
+    `save_timelines`, which needs matplotlib; by default there is only the page. `progress` receives
+    the share of the logs read, 0 to 1. Raise `DataError` if these days have no logs or no labels,
+    or the labelling does not exist; `LogError` if segments are invalid, or a file exists or cannot
+    be written.
     """
     picture = page.with_suffix(".png")
     if draw is not None and picture == page:

@@ -219,11 +219,8 @@ class Account:
     def rightness(self, name: str) -> str:
         """Return the accuracy of a class in the checked minutes: `3 of 4, missed 1`.
 
-        Parameters
-        ----------
-        name : str
-            Class name; silence and `unknown` return an empty text, since neither is a sound that
-            can be counted as correct or missed.
+        Empty for silence and `unknown`, since neither is a sound that can be counted as correct or
+        missed.
         """
         if name in {SILENCE, UNKNOWN}:
             return ""
@@ -239,13 +236,9 @@ class Account:
         return len(self.earlier) >= FEWEST
 
     def baseline(self, figure: ReportFigure) -> tuple[UsualRange, Value] | None:
-        """Return the usual range of a figure, and a value that formats it.
+        """Return the usual range of a figure over days with sufficient coverage, and its formatter.
 
-        Returns
-        -------
-        (UsualRange, Value) or None
-            From the earlier days with sufficient coverage; None if fewer than seven of them have
-            the figure.
+        None if fewer than seven of the earlier days have the figure.
         """
         days = [day for day in self.earlier if day.comparable(figure.name)]
         values = [value for day in days if (value := figure.value(day)) is not None]
@@ -258,13 +251,9 @@ class Account:
         return "" if baseline is None else baseline[1].spread(*baseline[0])
 
     def change(self, figure: ReportFigure, day: DayMetrics) -> str:
-        """Compare a figure of a day with all earlier days.
+        """Compare a figure of a day with all earlier days in a word or two, such as `more often`.
 
-        Returns
-        -------
-        str
-            A word or two, such as `more often` or `later`; empty if the figure is usual or cannot
-            be compared.
+        Empty if the figure is usual or cannot be compared.
         """
         value, baseline = figure.value(day), self.baseline(figure)
         if value is None or baseline is None or not day.comparable(figure.name):

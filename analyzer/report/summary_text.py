@@ -69,11 +69,8 @@ def gist_of_week(account: Account) -> Iterator[str]:
 def needing_look(account: Account) -> Iterator[str]:
     """Yield the times of loud or possibly worrying sounds that the model is not sure of.
 
-    Yields
-    ------
-    str
-        `Needs a look, 14:02 and 14:05: loud, and the model is not sure; it might be shouting.`
-        At most five times, the loud ones first.
+    `Needs a look, 14:02 and 14:05: loud, and the model is not sure; it might be shouting.` At most
+    five times, the loud ones first.
     """
     runs: list[list[DoubtfulSound]] = []
     for sound in sorted(account.doubts, key=lambda sound: sound.start):
@@ -93,13 +90,9 @@ def needing_look(account: Account) -> Iterator[str]:
 
 
 def not_recorded(account: Account) -> Iterator[str]:
-    """Yield sentences on missing coverage and its reasons.
+    """Yield a sentence or two on missing coverage, if any, and its reasons.
 
-    Yields
-    ------
-    str
-        A sentence or two, the total first, unless the headline has it; none with complete
-        coverage.
+    The total comes first, unless the headline has it.
     """
     length = sum(day.span.length for day in account.days)
     missing = length - sum(day.coverage.length for day in account.days)
@@ -130,11 +123,7 @@ def not_recorded(account: Account) -> Iterator[str]:
 def not_well(account: Account) -> Iterator[str]:
     """Yield the troubles reported by the recorder that gaps do not explain.
 
-    Yields
-    ------
-    str
-        An introduction, then a line for each kind of trouble, the longest first; nothing without
-        troubles.
+    If there are any, an introduction, then a line for each kind of trouble, the longest first.
     """
     reported = {gap.text for gap in account.gaps}
     troubles = [trouble for trouble in account.troubles if trouble.text not in reported]

@@ -41,40 +41,22 @@ class TimelineBlock(NamedTuple):
 
 
 class MarkPaths(NamedTuple):
-    """SVG paths in a box as wide as the steps of an axis, and 1 high.
+    """SVG paths in a box as wide as the steps of an axis, and 1 high."""
 
-    Attributes
-    ----------
-    long : str
-        Filled.
-    short : str
-        Upright lines, to be drawn three pixels wide: events too short to be seen otherwise.
-    many : str
-        Level lines through many short events, between which no screen has room; to be dashed.
-    """
-
-    long: str
-    short: str
-    many: str
+    long: str  # filled
+    short: str  # upright lines, three pixels wide: events too short to be seen otherwise
+    many: str  # level lines, dashed, through many short events that no screen can separate
 
 
 class TimelineLane(NamedTuple):
-    """Events of a class on a day, in steps of the axis.
-
-    Attributes
-    ----------
-    counted, uncounted : np.ndarray [shape=(n, 2)], float64
-        Start and end of the events: those that count, and those beside a television.
-    gaps : list of TimelineBlock
-        Time in which the class could not have been heard, though others could.
-    """
+    """Events of a class on a day, in steps of the axis."""
 
     name: str
     words: str
     colour: Colour
-    counted: Float64
-    uncounted: Float64
-    gaps: Sequence[TimelineBlock]
+    counted: Float64  # [shape=(n, 2)]; start and end of the events that count
+    uncounted: Float64  # [shape=(n, 2)]; of those beside a television
+    gaps: Sequence[TimelineBlock]  # time in which only other classes could be detected
 
     @property
     def empty(self) -> bool:
@@ -167,11 +149,8 @@ class DayTimeline(NamedTuple):
 def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimeline:
     """Return the timeline of a day.
 
-    Parameters
-    ----------
-    names : sequence of str, optional
-        Classes of the lanes, on an axis that is the day; by default all that can occur, but
-        silence, on that of `shown_span`.
+    The lanes are of the given classes, on an axis that is the day; by default of all that can
+    occur, but silence, on that of `shown_span`.
     """
     span = shown_span(day) if names is None else day.span
     if names is None:

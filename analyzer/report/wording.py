@@ -71,15 +71,7 @@ def clock_text(nanoseconds: int, zone: tzinfo) -> str:
 
 
 def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
-    """List times of day; long lists are cut, with the number of the rest.
-
-    Parameters
-    ----------
-    starts : np.ndarray [shape=(n,)], int64
-        In nanoseconds of UTC, in any order.
-    most : int, optional
-        Maximum number of listed times.
-    """
+    """List times of day (nanoseconds of UTC, any order), `most` of them, and how many more."""
     shown = [clock_text(start, zone) for start in np.sort(starts)[:most].tolist()]
     more = len(starts) - len(shown)
     return ", ".join(shown) + (f" and {more} more" if more else "")
