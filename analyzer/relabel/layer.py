@@ -69,13 +69,7 @@ class LayerMetadata(NamedTuple):
 
 
 def layer_topics(microphone: str, model: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
-    """Return the topics of a layer.
-
-    Parameters
-    ----------
-    classes : sequence of str
-        In the order of the model's probabilities.
-    """
+    """Return the topics of a layer; classes are in the order of the model's probabilities."""
     return label_topics(microphone, relabelling(model), classes)
 
 
@@ -204,28 +198,14 @@ _Labellers = dict[str, StreamLabeller]  # by microphone
 
 
 def label_logs(jobs: Sequence[Job]) -> list[UnfinishedLayer | None]:
-    """Write the labels of logs, and find their segments.
+    """Write the labels of consecutive logs of one chain, and find their segments.
 
-    The intact parts of a damaged log are labelled.
+    The intact parts of a damaged log are labelled. The labels are in the file `part` of a layer,
+    which the caller must delete. None if one of several logs failed; a single log raises its error.
 
-    Parameters
-    ----------
-    jobs : sequence of Job
-        Consecutive logs of one chain.
-
-    Returns
-    -------
-    list of UnfinishedLayer or None
-        One for each log. The labels are in the file `part` of a layer, which the caller must
-        delete. None if one of several logs failed; a single log raises its error.
-
-    Raises
-    ------
-    LogError
-        If the log has no features, or a feature set other than the model's; if the log has no
-        intact part; if the labels cannot be written.
-    ModelError
-        If the file of the model is missing or damaged, or holds another model.
+    Raise `LogError` if the log has no features, or a feature set other than the model's; if the log
+    has no intact part; if the labels cannot be written. Raise `ModelError` if the file of the model
+    is missing or damaged, or holds another model.
     """
     layers: list[UnfinishedLayer | None] = []
     labellers: _Labellers = {}
@@ -369,17 +349,9 @@ def _row_type(classes: int) -> np.dtype[np.void]:
 def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     """Append the segments to the labels and rename the file to the layer.
 
-    Parameters
-    ----------
-    labelled : UnfinishedLayer
-        Must not lack starts. Its file `part` is deleted once the layer is complete.
-
-    Raises
-    ------
-    LogError
-        If the layer cannot be written, or there is another one that may not be replaced.
-    ModelError
-        If the file of the model is missing or damaged, or holds another model.
+    The layer must not lack starts; its file `part` is deleted once it is complete. Raise `LogError`
+    if the layer cannot be written, or there is another one that may not be replaced; `ModelError`
+    if the file of the model is missing or damaged, or holds another model.
     """
     model, classifier = _loaded(job.model, job.model_sha256)
     metadata, smoothing = labelled.metadata, model.description.smoothing

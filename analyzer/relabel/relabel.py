@@ -61,24 +61,10 @@ def relabel(
     """Relabel logs into layers next to them; layers that are up to date are kept.
 
     The same logs and the same model give the same labels and segments, independent of the selection
-    of logs in one call and of the number of parallel tasks.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the finished share of the logs, 0 to 1.
-
-    Returns
-    -------
-    Relabelled
-        The result for each log; a failed log is recorded there, and does not stop others.
-
-    Raises
-    ------
-    LogError
-        If a log does not exist, or is a layer.
-    LostClusterError
-        If the workers' cluster is gone; completed layers stay.
+    of logs in one call and of the number of parallel tasks. A failed log is recorded in the result,
+    and does not stop others. `progress` receives the finished share of the logs, 0 to 1. Raise
+    `LogError` if a log does not exist, or is a layer; `LostClusterError` if the workers' cluster is
+    gone: completed layers stay.
     """
     chains = find_chains(paths)
     total = sum(len(chain.requested) for chain in chains)

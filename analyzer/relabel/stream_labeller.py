@@ -35,18 +35,10 @@ _LARGEST_STEP = NANOSECONDS // 5  # maximum jump of a sound card's time between 
 class StreamLabeller:
     """Labels the recording of one microphone, in time order.
 
-    Parameters
-    ----------
-    label_from : int
-        Time before which frames are not labelled, in nanoseconds of UTC; there only the noise
-        floor is tracked, which is much faster.
-    microphone : str
-        Its name; selects the array directions that the model supports.
-
-    Attributes
-    ----------
-    floor_converged : bool
-        Whether sound before the first frame would not affect later floors.
+    The name of the microphone selects the array directions that the model supports. Frames before
+    `label_from`, in nanoseconds of UTC, are not labelled; there only the noise floor is tracked,
+    which is much faster. `floor_converged` if sound before the first frame would not affect later
+    floors.
     """
 
     def __init__(
@@ -95,28 +87,16 @@ class StreamLabeller:
     def is_followed_by(self, frame: tuple[int, int]) -> bool:
         """Return whether a frame continues the sound: the next number, within 0.2 s of its time.
 
-        Parameters
-        ----------
-        frame : (int, int)
-            Number and start of the frame, in nanoseconds of UTC.
+        A frame is its number and its start in nanoseconds of UTC.
         """
         return frame[0] == self._next and abs(frame[1] - self._end) <= _LARGEST_STEP
 
     def push(self, event: Features | Gap) -> FrameLabels | None:
-        """Add features or a gap.
+        """Add features, at least one frame, or a gap, in time order; None for a gap.
 
-        Closed segments are added to `segments`. The open segment ends at a gap, and where
-        features are not contiguous.
-
-        Parameters
-        ----------
-        event : Features or Gap
-            At least one frame, in time order.
-
-        Returns
-        -------
-        FrameLabels or None
-            Of the frames at which a window is complete, possibly none; None for a gap.
+        The labels are of the frames at which a window is complete, possibly none. Closed segments
+        are added to `segments`. The open segment ends at a gap, and where features are not
+        contiguous.
         """
         if isinstance(event, Gap):
             self.close()
@@ -178,15 +158,10 @@ class UnreadableError(LogError):
 def infos_for_model(
     path: Path, model: Model, log: Path
 ) -> tuple[list[RecorderInfo], dict[str, str]]:
-    """Find the microphones of a log whose features the model supports.
+    """Find the microphones of a log, sorted by name, whose features the model supports.
 
-    Raise `LogError` if none has features of the model's set; an `UnreadableError` if the log is
-    damaged.
-
-    Returns
-    -------
-    infos : list of RecorderInfo
-        At least one, sorted by microphone name.
+    There is at least one. Raise `LogError` if none has features of the model's set; an
+    `UnreadableError` if the log is damaged.
     """
     infos = [info for info in _read_infos(path) if info.first_frame is not None]
     if not infos:
@@ -207,15 +182,10 @@ def infos_for_model(
 def read_sound(
     info: RecorderInfo, start: int, end: int = _NEVER, *, auxiliary: bool = False
 ) -> Iterator[Features | Gap]:
-    """Read the features and gaps of a log.
+    """Read the features and gaps of a log between log times (ns of UTC), the end excluded.
 
     Raise `UnreadableError` if it is damaged, or was not written by a recorder, or its feature set
     is not installed.
-
-    Parameters
-    ----------
-    start, end : int
-        Log times, in nanoseconds of UTC; `end` is excluded.
     """
     try:
         sound = read_recorded(info, start, end, sound_only=True, auxiliary=auxiliary)
@@ -231,14 +201,9 @@ def read_sound(
 
 
 def recover_copy(log: Path, folder: Path) -> tuple[Path, str]:
-    """Save the intact parts of a damaged log to a folder.
+    """Save the intact parts of a damaged log to a folder; return the unsaved parts as text, if any.
 
     Raise `LogError` if nothing can be saved, or the copy cannot be written.
-
-    Returns
-    -------
-    loss : str
-        The unsaved parts; empty if nothing is lost.
     """
     source, copy = log, folder / log.name
     if not is_local(log):
@@ -257,16 +222,9 @@ def warm_up(
 ) -> StreamLabeller:
     """Label as much of the sound before a log as its first labels depend on.
 
-    Parameters
-    ----------
-    states_only : bool
-        Whether converged states suffice: the open segment may then lack its beginning.
-
-    Returns
-    -------
-    StreamLabeller
-        Ready for the first frame of the log; without a past where the earlier logs do not lead up
-        to it.
+    With `states_only` converged states suffice: the open segment may then lack its beginning. The
+    labeller is ready for the first frame of the log; without a past where the earlier logs do not
+    lead up to it.
     """
     first, labels_back = info.first_frame, _WARM_UP
     floor_back = _FLOOR_WARM_UP if classifier.timing.needs_floor else labels_back
@@ -338,10 +296,7 @@ def _label_readable(
 def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> bool | None:
     """Return whether the sound of a log continues in the next log.
 
-    Returns
-    -------
-    bool or None
-        None while undecided: the next log is being written and has no frame.
+    None while undecided: the next log is being written and has no frame.
     """
     other = None
     with suppress(LogError):
@@ -352,37 +307,21 @@ def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> 
 
 
 class SpanLabels(NamedTuple):
-    """Labels of the frames of a span that are in a segment.
+    """Labels of the frames of a span that are in a segment."""
 
-    Attributes
-    ----------
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
-    classes : np.ndarray [shape=(n,)], intp
-        Class of the segment around each frame.
-    probabilities : np.ndarray [shape=(n, C)], float32
-    """
-
-    stamps: Int64
-    classes: Indices
-    probabilities: Float32
+    stamps: Int64  # [shape=(n,)]; starts in nanoseconds of UTC
+    classes: Indices  # [shape=(n,)]; of the segment around each frame
+    probabilities: Float32  # [shape=(n, C)]
 
 
 def label_span(
     info: RecorderInfo, classifiers: Sequence[Classifier], start: int, end: int
 ) -> list[SpanLabels]:
-    """Label a span of a log with each of several classifiers, reading the features once.
+    """Label a span, in nanoseconds of UTC, with several classifiers, reading the features once.
 
-    The labels are those of a recorder as far as 150 s of sound before the span, of which 5 s are
-    labelled, and 5 s after it decide them.
-
-    Raise `LogError` if the log is damaged, or was not written by a recorder, or its feature set is
-    not installed.
-
-    Parameters
-    ----------
-    start, end : int
-        Nanoseconds of UTC; `end` is excluded.
+    The end is excluded. The labels are those of a recorder as far as 150 s of sound before the
+    span, of which 5 s are labelled, and 5 s after it decide them. Raise `LogError` if the log is
+    damaged, or was not written by a recorder, or its feature set is not installed.
     """
     sound = list(read_sound(info, start - _FLOOR_WARM_UP, end + _SETTLING, auxiliary=True))
     label_from, microphone = start - _SETTLING, info.microphone
