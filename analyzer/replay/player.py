@@ -88,19 +88,10 @@ _LOST = "the log that was replayed does not have it"
 class Player:
     """Pushes recorded events to pipelines, one recorder run after the other.
 
-    Parameters
-    ----------
-    start : int
-        Log time before which messages are dropped, in nanoseconds of UTC.
-    progress : callable
-        Called with the time (nanoseconds of UTC) up to which frames were replayed.
-
-    Attributes
-    ----------
-    converged : bool
-        Whether frames before the first one would not affect the messages to come.
-    missing_before : bool
-        Whether frames before the first one were recorded, but are missing in the logs.
+    Messages before log time `start` are dropped; `progress` receives the time up to which frames
+    were replayed; both in nanoseconds of UTC. It is `converged` if frames before the first one
+    would not affect the messages to come, and `missing_before` if such frames were recorded, but
+    are missing in the logs.
     """
 
     def __init__(
@@ -128,15 +119,10 @@ class Player:
         self._uncompared: list[EncodedMessage] = []
 
     def open(self, info: RecorderInfo) -> None:
-        """Continue with another log; restart if it is of another recorder run.
+        """Continue with another log, unless it is open; restart if it is of another recorder run.
 
         Raise `LogError` if its feature set is not installed, or differs from the model's, or if the
         new log cannot be written.
-
-        Parameters
-        ----------
-        info : RecorderInfo
-            Of the log; a log that is already open changes nothing.
         """
         if info.path == self._opened:
             return
@@ -177,14 +163,10 @@ class Player:
         self._result.compared.add_segments(batch.segments, segments, end)
 
     def finish(self, *, cut: bool) -> None:
-        """Complete the log and the comparison.
+        """Complete the log and the comparison; raise `LogError` if the new log cannot be written.
 
-        Raise `LogError` if the new log cannot be written.
-
-        Parameters
-        ----------
-        cut : bool
-            Whether the recorded sound continues: the last segment then differs from the recording.
+        It is `cut` if the recorded sound continues: the last segment then differs from the
+        recording.
         """
         self._close()
         if not cut and self._options.kind == "features":

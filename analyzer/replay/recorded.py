@@ -54,18 +54,11 @@ _Known = TypeVar("_Known", Directions, Embeddings)
 
 
 class Features(NamedTuple):
-    """Features of successive frames, as input of `Pipeline.push_features`.
-
-    Attributes
-    ----------
-    values : np.ndarray [shape=(n, d)], float32
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
-    """
+    """Features of successive frames, as input of `Pipeline.push_features`."""
 
     first: int
-    values: Float32
-    stamps: Int64
+    values: Float32  # [shape=(n, d)]
+    stamps: Int64  # [shape=(n,)]; starts in nanoseconds of UTC
     auxiliary: Auxiliary = NO_AUXILIARY
 
     def part(self, frames: slice) -> "Features":
@@ -91,19 +84,11 @@ def read_recorded(
     sound_only: bool = False,
     auxiliary: bool = True,
 ) -> Iterator[RecordedBatch]:
-    """Read a log, one span of time after the other.
+    """Read a log, one span of time after the other, between log times (ns of UTC, end excluded).
 
-    Raise `LogError` if the log is damaged, or was not written by a recorder, or its feature set is
-    not installed.
-
-    Parameters
-    ----------
-    start, end : int
-        Log times, in nanoseconds of UTC; `end` is excluded.
-    sound_only : bool
-        Read only features and gaps, and verify their checksums.
-    auxiliary : bool
-        Read the directions of an array and the embeddings of a network, too.
+    With `sound_only` read only features and gaps, and verify their checksums; with `auxiliary` also
+    the directions of an array and the embeddings of a network. Raise `LogError` if the log is
+    damaged, or was not written by a recorder, or its feature set is not installed.
     """
     width = features_of(info).width
     kinds = _SOUND_TYPES if sound_only else _TYPES
@@ -279,14 +264,9 @@ class ReplayComparison:
     def add_labels(
         self, recorded: Sequence[RawMessages], replayed: Sequence[EncodedMessage], end: int
     ) -> None:
-        """Count the labels of one span of time.
+        """Count the labels of one span; the replay ended at `end`, in nanoseconds of UTC.
 
         Raise `LogError` if a recorded message does not have the type stated by its channel.
-
-        Parameters
-        ----------
-        end : int
-            Time at which the replay ended, in nanoseconds of UTC.
         """
         for absent, same in _by_version(recorded).items():
             old = {time: data for time, data in _recorded(same, absent) if time < end}
@@ -328,11 +308,8 @@ class ReplayComparison:
     def finish(self, *, cut: bool) -> None:
         """Count the recorded segments that were never replayed.
 
-        Parameters
-        ----------
-        cut : bool
-            Whether the replay was cut short: then they are not counted, since they might have been
-            replayed later.
+        If the replay was `cut` short they are not counted, since they might have been replayed
+        later.
         """
         if not cut:
             self.segments += len(self._unmatched)

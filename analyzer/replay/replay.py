@@ -28,19 +28,9 @@ _NEVER = (1 << 63) - 1
 class LogSet:
     """Logs of one microphone, in the order of their first messages.
 
-    Raise `LogError` if they hold no message, or one is damaged.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Layers and empty logs among them are skipped.
-    microphone : str or None
-        Name of the microphone; None if there is only one.
-
-    Attributes
-    ----------
-    first, last : int
-        Log times of the first and the last message, in nanoseconds of UTC.
+    Layers and empty logs among the paths are skipped; the name of the microphone is None if there
+    is only one. `first` and `last` are log times of messages, in nanoseconds of UTC. Raise
+    `LogError` if the logs hold no message, or one is damaged.
     """
 
     def __init__(self, paths: Sequence[Path], kind: str, microphone: str | None = None) -> None:
@@ -54,13 +44,9 @@ class LogSet:
         self._infos: dict[Path, list[RecorderInfo]] = {}
 
     def span(self, options: ReplayOptions) -> tuple[int, int]:
-        """Return the replayed span of time.
+        """Return the replayed span in log times (nanoseconds of UTC), the end excluded.
 
-        Returns
-        -------
-        start, end : int
-            Log times in nanoseconds of UTC; `end` is excluded, and is the largest 64-bit number
-            without a duration.
+        The end is the largest 64-bit number without a duration.
         """
         start = self.first + round(options.start_offset * NANOSECONDS)
         if options.duration is None:
@@ -68,14 +54,9 @@ class LogSet:
         return start, min(start + round(options.duration * NANOSECONDS), _NEVER)
 
     def chosen(self, options: ReplayOptions) -> list[RecorderInfo]:
-        """Return the logs to replay.
+        """Return the logs to replay, at least one, in the order of their first messages.
 
         Raise `LogError` if there is none, and as `between`.
-
-        Returns
-        -------
-        list of RecorderInfo
-            At least one, in the order of their first messages.
         """
         infos = self.between(*self.span(options))
         if not infos:
@@ -94,20 +75,11 @@ class LogSet:
         return LogError(f"no {what} to replay there; the logs last {seconds:.1f} s")
 
     def between(self, start: int, end: int) -> list[RecorderInfo]:
-        """Return the logs that have messages in a span of time.
+        """Return the logs with messages in a span, in the order of their first messages.
 
-        Raise `LogError` if they are of several microphones or nodes, or one is damaged or listed
-        twice.
-
-        Parameters
-        ----------
-        start, end : int
-            Log times, in nanoseconds of UTC; `end` is excluded.
-
-        Returns
-        -------
-        list of RecorderInfo
-            In the order of their first messages, without logs that lack the replayed kind.
+        Logs that lack the replayed kind are left out. The span has log times in nanoseconds of UTC,
+        the end excluded. Raise `LogError` if they are of several microphones or nodes, or one is
+        damaged or listed twice.
         """
         infos: list[RecorderInfo] = []
         for first, last, path in self._spans:
@@ -155,20 +127,9 @@ class ClipFramer:
         self._offsets: list[int] = []
 
     def add(self, start: int, rate: int, samples: Float32) -> Iterator[Frames | Gap]:
-        """Add a clip, and yield the completed frames and the gap before them.
+        """Add a clip by the time of its first sample (ns of UTC) and its samples per second.
 
-        Parameters
-        ----------
-        start : int
-            Time of its first sample, in nanoseconds of UTC.
-        rate : int
-            Samples per second.
-        samples : np.ndarray [shape=(n,)], float32
-
-        Yields
-        ------
-        Frames or Gap
-            In time order: the last frames before a hole, the gap, the frames of this clip.
+        Yield, in time order, the last frames before a hole, the gap, and the frames of this clip.
         """
         if rate != self._rate or abs(start - self._expected()) > _JOINED:
             yield from self.finish()
@@ -222,17 +183,9 @@ _LONGEST_NAME = 200
 
 
 def find_model(name: str, sha256: str, folders: Sequence[Path]) -> Model | None:
-    """Search folders for the model of a recording.
+    """Search folders for the model of a recording by its name: a file name without the suffix.
 
-    Parameters
-    ----------
-    name : str
-        Name of the model: its file name without the suffix.
-
-    Returns
-    -------
-    Model or None
-        None if no folder has it; unreadable files are skipped.
+    None if no folder has it; unreadable files are skipped.
     """
     for folder in folders:
         path = folder / (name + SUFFIX)
@@ -254,19 +207,10 @@ def replay(
 
     From features, the model of the recording gives its labels and segments bit for bit. If the
     replay starts later than the logs, the sound before it is processed as far as it affects the
-    result, without logging.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the replayed share, 0 to 1.
-
-    Raises
-    ------
-    LogError
-        If a log is damaged, or the logs are of several microphones, or of another feature set, or
-        hold nothing to replay, or if the new log cannot be written. The part replayed before the
-        error is a complete log.
+    result, without logging. `progress` receives the replayed share, 0 to 1. Raise `LogError` if a
+    log is damaged, or the logs are of several microphones, or of another feature set, or hold
+    nothing to replay, or if the new log cannot be written: the part replayed before the error is a
+    complete log.
     """
     start, end = logs.span(options)
     chosen = logs.chosen(options)
