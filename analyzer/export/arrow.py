@@ -67,16 +67,9 @@ def _is_binary(field: Field) -> bool:
 
 
 def batch_of(pieces: Sequence[TypedColumns], table: Table, schema: pa.Schema) -> pa.RecordBatch:
-    """Convert messages of one table to a record batch in log-time order.
+    """Convert messages of one table, at least one piece, to a record batch in log-time order.
 
-    Fields that a piece lacks are null.
-
-    Parameters
-    ----------
-    pieces : sequence of TypedColumns
-        At least one.
-    schema : pa.Schema
-        Result of `schema_of` for the table.
+    The schema is from `schema_of`; fields that a piece lacks are null.
     """
     batches = [
         pa.RecordBatch.from_arrays(
@@ -117,13 +110,9 @@ def head_arrays(columns: Columns) -> dict[str, pa.Array]:
 
 
 def array_of(values: NDArray[Any], field: Field) -> pa.Array:
-    """Convert a message column to an Arrow array.
+    """Convert a message column, in the format of `Columns`, to an Arrow array.
 
-    Parameters
-    ----------
-    values : np.ndarray [shape=(n, ...)]
-        Format of `Columns`: times as int64 nanoseconds; arrays as one row each, or as objects if
-        their lengths differ.
+    Times are int64 nanoseconds; arrays are one row each, or objects if their lengths differ.
     """
     kind = type_of(field)
     if not field.type:

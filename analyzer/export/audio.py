@@ -32,10 +32,7 @@ _FILE_LIMIT = 2 << 30  # bytes; the WAV limit is 4 GiB
 class WavFiles:
     """Writer of one topic's clips; consecutive clips without a gap share a file.
 
-    Parameters
-    ----------
-    name : callable
-        Returns the path of the file that begins at a given time (nanoseconds of UTC).
+    `name` returns the path of the file that begins at a given time (nanoseconds of UTC).
     """
 
     def __init__(self, name: Callable[[int], Path]) -> None:

@@ -322,15 +322,9 @@ class BagInPlace(NamedTuple):
 def describe_as_bag(folder: Path, progress: Progress = ignore_progress) -> BagInPlace:
     """Write or replace a `metadata.yaml` that makes one bag of all finished logs in a folder.
 
-    Layers are omitted: rosbag2 reads files one after the other.
-
-    Raise `LogError` if the folder or a finished log is missing, a log is damaged, a topic has
-    different types or qualities of service, or the file cannot be written.
-
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share, 0 to 1.
+    Layers are omitted: rosbag2 reads files one after the other. `progress` receives the completed
+    share, 0 to 1. Raise `LogError` if the folder or a finished log is missing, a log is damaged, a
+    topic has different types or qualities of service, or the file cannot be written.
     """
     if not (is_local(folder) and folder.is_dir()):
         raise LogError(f"{folder}: is no folder of this machine; name that of the logs")

@@ -46,15 +46,10 @@ class CsvFile:
         self._schema: pa.Schema | None = None
 
     def write(self, pieces: Sequence[TypedColumns]) -> None:
-        """Append messages.
+        """Append messages; the first call fixes the number of columns of each array.
 
         Raise `LogError` if a value has no column, or the names do not match the elements of an
         array.
-
-        Parameters
-        ----------
-        pieces : sequence of TypedColumns
-            Messages of the table. The first call fixes the number of columns of each array.
         """
         is_first = self._schema is None
         if is_first:

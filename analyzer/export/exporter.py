@@ -46,26 +46,14 @@ _NAMED = 8  # fields per line
 
 
 class Table(NamedTuple):
-    """Messages of one topic and type that fit one table, across definition changes.
-
-    Attributes
-    ----------
-    number : int
-        0 for the first table of its topic.
-    fields : mapping of str to Field
-        Union of the fields of all definitions, wide enough for each, by path.
-    definitions : sequence of mapping of str to Field
-        Fields of each definition.
-    channels : sequence of (Channel, Schema or None)
-        Channels with messages of this table.
-    """
+    """Messages of one topic and type that fit one table, across definition changes."""
 
     topic: str
     type: str
-    number: int
-    fields: Mapping[str, Field]
-    definitions: Sequence[Mapping[str, Field]]
-    channels: Sequence[Described]
+    number: int  # 0 for the first table of its topic
+    fields: Mapping[str, Field]  # by path: union of all definitions, wide enough for each
+    definitions: Sequence[Mapping[str, Field]]  # fields of each definition
+    channels: Sequence[Described]  # with messages of this table
 
     @property
     def optional(self) -> list[str]:
@@ -79,18 +67,10 @@ class Table(NamedTuple):
 
 
 def tables_of(topic: str, channels: Iterable[Described]) -> list[Table]:
-    """Divide the messages of a topic into tables.
+    """Divide the messages of a topic, with channels of readable definitions, into tables.
 
-    Parameters
-    ----------
-    channels : iterable of (Channel, Schema or None)
-        Channels of the topic with readable definitions.
-
-    Returns
-    -------
-    list of Table
-        One, unless the topic has several types, or a field's type changed so that no column
-        type holds all its values.
+    There is one, unless the topic has several types, or a field's type changed so that no column
+    type holds all its values.
     """
     groups: list[tuple[str, list[Mapping[str, Field]], list[Described]]] = []
     for channel, schema in channels:
@@ -132,15 +112,7 @@ def table_of(piece: TypedColumns, tables: Sequence[Table]) -> Table:
 
 
 def with_numbers(columns: Columns, table: Table, paths: Collection[str]) -> Columns:
-    """Select fields of messages, with numbers converted to the table's types.
-
-    Parameters
-    ----------
-    columns : Columns
-        Messages of the table that have these fields.
-    paths : collection of str
-        Field paths.
-    """
+    """Select fields of messages that have them, with numbers converted to the table's types."""
     fields: dict[str, NDArray[Any]] = {}
     for path in paths:
         fields[path] = columns[path]
@@ -190,10 +162,7 @@ def _why_apart(tables: Sequence[Table]) -> str:
 class OutputFiles:
     """Files of an export, under temporary names until all are written.
 
-    Parameters
-    ----------
-    path : Path
-        The single output file, which must not exist, or an empty folder.
+    The path is the single output file, which must not exist, or an empty folder.
     """
 
     def __init__(self, path: Path, output: Path, suffix: str) -> None:
@@ -210,12 +179,8 @@ class OutputFiles:
     def new(self, stem: str) -> Path:
         """Return the path of a new file in the folder, or of the single file.
 
-        Raise `LogError` if the single file already exists.
-
-        Parameters
-        ----------
-        stem : str
-            File name without suffix, in a folder; a number is added if the name is taken.
+        In a folder its name is `stem`, with a number if that is taken. Raise `LogError` if the
+        single file already exists.
         """
         path = self.path
         if path.is_dir():
@@ -277,19 +242,11 @@ def write_tables(
     opened: Callable[[Table], TableWriter],
     type_: str = "",
 ) -> None:
-    """Write the messages of each table with a separate writer.
+    """Write the messages of each table, by default of any type, with a separate writer.
 
     Topics that the format cannot hold are skipped with a warning, unless no topic is left.
-
-    Raise `LogError` if a log is damaged, if there is no message, or if the format can hold none of
-    them.
-
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share, 0 to 1.
-    type_ : str
-        The only message type that is written; empty for any.
+    `progress` receives the completed share, 0 to 1. Raise `LogError` if a log is damaged, if there
+    is no message, or if the format can hold none of them.
     """
     writing = _Writing(files, opened, type_)
     selection = selection.decodable()
@@ -432,13 +389,7 @@ def table_exporter(
     type_: str = "",
     fields: Collection[str] = (),
 ) -> Exporter:
-    """Return the exporter of a format with one stream per table.
-
-    Parameters
-    ----------
-    type_ : str
-        The only supported message type; empty for any.
-    """
+    """Return the exporter of a format, of one message type or any, with one stream per table."""
 
     def save(selection: LogSelection, files: OutputFiles, progress: Progress) -> None:
         def opened(table: Table) -> TableWriter:
@@ -479,16 +430,10 @@ def export(
 ) -> int:
     """Write messages in another format.
 
-    Raise `LogError` if a log is damaged, there is no message, the format cannot hold a message, or
-    the output cannot be written; no output is left then.
-
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share, 0 to 1.
-    folder : bool
-        Write a folder with one file per topic (WAV: per clip); otherwise a single file, of one
-        topic if the format is `by_topic`.
+    With `folder` write a folder with one file per topic (WAV: per clip); otherwise a single file,
+    of one topic if the format is `by_topic`. `progress` receives the completed share, 0 to 1. Raise
+    `LogError` if a log is damaged, there is no message, the format cannot hold a message, or the
+    output cannot be written; no output is left then.
     """
     new = new_folder if folder or format_.is_folder else new_file
     with new(output) as temporary:

@@ -43,22 +43,13 @@ _LENGTH = 100  # characters
 def file_stem(topic: str) -> str:
     """Return a file name part for a topic: `mic_features` for `/mic/features`.
 
-    Returns
-    -------
-    str
-        At most 100 letters, digits and `_`; `topic` if none remain.
+    It has at most 100 letters, digits and `_`, and is `topic` if none remain.
     """
     return re.sub(r"[^A-Za-z0-9]+", "_", topic).strip("_")[:_LENGTH] or "topic"
 
 
 def unused_name(name: str, taken: dict[str, int]) -> str:
-    """Return an unused name, with a number before the suffix if necessary.
-
-    Parameters
-    ----------
-    name : str
-        Preferred name; becomes `name-2.suffix` and so on.
-    """
+    """Return an unused name: the preferred one, or `name-2.suffix` and so on."""
     stem, dot, suffix = name.rpartition(".")
     before, behind = (stem, dot + suffix) if stem else (name, "")
     unused, number = name, taken.get(name, 2)

@@ -46,16 +46,9 @@ from hearthlog.schemas.salvage.intact_records import (
 def without_repeats(batch: Sequence[RawMessages]) -> list[RawMessages]:
     """Drop messages that another log already provides.
 
-    Parameters
-    ----------
-    batch : sequence of RawMessages
-        Holds either all messages of a log time or none.
-
-    Returns
-    -------
-    list of RawMessages
-        The first messages of equal topic, times, sequence and bytes: as many as one log has.
-        Equal messages within one log are not duplicates.
+    A batch holds either all messages of a log time or none. Of equal topic, times, sequence and
+    bytes, the first messages remain, as many as one log has: equal messages within one log are not
+    duplicates.
     """
     topics: dict[tuple[str, str, str], list[int]] = {}
     for place, messages in enumerate(batch):
@@ -145,32 +138,21 @@ def merge_logs(
     Channels of equal topic, definition and metadata become one. Metadata records and attachments
     are copied, equal ones once; the `rosbag2` record is rebuilt.
 
-    Raise `LogError` if a log is damaged, there is no message, there are more channels than a log
-    can have, or the output exists or cannot be written.
-
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share, 0 to 1.
-    latched : bool
-        Begin with the messages that a late subscriber would still receive: for each transient
-        local channel without expiry, the last messages before the span up to its depth, with the
-        log time of the first message in the span and their own publish times.
+    With `latched` begin with the messages that a late subscriber would still receive: for each
+    transient local channel without expiry, the last messages before the span up to its depth, with
+    the log time of the first message in the span and their own publish times. `progress` receives
+    the completed share, 0 to 1. Raise `LogError` if a log is damaged, there is no message, there
+    are more channels than a log can have, or the output exists or cannot be written.
     """
     with new_file(output) as temporary, temporary.open("xb") as stream:
         return write_log(selection, stream, output.name, progress, latched=latched).repeated
 
 
 class WrittenLog(NamedTuple):
-    """Result of writing a log.
+    """Result of writing a log."""
 
-    Attributes
-    ----------
-    record : mapping of str to str, or None
-        The `rosbag2` record; None, and no record in the log, if a topic has channels that
-        rosbag2 cannot distinguish, or no ROS 2 messages.
-    """
-
+    # `rosbag2` record; None, and not in the log, if a topic has channels that rosbag2 cannot
+    # distinguish, or no ROS 2 messages
     record: Mapping[str, str] | None
     repeated: int
 
@@ -505,16 +487,9 @@ def _at(time: int, messages: RawMessages) -> RawMessages:
 def held_count(channel: Channel) -> float:
     """Return how many past messages a late subscriber still receives, of any age.
 
-    Parameters
-    ----------
-    channel : Channel
-        Its metadata `offered_qos_profiles` has one profile per publisher. Volatile publishers
-        and publishers with expiring messages keep none; publishers of unknown depth keep ten.
-
-    Returns
-    -------
-    float
-        Infinite if a publisher keeps all; 0 for a channel without valid profiles.
+    The channel's metadata `offered_qos_profiles` has one profile per publisher; without valid ones
+    the count is 0. Volatile publishers and publishers with expiring messages keep none; publishers
+    of unknown depth keep ten. It is infinite if a publisher keeps all.
     """
     return sum(
         _held_by(profile)
@@ -540,10 +515,7 @@ def _held_by(profile: Mapping[str, Any]) -> float:
 def bag_metadata(channel: Channel) -> dict[str, str]:
     """Return the channel metadata of rosbag2, in the recorder's form.
 
-    Returns
-    -------
-    dict of str to str
-        `offered_qos_profiles`, as JSON, and `topic_type_hash`; empty strings if unset.
+    They are `offered_qos_profiles`, as JSON, and `topic_type_hash`; empty strings if unset.
     """
     return {
         "offered_qos_profiles": json.dumps(_profiles(channel), default=str),

@@ -32,13 +32,9 @@ class NpzFile:
 
     Stamps are datetime64[ns], durations timedelta64[ns]. Arrays of different lengths are
     concatenated, with their lengths in `<field>.lengths`; arrays of messages are JSON. Element
-    names from the channel are in `<field>_names`. An optional field holds only the values that
-    are present, with their rows in `<field>.rows`.
-
-    Parameters
-    ----------
-    sizes : Counter
-        Shared count of bytes in memory by table, with the total under None.
+    names from the channel are in `<field>_names`. An optional field holds only the values that are
+    present, with their rows in `<field>.rows`. `sizes` is the shared count of bytes in memory by
+    table, with the total under None.
     """
 
     def __init__(self, table: Table, files: OutputFiles, sizes: "Counter[NpzFile | None]") -> None:

@@ -85,15 +85,10 @@ def quoted(text: str) -> str:
 
 
 def json_texts(values: NDArray[Any], field: Field) -> list[str]:
-    """Return the JSON of every value of a column, one text per row.
+    """Return the JSON of every value of a column, in the format of `Columns`, one text per row.
 
-    Times are seconds with nine decimals, bytes are base64, and non-finite values are null.
-
-    Parameters
-    ----------
-    values : np.ndarray [shape=(n, ...)]
-        Format of `Columns`: times as int64 nanoseconds; arrays as one row each, or as objects if
-        their lengths differ.
+    Times are seconds with nine decimals, bytes are base64, and non-finite values are null. Times of
+    a column are int64 nanoseconds; arrays are one row each, or objects if their lengths differ.
     """
     if field.size is None and field.type in {TIME, DURATION}:
         return _seconds(values)
