@@ -35,19 +35,11 @@ SEVERAL = "several sounds at once"
 
 
 class Decision(NamedTuple):
-    """Label of simultaneous categories in a manifest.
+    """Label of simultaneous categories in a manifest."""
 
-    Attributes
-    ----------
-    label : str
-        Empty if skipped.
-    reason : str
-        Reason for skipping; empty otherwise.
-    """
-
-    label: str
+    label: str  # empty if skipped
     detail: str
-    reason: str = ""
+    reason: str = ""  # for skipping
 
 
 @dataclass(frozen=True)
@@ -162,16 +154,11 @@ class LabelledPart(NamedTuple):
 def labelled_parts(
     sounds: Sequence[CategorySpan], seconds: float, label_map: LabelMap
 ) -> tuple[list[LabelledPart], Counter[tuple[str, str]]]:
-    """Return the parts of a file with a single label.
+    """Return the parts of a file, of infinite seconds if unknown, with a single label.
 
     A sound shorter than a second is extended evenly to one second. Sounds that overlap a sound of
     another label, or of a label that the map skips, are dropped; overlapping sounds of the same
     label are merged.
-
-    Parameters
-    ----------
-    seconds : float
-        Length of the file; infinite if unknown.
     """
     decided = [(sound, label_map.decide(sound.categories)) for sound in sounds]
     specific = [(sound, what) for sound, what in decided if what.reason != BROAD]
@@ -239,13 +226,7 @@ _NOT_UTF_8 = "its name is not UTF-8"
 
 @dataclass
 class ManifestSummary:
-    """Counts of the clips in a manifest, and of skipped ones.
-
-    Attributes
-    ----------
-    files, missing : int
-        Number of listed files, and of missing ones.
-    """
+    """Counts of the clips in a manifest, and of skipped ones."""
 
     clips: Counter[str] = field(default_factory=Counter)
     groups: dict[str, set[str]] = field(default_factory=dict)
@@ -253,8 +234,8 @@ class ManifestSummary:
     negatives: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
     skipped: Counter[str] = field(default_factory=Counter)
-    files: int = 0
-    missing: int = 0
+    files: int = 0  # listed
+    missing: int = 0  # of the listed files
     first_missing: Path | None = None
 
 
@@ -267,25 +248,14 @@ def make_manifest(  # noqa: PLR0913, PLR0917
     source: str = "",
     licence: str = "",
 ) -> ManifestSummary:
-    """Write a manifest of a collection.
+    """Write a manifest, which must not exist, of a collection, with paths relative to its folder.
 
-    Parameters
-    ----------
-    output : Path
-        The manifest; must not exist. Paths in it are relative to its folder.
-    progress : callable
-        Receives the completed share of the files, 0 to 1.
-    source, licence : str
-        For your own folder; an empty source becomes the name of the folder.
+    Source and licence are for your own folder; an empty source becomes the name of the folder.
+    `progress` receives the completed share of the files, 0 to 1.
 
-    Raises
-    ------
-    DataError
-        If the folder is not of this collection, a table of it or the map cannot be read, nothing
-        is left for the manifest, or it would be too large; if source or licence is no line of at
-        most 300 characters.
-    LogError
-        If the manifest exists, or cannot be written.
+    Raise `DataError` if the folder is not of this collection, a table of it or the map cannot be
+    read, nothing is left for the manifest, or it would be too large; if source or licence is no
+    line of at most 300 characters; `LogError` if the manifest exists, or cannot be written.
     """
     check_folder(folder, collection)
     folder = folder.resolve()

@@ -16,29 +16,18 @@ from hearthlog.schemas.files import read_limited
 
 
 class CategorySpan(NamedTuple):
-    """Category of a file, or of a part of it.
-
-    Attributes
-    ----------
-    start, end : float
-        Seconds; an infinite `end` is the end of the file.
-    """
+    """Category of a file, or of a part of it."""
 
     categories: tuple[str, ...]
-    start: float = 0.0
-    end: float = math.inf
+    start: float = 0.0  # in seconds
+    end: float = math.inf  # infinite for the end of the file
 
 
 class CollectionClip(NamedTuple):
     """An audio file of a collection.
 
-    Attributes
-    ----------
-    source_group : str
-        The original recording or speaker, with a prefix for the origin of its number: groups of
-        two collections are the same only if their recordings are.
-    left_out : str
-        Reason for skipping the clip; empty otherwise.
+    Groups of two collections are the same only if their recordings are: `source_group` is the
+    original recording or speaker, with a prefix for the origin of its number.
     """
 
     path: Path
@@ -46,7 +35,7 @@ class CollectionClip(NamedTuple):
     source_group: str
     licence: str
     seconds: float = math.inf
-    left_out: str = ""
+    left_out: str = ""  # reason for skipping the clip
 
 
 _TABLE_LIMIT = 128 << 20  # the largest, of AudioSet, has 50 MB
@@ -60,11 +49,6 @@ def read_table(
 
     Raise `DataError` if the file cannot be read, is larger than 128 MB, is no such table, lacks one
     of the columns, or has a line that ends before them.
-
-    Parameters
-    ----------
-    delimiter : str
-        Field separator.
     """
     lines = csv_records(path, read_text(path, "table", _TABLE_LIMIT), delimiter)
     number, header = next(lines, (1, []))
@@ -239,10 +223,7 @@ def _fsd50k_about(clip: object) -> tuple[str, str]:
 def short_licence(address: str) -> str:
     """Return the short name of a Creative Commons licence; `unstated` for others.
 
-    Parameters
-    ----------
-    address : str
-        As `http://creativecommons.org/licenses/by/3.0/`.
+    An address is as `http://creativecommons.org/licenses/by/3.0/`.
     """
     if _PUBLIC_DOMAIN.fullmatch(address):
         return "CC0"
@@ -524,18 +505,11 @@ def _no_audio(path: Path) -> str:
 
 
 class CollectionFormat(NamedTuple):
-    """A collection.
-
-    Attributes
-    ----------
-    markers : tuple of str
-        Files, folders or patterns; every folder of the collection has at least one of them;
-        empty for any folder.
-    """
+    """A collection; every folder of it has at least one of the markers, if there are any."""
 
     name: str
     title: str
-    markers: tuple[str, ...]
+    markers: tuple[str, ...]  # files, folders or patterns; empty for any folder
     read: Callable[[Path], Iterator[CollectionClip]]
 
 
