@@ -28,19 +28,12 @@ _PALE: Colour = (23, 190, 207)  # for white, which a white page does not show
 
 
 class LaidOutMicrophone(NamedTuple):
-    """A microphone in a layout.
-
-    Attributes
-    ----------
-    classes : list of (str, int)
-        Classes to show, in the order of all displays, each with its place in `probabilities`.
-    energy : int or None
-        Place of the energy in the features.
-    """
+    """A microphone in a layout."""
 
     name: str
+    # in the order of all displays, each with its place in `probabilities`
     classes: list[tuple[str, int]]
-    energy: int | None
+    energy: int | None  # its place in the features
 
     @property
     def title(self) -> str:

@@ -90,14 +90,9 @@ Damaged = Callable[[LogError], None]
 
 
 class RecordedSpan:
-    """Messages of some logs between two times.
+    """Messages of logs between two times in ns of UTC, the end excluded; None for no limit.
 
     Raise `DataError` if there is no message between the two times.
-
-    Parameters
-    ----------
-    start, end : int or None
-        Nanoseconds of UTC; `end` is excluded; None for no limit.
     """
 
     def __init__(
@@ -135,13 +130,7 @@ class RecordedSpan:
             self._damaged(error)
 
     def messages(self, start: int) -> Generator[list[RawMessages], None, None]:
-        """Read the messages from a moment on.
-
-        Yields
-        ------
-        list of RawMessages
-            Messages of the next span of time; none is older than any yielded before.
-        """
+        """Read the messages from a moment on; none is older than any yielded before."""
         while start < self.end:
             end = min(start + _WINDOW, self.end)
             yield from self._between(start, end)
@@ -152,11 +141,8 @@ class RecordedSpan:
     def before(self, moment: int) -> list[tuple[RawMessages, int]]:
         """Read the state at a moment.
 
-        Returns
-        -------
-        list of (RawMessages, int)
-            The last description of each stream in the logs that contain the moment, and the last
-            message of each topic in the second before, with their places.
+        It is the last description of each stream in the logs that contain the moment, and the last
+        message of each topic in the second before, with their places.
         """
         known: dict[str, tuple[RawMessages, int]] = {}
         topics = {
@@ -203,13 +189,7 @@ _HEARD = ("", AUDIO_LAYER)  # layers of current sound; the others are about earl
 
 
 def publish_live(folder: Path, publisher: Publisher, stop: Event, damaged: Damaged) -> None:
-    """Publish new messages of the logs in a folder.
-
-    Parameters
-    ----------
-    damaged : callable
-        Called with the error of a log that can no longer be read.
-    """
+    """Publish new messages of the logs in a folder; `damaged` gets errors of unreadable logs."""
     known: set[Path] = set()
     for path, parts in follow_messages(folder, stop=stop, damaged=damaged, infos=True):
         if log_name(path).layer in _HEARD:

@@ -50,13 +50,9 @@ class Admission:
 
     A page in a browser can connect to every server of this machine. The token blocks clients that
     do not know the address, the origin blocks other pages that learned it, and the host blocks
-    pages with a domain name that resolves to this machine.
-
-    Attributes
-    ----------
-    origins : frozenset of str
-        Allowed pages, as `https://lichtblick.example`, in addition to Foxglove's own and to local
-        pages. A client that is no page sends no origin, and needs only the token.
+    pages with a domain name that resolves to this machine. `origins` are allowed pages, as
+    `https://lichtblick.example`, in addition to Foxglove's own and to local pages. A client that is
+    no page sends no origin, and needs only the token.
     """
 
     bind: str
@@ -64,19 +60,10 @@ class Admission:
     origins: frozenset[str] = frozenset()
 
     def check(self, head: bytes) -> bytes:
-        """Check a request.
+        """Check a request up to and including the empty line.
 
-        Raise `RefusedError` if the client is not allowed.
-
-        Parameters
-        ----------
-        head : bytes
-            Up to and including the empty line.
-
-        Returns
-        -------
-        bytes
-            Head of the request for the server behind the gate, without unneeded fields.
+        Return its head for the server behind the gate, without unneeded fields. Raise
+        `RefusedError` if the client is not allowed.
         """
         target, fields = _parse(head)
         origin = fields.get("origin")
