@@ -132,13 +132,9 @@ class Cluster:
         return max(sum(self._threads.values()), 1)
 
     def submit(self, function: Callable[P, T], *args: P.args, **_: P.kwargs) -> Future[T]:
-        """Run a function on any worker of the cluster.
+        """Run a function on any worker of the cluster; its arguments can be pickled.
 
-        Parameters
-        ----------
-        *args
-            Arguments of the function, which can be pickled. A large array shared by several tasks
-            is sent once, and must not change.
+        A large array shared by several tasks is sent once, and must not change.
         """
         future = self._in_loop(self._until_lost(self._run(function, args)))
         self._open.add(future)

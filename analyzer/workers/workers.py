@@ -41,13 +41,8 @@ T = TypeVar("T")
 class Processes:
     """Local processes, each with a thread in this process that sends it one task after the other.
 
-    Parameters
-    ----------
-    count : int
-        Number of processes, at least 1.
-    module : str, optional
-        Name of the module of the tasks. The processes start and import it at once; without it each
-        process starts with its first task.
+    The count is at least 1. The processes import the module of the tasks at once; without it each
+    process starts with its first task.
     """
 
     def __init__(self, count: int, module: str | None = None) -> None:
@@ -238,17 +233,10 @@ def open_workers(
 ) -> Iterator[Workers]:
     """Open workers; unfinished tasks are given up when the block ends.
 
-    Raise `WorkerError` if Dask is not installed, the scheduler does not exist, it has no workers,
-    or a worker has another version.
-
-    Parameters
-    ----------
-    count : int
-        Number of processes, at least 1; with 1 each task runs in this process, when it is
-        submitted.
-    module : str, optional
-        Name of the module of the tasks: processes start and import it at once, not with the first
-        task.
+    The number of processes is at least 1; with 1 each task runs in this process, when it is
+    submitted. Processes import the module of the tasks at once, not with the first task. Raise
+    `WorkerError` if Dask is not installed, the scheduler does not exist, it has no workers, or a
+    worker has another version.
     """
     if scheduler is not None:
         with connected(scheduler) as cluster:
@@ -306,15 +294,8 @@ def _on(cluster: Cluster, calls: Iterable[Any]) -> Iterator[Any]:
 def fits_on(scheduler: str | None) -> Iterator[None]:
     """Run the calls of `in_parallel` in this block on a Dask cluster, if one is given.
 
-    Parameters
-    ----------
-    scheduler : str or None
-        Address of the scheduler, as `tcp://host:port`; None changes nothing.
-
-    Raises
-    ------
-    WorkerError
-        As `connected` does, and if the cluster goes away or a fit kills its workers.
+    Its address is as `tcp://host:port`. Raise `WorkerError` as `connected` does, and if the cluster
+    goes away or a fit kills its workers.
     """
     if scheduler is None:
         yield
@@ -372,13 +353,9 @@ single_thread = _SingleThread()  # a sum depends on how many threads share it
 
 
 def kernel_in_use() -> str:
-    """Return the BLAS library and kernel of this process.
+    """Return the BLAS library and kernel of this process, such as "openblas SkylakeX".
 
-    Returns
-    -------
-    str
-        Such as "openblas SkylakeX"; empty for a library other than OpenBLAS, or without
-        threadpoolctl.
+    Empty for a library other than OpenBLAS, or without threadpoolctl.
     """
     try:
         from threadpoolctl import threadpool_info  # noqa: PLC0415  part of the extra `headless`
