@@ -51,10 +51,7 @@ _TYPE_NAME = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,2}")
 class CheckedDefinitions(Definitions):
     """Schemas and channels defined so far, each checked when added.
 
-    Parameters
-    ----------
-    ours : bool
-        Whether hearthlog wrote the file: violations of its profile are then errors, not warnings.
+    In a file of hearthlog, `ours`, violations of its profile are errors, not warnings.
     """
 
     def __init__(self, findings: Findings, *, ours: bool) -> None:
@@ -68,12 +65,8 @@ class CheckedDefinitions(Definitions):
     def read(self, opcode: int, offset: int, content: bytes) -> int | None:
         """Read and check a schema or a channel; return the number of a new channel.
 
-        Only the first definition of each number is kept.
-
-        Parameters
-        ----------
-        offset : int
-            Byte of the file at which the record, or its chunk, begins.
+        Only the first definition of each number is kept. The record, or its chunk, begins at byte
+        `offset`.
         """
         record = parse_strictly(self._findings, opcode, offset, content)
         if isinstance(record, Schema):
@@ -147,21 +140,11 @@ BATCH_SIZE = 4 << 20  # bytes
 
 
 class MessageBatch(NamedTuple):
-    """Some messages, still encoded.
+    """Some messages, still encoded."""
 
-    Attributes
-    ----------
-    records : bytes
-        Their records, and others.
-    starts : np.ndarray [shape=(n,)], int64
-        Bytes in `records` at which messages begin, ascending.
-    heads : np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
-        Heads of these messages.
-    """
-
-    records: bytes
-    starts: Int64
-    heads: NDArray[np.void]
+    records: bytes  # of the messages, and others
+    starts: Int64  # [shape=(n,)]; bytes in `records` at which messages begin, ascending
+    heads: NDArray[np.void]  # [shape=(n,)], of dtype `MESSAGE_HEAD`
 
     def by_channel(
         self, channels: Mapping[int, Channel], schemas: Mapping[int, Schema]
@@ -180,10 +163,7 @@ class MessageBatch(NamedTuple):
 def batches(chunks: Sequence[MessageBatch]) -> Iterator[MessageBatch]:
     """Yield the messages of some chunks in batches of a few megabytes, whatever the chunk size.
 
-    Parameters
-    ----------
-    chunks : sequence of MessageBatch
-        At least one.
+    There is at least one chunk.
     """
     firsts = np.cumsum([0, *(len(chunk.records) for chunk in chunks[:-1])]).tolist()
     records = b"".join(chunk.records for chunk in chunks)
@@ -257,13 +237,7 @@ class Chunk:
                 self._index_offsets.append((channel, record.offset))
 
     def check(self, *, cut: bool) -> None:
-        """Check the records of the chunk, its times and its message indexes.
-
-        Parameters
-        ----------
-        cut : bool
-            Whether message indexes may be missing after the chunk: they are then not compared.
-        """
+        """Check the records of the chunk, its times and its message indexes, unless cut off."""
         if not self.is_complete:
             return
         entries = np.frombuffer(b"".join(self._indexes.values()), INDEX_ENTRIES)
@@ -274,13 +248,7 @@ class Chunk:
                 self._check_index(self.content)
 
     def index_content(self) -> bytes | None:
-        """Return the expected chunk index, without opcode and length.
-
-        Returns
-        -------
-        bytes or None
-            None if the head of the chunk cannot be read.
-        """
+        """Return the expected chunk index, without opcode and length, if the head can be read."""
         if self._head is None:
             return None
         head = self._head
@@ -355,12 +323,9 @@ class Chunk:
 
 
 class RecordBudget:
-    """Limit of the records inside chunks that are walked one by one in a file.
+    """Limit of the records inside chunks that are walked one by one in a file of `size` bytes.
 
-    Parameters
-    ----------
-    size : int
-        Bytes of the file; limits the records that a small file can claim.
+    The size limits the records that a small file can claim.
     """
 
     def __init__(self, size: int) -> None:
@@ -368,19 +333,10 @@ class RecordBudget:
 
 
 def _split(records: bytes, hints: Int64, budget: RecordBudget) -> tuple[Int64, Int64, int]:
-    """Find the records of a chunk.
+    """Return starts of messages, of other or too short records, and the end of the last record.
 
-    Parameters
-    ----------
-    hints : np.ndarray [shape=(n,)], int64
-        Starts of messages according to the index, ascending; not trusted.
-
-    Returns
-    -------
-    starts, others : np.ndarray [shape=(m,)], int64
-        Starts of messages; starts of other records and of messages that are too short.
-    end : int
-        End of the last record; less than the length of the chunk if a record is damaged.
+    The end is less than the length of the chunk if a record is damaged. `hints` are starts of
+    messages according to the index, ascending; not trusted.
     """
     if len(hints) and hints[0] >= 0 and hints[-1] <= len(records) - MESSAGE_HEAD.itemsize:
         heads = gather_heads(records, hints)
@@ -426,12 +382,8 @@ def check_channels(
 ) -> None:
     """Report messages with an undefined channel, or a channel defined after them.
 
-    Parameters
-    ----------
-    new : dict of int to int
-        Byte of the definition, by channel defined in these records.
-    offset : int
-        Byte of the file at which the chunk, or the first of the messages, begins.
+    `new` has the byte of the definition, by channel defined in these records; `offset` is the byte
+    of the file at which the chunk, or the first of the messages, begins.
     """
     numbers = content.heads["channel"]
     for channel in np.flatnonzero(np.bincount(numbers)).tolist():

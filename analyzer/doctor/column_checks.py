@@ -50,13 +50,10 @@ SHARED = {DIAGNOSTICS: message_types.DIAGNOSTICS, ROSOUT: message_types.LOG}
 
 
 def split_topic(topic: str) -> tuple[str, str]:
-    """Split a topic of a recorder into microphone and kind.
+    """Split a topic of a recorder into microphone and kind, such as `mic` and `features`.
 
-    Returns
-    -------
-    microphone, kind : str
-        Such as `mic` and `features`; `BESIDE_LABEL` or `BESIDE_SEGMENT` for a candidate or a
-        scenario; an empty text and the complete topic for other topics.
+    The kind is `BESIDE_LABEL` or `BESIDE_SEGMENT` for a candidate or a scenario; an empty text and
+    the complete topic are returned for other topics.
     """
     name = parse_topic(topic)
     if name is None:
@@ -99,13 +96,7 @@ class ColumnChecks:
         self._topic = columns.topic
 
     def check_stamps(self, kind: str, microphone: str, *, named: bool) -> None:
-        """Compare log times with stamps, and `frame_id` with the microphone.
-
-        Parameters
-        ----------
-        microphone : str
-            Name; empty for a topic without a microphone.
-        """
+        """Compare log times with stamps, and `frame_id` with the microphone, if any."""
         columns = self._columns
         stamps = columns["stamp" if kind == ROSOUT else STAMP]
         if kind in {SEGMENT, BESIDE_SEGMENT, GAP}:
@@ -128,10 +119,8 @@ class ColumnChecks:
     def check_content(self, kind: str, info: Mapping[str, Any] | None) -> None:
         """Check the values of the messages of a kind.
 
-        Parameters
-        ----------
-        info : mapping or None
-            `AudioStreamInfo` of the microphone, with the classes and the names of the features.
+        `info` is the `AudioStreamInfo` of the microphone, with the classes and the names of the
+        features.
         """
         classes = None if info is None else list(info["labels"])
         if kind in _ARRAYS and info is not None:

@@ -59,10 +59,7 @@ class ExaminedFile:
 def examine_file(path: Path, progress: Progress = ignore_progress) -> ExaminedFile:
     """Check one file against the MCAP specification and, if it is ours, docs/log.md.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the share of the bytes that is done, 0 to 1.
+    `progress` receives the share of the bytes that is done, 0 to 1.
     """
     examined = ExaminedFile(Findings(path))
     try:
@@ -276,12 +273,9 @@ def check_leftovers(folder: Path) -> Iterator[Findings]:
 
 
 def check_series(files: Sequence[ExaminedFile]) -> None:
-    """Compare the logs of each node of a home with each other, and add to their findings.
+    """Compare the logs of each node of a home, in any order, and add to their findings.
 
-    Parameters
-    ----------
-    files : sequence of ExaminedFile
-        In any order; files that are not ours, or have no messages, are skipped.
+    Files that are not ours, or have no messages, are skipped.
     """
     homes = {home for file in files if (home := _folder_of_days(file.findings.path)) is not None}
     nodes: dict[tuple[Path | None, str], list[ExaminedFile]] = {}
@@ -407,21 +401,10 @@ def examine(
 ) -> list[Findings]:
     """Check logs, or all logs of folders and their sequence.
 
-    Raise `LogError` if there is neither a log nor a leftover file.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the share of the bytes that is done, 0 to 1.
-    missing : list of str, optional
-        Receives the errors of paths without a log, if there are several paths; the others are
-        checked.
-
-    Returns
-    -------
-    list of Findings
-        One for each log, in the order of the paths, intact ones too; then one for each file left
-        by a killed recorder or command.
+    There is one result for each log, in the order of the paths, intact ones too; then one for each
+    file left by a killed recorder or command. Of several paths, `missing` receives the errors of
+    those without a log, and the others are checked. `progress` receives the share of the bytes that
+    is done, 0 to 1. Raise `LogError` if there is neither a log nor a leftover file.
     """
     paths = [paths] if isinstance(paths, Path) else paths
     logs: dict[Path, Path] = {}

@@ -62,14 +62,8 @@ class Findings:
     ) -> None:
         """Add a violation of the MCAP specification or of docs/log.md.
 
-        Parameters
-        ----------
-        advice : str
-            What to do; empty if `what` is sufficient.
-        offset : int, optional
-            Byte of the file at which the record begins.
-        time : int, optional
-            Log time in nanoseconds of UTC.
+        The advice on what to do is empty if `what` is sufficient. `offset` is the byte of the file
+        at which the record begins, `time` a log time in nanoseconds of UTC.
         """
         self._add(Finding(self.path, "error", rule, what, advice, offset, time))
 
@@ -95,16 +89,10 @@ class Findings:
         *,
         advice: str = DISTRUST,
     ) -> None:
-        """Add the rows of a column that violate a rule.
+        """Add the rows [shape=(n,)] of a column that violate a rule; times are nanoseconds of UTC.
 
-        Parameters
-        ----------
-        wrong : np.ndarray [shape=(n,)], bool
-            Which rows violate it.
-        times : np.ndarray [shape=(n,)], int64
-            Log times in nanoseconds of UTC.
-        what : callable
-            Returns the text of a finding for a row number, from 0; called for the first five rows.
+        `what` returns the text of a finding for a row number, from 0; it is called for the first
+        five rows.
         """
         places = np.flatnonzero(wrong)
         advice = advice if level == "error" else ""

@@ -34,12 +34,8 @@ class FrameSequence:
     """Checks of one microphone's messages throughout a file.
 
     Messages are added as rows of three numbers: log time, frame and stamp; for segments log time,
-    start and end; for gaps log time (their end), start, and number of lost frames.
-
-    Parameters
-    ----------
-    timing : LabelTiming or None
-        Timing of the labels; None if there are no labels or it is unknown.
+    start and end; for gaps log time (their end), start, and number of lost frames. The timing of
+    the labels is None if there are no labels or it is unknown.
     """
 
     def __init__(
@@ -82,14 +78,9 @@ class FrameSequence:
         self._pending.setdefault(kind, []).append(rows)
 
     def add_damages(self, gaps: Int64) -> None:
-        """Mark gaps, added before or now, as losses of a damaged log.
+        """Mark gaps (rows as for `add`), added before or now, as losses of a damaged log.
 
         The sound itself has no gap there: labels continue, and segments extend across it.
-
-        Parameters
-        ----------
-        gaps : np.ndarray [shape=(n, 3)], int64
-            As for `add`.
         """
         self._damages = np.concatenate([self._damages, gaps])
 
@@ -116,12 +107,9 @@ class FrameSequence:
         self._check_segments(self._take(SEGMENT, None))
 
     def settle(self, until: int | None) -> None:
-        """Check all messages before a log time; no more messages of that time may follow.
+        """Check all messages before a log time (nanoseconds of UTC), or all for None.
 
-        Parameters
-        ----------
-        until : int or None
-            Nanoseconds of UTC; None for all added messages.
+        No more messages of that time may follow.
         """
         kinds = FEATURES, STATISTICS, DIRECTION, EMBEDDING, LABEL, SEGMENT, GAP
         features, statistics, directions, embeddings, labels, segments, gaps = (
@@ -201,13 +189,9 @@ class FrameSequence:
     def _check_steps(self, rows: Int64, has_previous: NDArray[np.bool_], steps: Int64) -> None:
         """Check that frame numbers and stamps are continuous, and that gaps explain every jump.
 
-        Parameters
-        ----------
-        has_previous : np.ndarray [shape=(n,)], bool
-            Whether the previous frame was read.
-        steps : np.ndarray [shape=(4, n)], int64
-            Increments of the frame number and of the stamp (ns), number of gaps since the previous
-            frame, and frames lost in them.
+        `steps` [shape=(4, n)] are increments of the frame number and of the stamp (ns), number of
+        gaps since the previous frame, and frames lost in them; `has_previous` if that frame was
+        read.
         """
         numbers, elapsed, gaps, lost = steps
         times, frames, _ = rows.T

@@ -240,13 +240,7 @@ class MessageChecks:
 
 
 def statistics_every(data: DataSection) -> int | None:
-    """Read the interval of statistics from the configuration in a file.
-
-    Returns
-    -------
-    int or None
-        Frames between messages of statistics; None if the file does not state it.
-    """
+    """Read the interval of statistics, in frames, from the configuration in a file, if stated."""
     try:
         configuration = json.loads(data.attachments["configuration.json"][0])
         every = configuration["statistics_every"]
@@ -317,10 +311,7 @@ _CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS = ("configuration.json", CARD,
 class MetadataChecks:
     """Checks of metadata and counts, after the complete file was read.
 
-    Parameters
-    ----------
-    is_readable : bool
-        Whether the complete file was readable: counts are compared only then.
+    Counts are compared only if the complete file was readable.
     """
 
     def __init__(

@@ -33,19 +33,10 @@ class Record(NamedTuple):
 def parse_strictly(
     findings: Findings, opcode: int, offset: int, content: bytes
 ) -> McapRecord | None:
-    """Parse a record, and report a damaged or too large one.
+    """Parse the record at byte `offset` (or that of its chunk); report a damaged or too large one.
 
-    A record is damaged if it is too short, has invalid UTF-8, or repeats a key of a map.
-
-    Parameters
-    ----------
-    offset : int
-        Byte of the file at which the record, or its chunk, begins.
-
-    Returns
-    -------
-    McapRecord or None
-        None if the record cannot be parsed, is too large for hearthlog, or is of an unknown kind.
+    A record is damaged if it is too short, has invalid UTF-8, or repeats a key of a map. None if
+    the record cannot be parsed, is too large for hearthlog, or is of an unknown kind.
     """
     if len(content) > _SIZE_LIMIT and opcode != Opcode.ATTACHMENT:
         what = f"{name_of(opcode)} of {len(content)} bytes is larger than hearthlog reads"
@@ -75,11 +66,8 @@ def name_of(opcode: int) -> str:
 class RecordWalk:
     """All records of a file, up to its size when opened, except those inside chunks.
 
-    Parameters
-    ----------
-    offsets : sequence of int
-        Bytes at which records begin, ascending, from the index of the file: the walk resumes
-        there after damage.
+    `offsets` are bytes at which records begin, ascending, from the index of the file: the walk
+    resumes there after damage.
     """
 
     def __init__(

@@ -69,16 +69,10 @@ class BatchChecks(Protocol):
 
 
 class DataSection:
-    """Data section of a file, checked record by record.
+    """Data section of a file of `size` bytes, checked record by record.
 
-    Parameters
-    ----------
-    names : collection of str
-        Names of metadata records and attachments to keep: the first two of each, up to 1 MiB.
-    size : int
-        Bytes of the file.
-    checks : callable
-        Returns the checks of the messages, which get them in batches of a few megabytes.
+    Metadata records and attachments of some names are kept: the first two of each, up to 1 MiB.
+    `checks` returns the checks of the messages, which get them in batches of a few megabytes.
     """
 
     def __init__(
@@ -271,10 +265,7 @@ class DataSection:
 class SummarySection:
     """The summary section, the summary offsets, and the footer.
 
-    Parameters
-    ----------
-    is_readable : bool
-        Whether the data section was completely readable: else the index is not compared with it.
+    If the data section was not completely readable, the index is not compared with it.
     """
 
     def __init__(self, data: DataSection, findings: Findings, *, is_readable: bool) -> None:
