@@ -95,16 +95,10 @@ _FORGOTTEN = 24 * 3600 * NANOSECONDS  # before the last midnight and evening
 
 @dataclass
 class Bridge:
-    """Follows one recorder and updates the outputs.
-
-    Attributes
-    ----------
-    since : int
-        Log time from which events are read, in nanoseconds of UTC.
-    """
+    """Follows one recorder and updates the outputs."""
 
     home: RecorderAddress
-    since: int
+    since: int  # log time from which events are read, in nanoseconds of UTC
     outputs: dict[str, Output]
     say: Callable[[str], None]
     _watchdog_due: float = 0.0
@@ -197,13 +191,7 @@ _AGAIN_SECONDS = 60.0
 
 
 class ReopenedOutput:
-    """An output that is retried every minute while it cannot be opened.
-
-    Attributes
-    ----------
-    output : Output or None
-        None while the output cannot be opened.
-    """
+    """An output that is retried every minute while it cannot be opened; `output` is None then."""
 
     def __init__(self, make: Callable[[], Output], say: Callable[[str], None]) -> None:
         self.output: Any = None
@@ -239,13 +227,9 @@ class ReopenedOutput:
 def open_outputs(
     settings: BridgeSettings, home: RecorderAddress, state: BridgeState, say: ProblemReporter
 ) -> tuple[dict[str, Output], int]:
-    """Open the configured outputs.
+    """Open the configured outputs; return also the log time from which they need events.
 
-    Returns
-    -------
-    outputs : dict of str to Output
-    since : int
-        Log time from which the outputs need events, in nanoseconds of UTC.
+    The time is nanoseconds of UTC.
     """
     moment = today(time.time_ns(), home.zone)
     since = min(moment.midnight, moment.night) - _EARLIER
@@ -301,15 +285,10 @@ def needed_modules(settings: BridgeSettings) -> dict[str, bool]:
 
 
 def output_problems(settings: BridgeSettings) -> tuple[list[str], list[str]]:
-    """Find errors that the outputs would raise at their start, without opening anything.
+    """Return errors that the outputs would raise at their start, and warnings; open nothing.
 
-    Returns
-    -------
-    problems : list of str
-        Errors.
-    warnings : list of str
-        Missing files that may be credentials of the service, and a text file of figures that
-        node_exporter would not read.
+    Warnings are of missing files that may be credentials of the service, and of a text file of
+    figures that node_exporter would not read.
     """
     problems: list[str] = []
     warnings: list[str] = []
@@ -404,12 +383,8 @@ def _check_ports(page: PageSettings) -> None:
 def exposed_files(settings: BridgeSettings, file: Path | None, state: Path | None) -> list[str]:
     """Return a line for each file of secrets that other users may read or change.
 
-    Parameters
-    ----------
-    file : Path or None
-        The configuration file, a secret if it has a ping URL with a password.
-    state : Path or None
-        The state folder of the bridge; None if unknown.
+    The configuration file is a secret if it has a ping URL with a password; the state folder of the
+    bridge is None if unknown.
     """
     mqtt, page, figures, ping = settings.mqtt, settings.page, settings.prometheus, settings.ping
     tables = (ping, "url_file"), (mqtt, "password_file"), (mqtt, "key_file"), (page, "token_file")

@@ -105,13 +105,7 @@ class Correction(NamedTuple):
 
 
 class EventCorrections:
-    """Corrections of a recorder's events by people.
-
-    Attributes
-    ----------
-    number : int
-        Grows with each change.
-    """
+    """Corrections of a recorder's events by people; `number` grows with each change."""
 
     def __init__(self, folder: Path, node: str) -> None:
         self.number = 0
@@ -126,14 +120,9 @@ class EventCorrections:
         self._reading: threading.Thread | None = None
 
     def refresh(self, say: Callable[[str], None], wait: float = 0.0) -> None:
-        """Read marks made elsewhere, such as in a review, in a thread of its own.
+        """Read marks made elsewhere, such as in a review, in a thread; wait for it some seconds.
 
         A call within a minute of the last reading does nothing.
-
-        Parameters
-        ----------
-        wait : float
-            Longest time to wait for the thread, in seconds.
         """
         is_reading = self._reading is not None and self._reading.is_alive()
         if is_reading or time.monotonic() < self._due:
@@ -194,10 +183,7 @@ class EventCorrections:
     def labels(self, events: Sequence[SoundEvent]) -> dict[str, str]:
         """Return the classes that people gave to events of one class and microphone, by id.
 
-        Parameters
-        ----------
-        events : sequence of SoundEvent
-            Sorted by start; they do not overlap.
+        Events are sorted by start, and do not overlap.
         """
         found: dict[str, str] = {}
         longest: dict[str, int] = {}

@@ -81,23 +81,11 @@ NO_CORRECTIONS = EventCorrections(Path(), "")
 class LiveMicrophone:
     """Current labels and recent events of one microphone, by one of its models.
 
-    Parameters
-    ----------
-    unnamed : collection of str, optional
-        Classes without events; except for silence they are left out of `classes`.
-
-    Attributes
-    ----------
-    names : list of str
-        Classes of the model, empty while unknown.
-    label, confidence : str, float
-        The newest label; empty before the first.
-    level_dbfs : float
-        Mean level of ten seconds; NaN if unknown.
-    gaps : list of (int, int)
-        Gaps in the audio, in nanoseconds of UTC, in log order.
-    since : int
-        Start of the first label or segment, in nanoseconds of UTC; 0 before there is any.
+    `unnamed` classes have no events; except for silence they are left out of `classes`. `names` are
+    all of the model, empty while unknown. `label` and `confidence` are of the newest label; empty
+    before the first. `level_dbfs` is the mean of ten seconds; NaN if unknown. `gaps` in the audio
+    are in log order; `since` is the start of the first label or segment, 0 before there is any;
+    both in nanoseconds of UTC.
     """
 
     def __init__(self, name: str, unnamed: Collection[str] = (SILENCE,)) -> None:
@@ -221,11 +209,8 @@ class LiveMicrophone:
         """Return the events of each shown class since a time, as the report counts them.
 
         `SET_APART` classes do not count beside a television, but where a person confirmed them.
-
-        Parameters
-        ----------
-        names : mapping of str to str
-            Common names of classes, such as `common_names`; empty for the classes of the model.
+        `names` are common names of classes, such as `common_names`; empty for the classes of the
+        model.
         """
         shown = [names.get(label, label) for label in [*self.classes, *self.labels()]]
         found = {name: ClassSounds([], [], set()) for name in ordered(shown) if name != SILENCE}
@@ -258,10 +243,7 @@ class LiveMicrophone:
     ) -> dict[str, tuple[int | None, int | None]]:
         """Count the events that began since midnight, and those of the last night, by class.
 
-        Returns
-        -------
-        dict of str to (int or None, int or None)
-            None in place of 0 if coverage is too low for a count of 0.
+        None is in place of 0 if coverage is too low for a count of 0.
         """
         key = self._changes, corrections.number, today[1:], self.never_tell, *self.classes
         if key != self._counts[0]:
@@ -360,18 +342,11 @@ class LiveMicrophone:
 class HomeState:
     """State of one recorder's microphones.
 
-    Attributes
-    ----------
-    scenarios : dict of str to LiveMicrophone
-        States by scenario models; the key `<microphone>-<scenario>` is no valid microphone name.
-    caught_up : bool
-        Whether all earlier messages have been read, so that further ones are live.
-    common_names : mapping of str to str
-        Names that people are shown for classes that a model takes for one another.
-    sources : collection of str or None
-        Labelling sources of the newest log; None while unknown.
-    corrections : EventCorrections
-        What people said of recent events.
+    `scenarios` has states by scenario models: the key `<microphone>-<scenario>` is no valid
+    microphone name. `caught_up` if all earlier messages have been read, so that further ones are
+    live. `common_names` are shown for classes that a model takes for one another; `sources` are the
+    labelling sources of the newest log, None while unknown; `corrections` are what people said of
+    recent events.
     """
 
     def __init__(self) -> None:
@@ -523,21 +498,10 @@ def follow_home(
 ) -> Iterator[tuple[HomeState, list[SoundEvent], list[Columns]]]:
     """Follow the logs of a recorder, and update the state of its home.
 
-    Parameters
-    ----------
-    start : int
-        Log time from which events are read, in nanoseconds of UTC.
-    say : callable
-        Called with a problem: a log that can be read no further, or a missing folder.
-
-    Yields
-    ------
-    state : HomeState
-        Always the same object: after each batch of messages, and twice a second without any.
-    begun : list of SoundEvent
-        Events that began with the batch.
-    columns : list of Columns
-        Messages of the batch, with the fields of `FIELDS`.
+    Events are read from log time `start`, in nanoseconds of UTC. `say` is called with a problem: a
+    log that can be read no further, or a missing folder. After each batch of messages, and twice a
+    second without any, yield the same state, the events that began with the batch, and its
+    messages, with the fields of `FIELDS`.
     """
     state, folder = HomeState(), home.folder
     state.corrections = EventCorrections(folder, home.node)

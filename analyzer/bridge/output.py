@@ -18,28 +18,14 @@ RECENT = 60 * NANOSECONDS  # after its end an event is no longer reported
 
 
 class News(NamedTuple):
-    """An update for the outputs.
-
-    Attributes
-    ----------
-    state : HomeState
-        Current state of the home.
-    begun, ended : sequence of SoundEvent
-        Events of the last minute not reported before, and events that ended since the last update.
-    today : Today
-        Current day and last night.
-    zone : tzinfo
-        Time zone of the home.
-    columns : sequence of Columns
-        Messages since the last update, except labels.
-    """
+    """An update for the outputs."""
 
     state: HomeState
-    begun: Sequence[SoundEvent]
-    ended: Sequence[SoundEvent]
+    begun: Sequence[SoundEvent]  # events of the last minute not reported before
+    ended: Sequence[SoundEvent]  # since the last update
     today: Today
     zone: tzinfo
-    columns: Sequence[Columns] = ()
+    columns: Sequence[Columns] = ()  # messages since the last update, except labels
 
 
 class Output(Protocol):
@@ -69,12 +55,8 @@ class _Kept(BaseModel, extra="forbid"):
 class Totals:
     """Totals of events and seconds by microphone and class, kept across restarts.
 
-    Events before a time are saved; later ones are counted from the state of the home.
-
-    Parameters
-    ----------
-    time : int
-        Start of the count if nothing is saved, in nanoseconds of UTC.
+    Events before a time are saved; later ones are counted from the state of the home. If nothing is
+    saved, the count starts at `time`, in nanoseconds of UTC.
     """
 
     def __init__(self, state: BridgeState, time: int, say: Callable[[str], None]) -> None:
@@ -88,12 +70,9 @@ class Totals:
         return self._kept.time
 
     def count(self, state: HomeState, end: int | None = None) -> list[Total]:
-        """Return the totals, sorted by microphone and class; 0 for classes without events.
+        """Return the totals by microphone and class, of events that begin before `end`, if given.
 
-        Parameters
-        ----------
-        end : int, optional
-            Count events that begin before this time, in nanoseconds of UTC; all by default.
+        It is in nanoseconds of UTC. A class without events has 0.
         """
         sums = {total[:2]: total for total in self._kept.totals}
         for microphone in state.every():

@@ -34,16 +34,9 @@ _READERS = {"owner": 0, "group": 0o040, "all": 0o044}
 class PrometheusOutput:
     """Serves the metrics of a home on a port, or writes them to a text file every ten seconds.
 
-    Parameters
-    ----------
-    since : int
-        Start of the count of events if no totals are saved, in nanoseconds of UTC.
-
-    Raises
-    ------
-    BridgeError
-        If neither port nor text file is configured, or if the port cannot be opened or has no
-        token and there is no text file.
+    If no totals are saved, the count of events starts at `since`, in nanoseconds of UTC. Raise
+    `BridgeError` if neither port nor text file is configured, or if the port cannot be opened or
+    has no token and there is no text file.
     """
 
     def __init__(

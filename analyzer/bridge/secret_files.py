@@ -23,18 +23,10 @@ _FORM = re.compile(r"[A-Za-z0-9._~-]{16,200}")  # characters that URLs need not 
 
 
 def page_token(file: Path | None, state: Path) -> str:
-    """Return the token of the page.
+    """Return the token of the page from a one-line file, resolved by `secret_path`.
 
-    Parameters
-    ----------
-    file : Path or None
-        One-line token file, resolved by `secret_path`; None to create a token in the state folder
-        and keep it.
-
-    Raises
-    ------
-    BridgeError
-        If the file cannot be used or created.
+    Without a file a token is created in the state folder and kept. Raise `BridgeError` if the file
+    cannot be used or created.
     """
     return read_token(file) if file is not None else _kept(state / _TOKEN)
 

@@ -33,18 +33,12 @@ from hearthlog.schemas.files import read_toml
 
 
 class RecorderAddress(NamedTuple):
-    """The recorder that a bridge follows.
-
-    Attributes
-    ----------
-    never_tell : frozenset of str
-        Classes of the configuration that no output shows.
-    """
+    """The recorder that a bridge follows."""
 
     folder: Path
     node: str
     zone: tzinfo
-    never_tell: frozenset[str] = frozenset()
+    never_tell: frozenset[str] = frozenset()  # classes of the configuration that no output shows
 
 
 NO_RECIPIENT = (
@@ -346,17 +340,9 @@ _OTHERS: dict[str, type[BaseModel]] = {  # other tables in which a misplaced key
 
 
 def load_bridge_settings(file: Path | None) -> tuple[Settings, BridgeSettings]:
-    """Load the configuration of a recorder and of its bridge.
+    """Load the configuration of a recorder and of its bridge from TOML; None for the defaults.
 
-    Parameters
-    ----------
-    file : Path or None
-        The TOML file; None for the defaults.
-
-    Raises
-    ------
-    ConfigurationError
-        As `load_settings`, also for the table `bridge`.
+    Raise `ConfigurationError` as `load_settings`, also for the table `bridge`.
     """
     problems: list[str] = []
     settings = Settings.model_construct()

@@ -32,15 +32,8 @@ _OF_SYSTEMD = "STATE_DIRECTORY"  # one folder, or several with colons between th
 def state_folder(configured: Path | None, logs: Path) -> Path:
     """Return the state folder, created if missing.
 
-    Returns
-    -------
-    Path
-        The configured folder; else the state directory of systemd; else `bridge` next to the logs.
-
-    Raises
-    ------
-    BridgeError
-        If the folder cannot be created.
+    It is the configured one, else the state directory of systemd, else `bridge` next to the logs.
+    Raise `BridgeError` if the folder cannot be created.
     """
     given = os.environ.get(_OF_SYSTEMD, "").partition(":")[0]
     folder = configured or (Path(given) if given else logs.absolute().parent / "bridge")
@@ -78,17 +71,9 @@ _FILES = {
 class BridgeState:
     """Persistent entries of one recorder's bridge: JSON texts by name; thread-safe.
 
-    An entry that was written survives a kill and a power cut. While the file cannot be used, as
-    on a full disk, entries are kept in memory, and the file is tried again every minute.
-
-    Parameters
-    ----------
-    folder : Path
-        State folder; recorders may share one.
-    node : str
-        Name of the recorder.
-    say : callable
-        Called with a line about a file that cannot be used.
+    An entry that was written survives a kill and a power cut. While the file cannot be used, as on
+    a full disk, entries are kept in memory, and the file is tried again every minute. Recorders may
+    share a folder. `say` is called with a line about a file that cannot be used.
     """
 
     def __init__(self, folder: Path, node: str, say: Callable[[str], None]) -> None:
@@ -106,15 +91,8 @@ class BridgeState:
     def claim(self, logs: Path) -> None:
         """Lock the entries of the recorder, and adopt those of its former names.
 
-        Parameters
-        ----------
-        logs : Path
-            Folder of the recorder's logs, which tell whether it was renamed.
-
-        Raises
-        ------
-        BridgeError
-            If another bridge of the recorder uses the folder, or the file is of a later version.
+        The folder of the recorder's logs tells whether it was renamed. Raise `BridgeError` if
+        another bridge of the recorder uses the folder, or the file is of a later version.
         """
         with suppress(OSError):  # a disk that cannot be written: entries stay in memory
             private_folder(self.folder)
@@ -377,14 +355,10 @@ Content = TypeVar("Content")
 
 
 class StateEntry(Generic[Content]):
-    """An entry of the bridge's state, checked when it is read.
+    """An entry of the bridge's state, checked by pydantic as of `kind` when it is read.
 
-    Parameters
-    ----------
-    kind : type
-        Type of the content, for pydantic.
-    damaged, unsaved : str
-        Consequence of an entry that cannot be read, or written, for `say`.
+    `damaged` and `unsaved` are the consequence, for `say`, of an entry that cannot be read, or
+    written.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -418,10 +392,7 @@ class StateEntry(Generic[Content]):
     def save(self, content: Content, obsolete: Collection[str] = ()) -> bool:
         """Write the content, on disk on return; return False if the failure is reported.
 
-        Parameters
-        ----------
-        obsolete : collection of str, optional
-            Names of entries to remove at the same moment.
+        Obsolete entries are removed, by name, at the same moment.
         """
         try:
             self._state.write(self.name, self._kind.dump_json(content).decode(), obsolete)
@@ -438,13 +409,9 @@ def is_renamed(logs: Path, node: str, former: str, *, is_first: bool) -> bool:
     """Whether a former recorder of a folder was renamed to this one.
 
     True if the former recorder wrote logs there and no longer records, and this recorder wrote no
-    log during that time, but later ones, or writes now. Two different recorders of one folder
-    would write at the same time.
-
-    Parameters
-    ----------
-    is_first : bool
-        Whether no bridge of this recorder ran before, so that it may have no log yet.
+    log during that time, but later ones, or writes now. Two different recorders of one folder would
+    write at the same time. It `is_first` if no bridge of this recorder ran before, so that it may
+    have no log yet.
     """
     if former == node:
         return False

@@ -25,15 +25,7 @@ _WITH_CAUSE = ("error.not saved", "error.not played")
 
 
 class Words:
-    """The texts of a language.
-
-    Attributes
-    ----------
-    language : str
-        `en`, `de` …
-    texts : mapping of str to str
-        By key, with placeholders in braces.
-    """
+    """The texts of a language, `en`, `de` …, by key, with placeholders in braces."""
 
     def __init__(self, language: str, texts: Mapping[str, str]) -> None:
         self.language = language
@@ -75,12 +67,7 @@ class Words:
     ) -> str:
         """Format a time relative to now: `14:05`, `yesterday 23:10`, `3 May 14:05`.
 
-        Parameters
-        ----------
-        seconds : bool
-            Whether to include seconds.
-        is_past : bool
-            Whether `now` is on a past day: then no other day is called yesterday.
+        If `now` is on a past day, no other day is called yesterday.
         """
         moment, today = local_time(time, zone), local_time(now, zone).date()
         shown = f"{moment:%H:%M:%S}" if seconds else f"{moment:%H:%M}"
@@ -194,11 +181,8 @@ def one_line(text: str) -> str:
 
 
 def reason(text: str) -> str:
-    """Return why a microphone does not listen; empty if its last diagnostics give no reason.
+    """Return why a microphone does not listen by its last diagnostics; empty without a reason.
 
-    Parameters
-    ----------
-    text : str
-        Last diagnostics of the microphone: `listening` if the recorder ended or was killed.
+    They are `listening` if the recorder ended or was killed.
     """
     return "" if text in _HEARD else text

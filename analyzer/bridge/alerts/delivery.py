@@ -50,10 +50,7 @@ class Waiting(BaseModel):
 class Outbox:
     """Persistent queue of notifications until each target has received them; thread-safe.
 
-    Parameters
-    ----------
-    most : int, optional
-        Most notifications kept; beyond that the oldest are dropped.
+    Beyond `most` notifications the oldest are dropped.
     """
 
     def __init__(
@@ -80,10 +77,7 @@ class Outbox:
     def set_targets(self, targets: Iterable[str], now: int) -> None:
         """Set the names of the targets; notifications that every target has are removed.
 
-        Parameters
-        ----------
-        targets : iterable of str
-            If `UNREAD` is among them, notifications are kept for a day for a target added later.
+        If `UNREAD` is among them, notifications are kept for a day for a target added later.
         """
         with self._lock:
             self._targets = frozenset(targets)
@@ -194,12 +188,7 @@ _CODE = re.compile(r"\berror=(\d{3})\b")
 class Target:
     """An address of Apprise.
 
-    Attributes
-    ----------
-    name : str
-        Identifier that is stable across restarts and reveals no secret.
-    place : str
-        Human-readable name without secrets, for messages.
+    `name` is stable across restarts; neither it nor `place`, for people, reveals a secret.
     """
 
     def __init__(self, plugin: Any, address: str, line: int) -> None:
@@ -240,22 +229,12 @@ def _reason(failure: str) -> str:
 
 
 class Addresses(NamedTuple):
-    """Result of reading a file of addresses.
-
-    Attributes
-    ----------
-    problems : list of str
-        One line for each target that cannot be used, without its address.
-    names : list of str
-        Identifier of the target of each line, readable or not.
-    lacks_package : bool
-        Whether Apprise, or a package that it needs, is not installed.
-    """
+    """Result of reading a file of addresses."""
 
     targets: list[Target]
-    problems: list[str]
-    names: list[str]
-    lacks_package: bool = False
+    problems: list[str]  # one line for each target that cannot be used, without its address
+    names: list[str]  # identifier of the target of each line, readable or not
+    lacks_package: bool = False  # whether Apprise, or a package that it needs, is not installed
 
 
 def find_targets(file: Path | None, say: Callable[[str], None]) -> Addresses:
@@ -339,10 +318,8 @@ _LATE = 5 * 60 * NANOSECONDS
 class Delivery:
     """Delivers queued notifications, with one thread per target.
 
-    Parameters
-    ----------
-    first_pause, longest_pause : float, optional
-        Seconds to wait after the first failure, doubled after each further one, up to the longest.
+    After a failure it waits for the first pause, in seconds, doubled after each further one, up to
+    the longest.
     """
 
     def __init__(  # noqa: PLR0913
@@ -421,12 +398,9 @@ class Delivery:
 
 
 def message(notification: Notification, zone: tzinfo, now: int | None = None) -> str:
-    """Format a notification: local time, text, and a remark if delivered late.
+    """Format a notification: local time, text, and a remark if late by `now` (nanoseconds of UTC).
 
-    Parameters
-    ----------
-    now : int, optional
-        In nanoseconds of UTC; the current time by default.
+    The current time is the default.
     """
     late = (time.time_ns() if now is None else now) - notification.due > _LATE
     moment = f"{local_time(notification.time, zone):%Y-%m-%d %H:%M}"

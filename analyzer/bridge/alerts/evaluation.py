@@ -62,20 +62,12 @@ from hearthlog.schemas.frames import NANOSECONDS
 
 
 class SoundEvents(NamedTuple):
-    """Events of a rule: segments joined over short pauses; times in nanoseconds of UTC.
-
-    Attributes
-    ----------
-    counted : np.ndarray [shape=(n,)], int64
-        When each event reached the minimum length of the rule, and so counts.
-    coverage : Spans
-        Joined segments, including those of too short events.
-    """
+    """Events of a rule: segments joined over short pauses; times in nanoseconds of UTC."""
 
     starts: Int64
     ends: Int64
-    counted: Int64
-    coverage: Spans
+    counted: Int64  # [shape=(n,)]; when each event reached the minimum length, and so counts
+    coverage: Spans  # joined segments, including those of too short events
 
     def counted_coverage(self) -> Spans:
         """Return the heard spans of each event from the time at which the event counts."""
@@ -126,12 +118,8 @@ def _listened_times(spans: Spans, firsts: Int64, least: int) -> tuple[Int64, Int
 def more_than_conditions(rule: MoreThan, activity: HomeActivity, until: int) -> list[Condition]:
     """Find when a class exceeded the limit of a rule in the preceding window.
 
-    Parameters
-    ----------
-    activity : HomeActivity
-        Must begin one window before the first evaluated time.
-    until : int
-        End of the recorded activity, in nanoseconds of UTC.
+    The activity must begin one window before the first evaluated time; `until` is its end, in
+    nanoseconds of UTC.
     """
     events = events_of_rule(rule, activity)
     window = duration_words(rule.window)
@@ -216,13 +204,9 @@ def silent_conditions(
 ) -> list[Condition]:
     """Find when the recorder had written nothing for too long.
 
-    Parameters
-    ----------
-    start, end : int
-        In nanoseconds of UTC. A recorder that wrote nothing within `silent_for` before the start
-        counts as silent at the start.
-    since : int
-        When the rule came into force, in nanoseconds of UTC: earlier silence does not count.
+    Times are nanoseconds of UTC. A recorder that wrote nothing within `silent_for` before the start
+    counts as silent at the start. The rule came into force at `since`: earlier silence does not
+    count.
     """
     starts, ends = activity.written
     before = start - 1 - rule.silent_for
@@ -237,18 +221,10 @@ def silent_conditions(
 
 
 def wall_times(day: date, minute: int, zone: tzinfo) -> tuple[int, int]:
-    """Return the first and last time at which local clocks show a minute of a day.
+    """Return first and last time (ns of UTC) when clocks show a minute, 0 to 1439, of a day.
 
-    Parameters
-    ----------
-    minute : int
-        Minute of the day, 0 to 1439.
-
-    Returns
-    -------
-    first, last : int
-        In nanoseconds of UTC. The two differ if the clock is set back past the minute; both are the
-        moment of the change if the clock is set forward past the minute.
+    The two differ if the clock is set back past the minute; both are the moment of the change if
+    the clock is set forward past the minute.
     """
     shown = datetime(day.year, day.month, day.day, *divmod(minute, 60), tzinfo=zone)
     first, last = (int(shown.replace(fold=fold).timestamp()) for fold in (0, 1))
@@ -277,12 +253,9 @@ def days_around(start: int, end: int, zone: tzinfo) -> list[date]:
 
 
 def end_of_quiet(hours: list[QuietHours], time: int, zone: tzinfo) -> int:
-    """Return the end of the quiet hours at a time; the time itself outside of quiet hours.
+    """Return the end of the quiet hours at a time (nanoseconds of UTC); the time itself if none.
 
-    Returns
-    -------
-    int
-        In nanoseconds of UTC; at most a day after the time, even if the complete day is quiet.
+    It is at most a day after the time, even if the complete day is quiet.
     """
     until = time
     for _ in hours:  # adjoining quiet hours
@@ -345,10 +318,7 @@ def unlike_conditions(
 ) -> list[Condition]:
     """Find the days or nights outside the range of the four weeks before.
 
-    Parameters
-    ----------
-    activity : HomeActivity
-        Must begin 31 days before the start.
+    The activity must begin 31 days before the start.
     """
     days = judged_days(rule, start, end, zone)
     if not days:
@@ -417,10 +387,7 @@ def unusual_conditions(
 ) -> list[Condition]:
     """Find the days unlike the four weeks before, each reported on the next morning.
 
-    Parameters
-    ----------
-    activity : HomeActivity
-        Must begin 34 days before the start.
+    The activity must begin 34 days before the start.
     """
     mornings = judged_days(rule, start, end, zone)
     if not mornings:
@@ -465,18 +432,11 @@ def notifications(  # noqa: PLR0913, PLR0917
     zone: tzinfo,
     state: RuleState = NEW,
 ) -> tuple[list[Notification], RuleState]:
-    """Find the notifications of a rule in a time span, and the new state of the rule.
+    """Find the notifications of a rule in a span (ns of UTC, end exclusive), and its new state.
 
     A condition gives one notification, at its start. If the condition starts within the cooldown of
     the previous notification, the notification is delayed to the end of the cooldown, and omitted
-    if the condition has ended by then.
-
-    Parameters
-    ----------
-    start, end : int
-        In nanoseconds of UTC, the end exclusive.
-    state : RuleState, optional
-        State returned by the evaluation up to the start.
+    if the condition has ended by then. `state` is that returned by the evaluation up to the start.
     """
     found: list[Notification] = []
     last, has_rung = state.last, False

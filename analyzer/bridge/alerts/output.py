@@ -117,14 +117,8 @@ class RuleWatch:
     ) -> list[Notification]:
         """Evaluate the rules up to a time; their notifications are on disk on return.
 
-        Parameters
-        ----------
-        activity : callable
-            Returns the live activity; called only if a rule needs it.
-        weeks : callable
-            Returns the activity between two times, read from the logs.
-        until : int
-            Time up to which the activity is complete, in nanoseconds of UTC.
+        `activity` returns the live activity, complete up to `until` (nanoseconds of UTC), if a rule
+        needs it; `weeks` that between two times, read from the logs.
         """
         self.set_right(now)
         found: list[Notification] = []
@@ -181,16 +175,9 @@ _WAIT_SECONDS = 60.0  # for news, without a recorder
 class AlertsOutput:
     """Evaluates rules in a separate thread, and delivers their notifications.
 
-    Parameters
-    ----------
-    on_notification : callable, optional
-        Called with rule, text and time (nanoseconds of UTC) of a notification, in the thread of
-        `update`; repeated at each update until it returns True.
-
-    Raises
-    ------
-    BridgeError
-        If there is no recipient.
+    `on_notification` is called with rule, text and time (nanoseconds of UTC) of a notification, in
+    the thread of `update`; repeated at each update until it returns True. Raise `BridgeError` if
+    there is no recipient.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917

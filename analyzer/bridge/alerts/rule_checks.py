@@ -59,12 +59,9 @@ def _of_network(label: str) -> str:
 def unknown_microphone(
     rule: AlertRule, microphones: Collection[str], *, recorded: bool = False
 ) -> str:
-    """Report that the microphone of a rule does not exist; empty if it does.
+    """Report that the microphone of a rule is not in the configuration, or not in recorded logs.
 
-    Parameters
-    ----------
-    recorded : bool, optional
-        Whether `microphones` come from the logs instead of the configuration.
+    Empty if it is.
     """
     name = rule.microphone if isinstance(rule, SoundRule) else ""
     if not microphones or name in {"", *microphones}:
@@ -95,10 +92,7 @@ def rule_doubts(
 ) -> Iterator[str]:
     """Report the rules that can never ring with the configuration of the recorder.
 
-    Parameters
-    ----------
-    microphones : sequence of str
-        Names of configured microphones; empty to skip the checks of names.
+    Names are not checked if no configured microphones are given.
     """
     never_tell = set(map(class_name, settings.never_tell))
     for rule in rules:

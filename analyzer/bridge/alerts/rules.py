@@ -301,23 +301,13 @@ def live_history(rule: AlertRule) -> int:
 
 
 class Notification(NamedTuple):
-    """Notification by a rule.
-
-    Attributes
-    ----------
-    time : int
-        Log time of the notification, in nanoseconds of UTC.
-    is_known : bool
-        False if the recorder heard too little to tell.
-    due : int
-        Earliest delivery, in nanoseconds of UTC: the time, or the end of quiet hours.
-    """
+    """Notification by a rule."""
 
     rule: str
-    time: int
+    time: int  # log time, in nanoseconds of UTC
     text: str
-    is_known: bool
-    due: int
+    is_known: bool  # False if the recorder heard too little to tell
+    due: int  # earliest delivery, in nanoseconds of UTC: the time, or the end of quiet hours
 
     @property
     def id(self) -> str:
@@ -327,40 +317,18 @@ class Notification(NamedTuple):
 
 @dataclass(frozen=True)
 class RuleState:
-    """State of a rule between two evaluations; times in nanoseconds of UTC.
+    """State of a rule between two evaluations; times in nanoseconds of UTC."""
 
-    Attributes
-    ----------
-    last : int
-        Time of the last notification.
-    has_rung : bool
-        Whether the condition at the end of the evaluation has given its notification.
-    since : int
-        When the rule came into force: whether there was a recorder before is unknown.
-    until : int
-        End of the evaluation; 0 for a new rule.
-    """
-
-    last: int = -NEVER
-    has_rung: bool = False
-    since: int = -NEVER
-    until: int = 0
+    last: int = -NEVER  # time of the last notification
+    has_rung: bool = False  # whether the condition at the end has given its notification
+    since: int = -NEVER  # when the rule came into force: a recorder before is unknown
+    until: int = 0  # end of the evaluation; 0 for a new rule
 
 
 class Condition(NamedTuple):
-    """Time span in which the condition of a rule holds.
+    """Time span in which the condition of a rule holds."""
 
-    Attributes
-    ----------
-    start, end : int
-        In nanoseconds of UTC, the end exclusive.
-    text : callable
-        Returns the text of a notification at a time.
-    is_known : bool
-        False if the recorder heard too little to tell.
-    """
-
-    start: int
-    end: int
-    text: Callable[[int], str]
-    is_known: bool = True
+    start: int  # in nanoseconds of UTC
+    end: int  # likewise, exclusive
+    text: Callable[[int], str]  # returns the text of a notification at a time
+    is_known: bool = True  # False if the recorder heard too little to tell

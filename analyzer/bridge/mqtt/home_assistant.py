@@ -31,12 +31,8 @@ def discovery(
 ) -> dict[str, Any]:
     """Return the discovery payload of a microphone, for Home Assistant 2024.11 and later.
 
-    Parameters
-    ----------
-    microphone : str
-        Name of a microphone, or `<microphone>-<scenario>`: its device has no level or health.
-    gone : sequence of str
-        Former classes, whose entities are removed.
+    The device of `<microphone>-<scenario>` has no level or health. Entities of `gone`, former
+    classes, are removed.
     """
     own = device_id(topics.node, microphone)
     sounds = [name for name in classes if name != SILENCE]
@@ -66,10 +62,7 @@ def command_discovery(
 ) -> dict[str, Any]:
     """Return the discovery payload of a recorder's device, with the commands to the bridge.
 
-    Parameters
-    ----------
-    gone : sequence of str
-        Former classes, whose switches are removed.
+    Switches of `gone`, former classes, are removed.
     """
     own = home_id(topics.node)
     command = topics.at("command")

@@ -39,14 +39,9 @@ class Topics(NamedTuple):
     def at(self, kind: str, microphone: str = "", label: str = "") -> str:
         """Return the topic of a place of any kind but `config`, which uses discovery topics.
 
-        Parameters
-        ----------
-        kind : str
-            Of the recorder, such as `bridge`; of a microphone, such as `heard`; or of a class, such
-            as `on`, or `told`, which shows whether its events are published.
-        label : str, optional
-            The class; characters that are invalid in topics or not ASCII are percent-encoded, such
-            as `%2B`.
+        A kind is of the recorder, such as `bridge`; of a microphone, such as `heard`; or of a
+        class, such as `on`, or `told`, which shows whether its events are published. Characters of
+        a label that are invalid in topics or not ASCII are percent-encoded, such as `%2B`.
         """
         part = quote(label, safe=_KEPT)
         if kind == TOLD:
@@ -92,10 +87,7 @@ class _Content(BaseModel, extra="forbid"):
 class RetainedTopics:
     """Persistent record of retained topics, muted classes and last published events.
 
-    Attributes
-    ----------
-    is_new : bool
-        Whether there was no record.
+    `is_new` if there was no record.
     """
 
     def __init__(self, state: BridgeState, say: Callable[[str], None]) -> None:
@@ -161,12 +153,9 @@ class RetainedTopics:
             self._is_changed = True
 
     def new_events(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
-        """Return the events that no earlier bridge has published.
+        """Return the events, in order of start, that no earlier bridge has published.
 
-        Parameters
-        ----------
-        events : sequence of SoundEvent
-            In order of start; all events up to the last published one count as published.
+        All events up to the last published one count as published.
         """
         last = {
             event.microphone: number

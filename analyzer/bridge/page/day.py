@@ -59,16 +59,10 @@ class DaySpan(NamedTuple):
 
 
 class HomeDay(NamedTuple):
-    """The microphones of a home on a day.
-
-    Attributes
-    ----------
-    moment : Today
-        The current day; for a past day, its last moment.
-    """
+    """The microphones of a home on a day."""
 
     microphones: Sequence[LiveMicrophone]
-    moment: Today
+    moment: Today  # the current day; for a past day, its last moment
     zone: tzinfo
     words: Words = ENGLISH
     is_past: bool = False
@@ -215,10 +209,9 @@ def _lane(
 
 
 def _times(events: Sequence[SoundEvent], name: str, given: Collection[str], home: HomeDay) -> Any:
-    """Return events, newest first, and how many older are left out.
+    """Return start, id, length, sureness and class by people of events, and how many are left out.
 
-    Of each event: when it began, its id, its length and sureness, and the class that people gave
-    it, in words.
+    The newest come first.
     """
     words, shown = home.words, events[-_MOST_TIMES:]
     mark = words.text("mark.other", **{"class": name})
@@ -237,10 +230,7 @@ def _times(events: Sequence[SoundEvent], name: str, given: Collection[str], home
 def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
     """Return how much of each two minutes of a day events fill: one digit per bin, 9 for full.
 
-    Returns
-    -------
-    str
-        Empty without events.
+    Empty without events.
     """
     filled = [0] * -(-(day.end - day.start) // BIN)
     for event in events:

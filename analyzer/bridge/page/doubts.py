@@ -100,12 +100,8 @@ def need_look(
 class CurrentDoubts:
     """The doubtful sounds of the current day.
 
-    Attributes
-    ----------
-    found : mapping of str to DoubtfulSound
-        By the ids of events; replaced when there are more.
-    is_up_to_date : bool
-        Whether every event has been looked for in the logs.
+    `found` has them by the ids of events, and is replaced when there are more; `is_up_to_date` if
+    every event has been looked for in the logs.
     """
 
     def __init__(self, folder: Path, node: str) -> None:

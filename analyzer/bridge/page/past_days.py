@@ -40,21 +40,13 @@ _FRESH_SECONDS = 300.0  # after which a day is read again: a late segment may be
 
 
 class PastDay(NamedTuple):
-    """A past day of a home; its state has no labels.
-
-    Attributes
-    ----------
-    marks : sequence of Mark
-        Marks of people in the logs of the day.
-    doubts : mapping of str to DoubtfulSound
-        By the ids of events.
-    """
+    """A past day of a home; its state has no labels."""
 
     moment: Today
     state: HomeState
-    marks: Sequence[Mark]
+    marks: Sequence[Mark]  # of people in the logs of the day
     events: Mapping[str, SoundEvent]  # by id
-    doubts: Doubts
+    doubts: Doubts  # by the ids of events
 
 
 class PastDays:

@@ -54,12 +54,8 @@ def recurring_list(
 ) -> Any:
     """Return the recurring sounds for JSON.
 
-    Parameters
-    ----------
-    looked : int
-        When the summary was written, in nanoseconds of UTC.
-    outcomes : mapping of str to str
-        Status of naming, by key of the group.
+    `looked` is when the summary was written, in nanoseconds of UTC; `outcomes` has the status of
+    naming, by key of the group.
     """
     shown = shown_groups(summary)
     left = sum(not each.name for each in summary.groups) - _MOST_UNNAMED
@@ -231,13 +227,7 @@ _NOTHING: dict[str, Any] = {"looked": "", "more": "", "groups": []}
 
 
 class RecurringSounds:
-    """The groups found by `hearthlog discover`, if any.
-
-    Attributes
-    ----------
-    problem : str
-        Why the groups cannot be shown; empty if there is no problem.
-    """
+    """The groups found by `hearthlog discover`, if any; `problem` is why they cannot be shown."""
 
     def __init__(self, folder: Path) -> None:
         self.problem = ""
@@ -262,17 +252,10 @@ class RecurringSounds:
         return described[1]
 
     def name(self, key: str, text: str, words: Words = ENGLISH) -> str:
-        """Start naming a group; return a status text.
+        """Start naming a group by a class or its words, or removing an empty name; return a status.
 
-        Parameters
-        ----------
-        text : str
-            A class, by name or in words; empty to remove the name.
-
-        Raises
-        ------
-        BridgeError
-            If the group no longer exists, the text is no valid class name, or naming cannot start.
+        Raise `BridgeError` if the group no longer exists, the text is no valid class name, or
+        naming cannot start.
         """
         summary = self._summary
         group = None if summary is None else shown_groups(summary).get(key)

@@ -41,23 +41,14 @@ class PageAdmission:
     Any web page in a browser can send requests to every server of this machine. The token excludes
     clients that do not know the address, the check of `Origin` excludes other pages that know it,
     and the check of `Host` excludes pages that use DNS rebinding.
-
-    Attributes
-    ----------
-    key : bytes
-        Key that signs passes.
-    names : frozenset of str
-        Host names under which the page may be requested, with or without a port.
-    ingress : str, optional
-        Address of a proxy that has checked its users: the only client, which needs no token.
     """
 
     bind: str
     port: int
     token: str
-    key: bytes
-    names: frozenset[str] = frozenset()
-    ingress: str = ""
+    key: bytes  # signs passes
+    names: frozenset[str] = frozenset()  # host names of the page, with or without a port
+    ingress: str = ""  # proxy that has checked its users: the only client, which needs no token
 
     def cookie(self) -> str:
         """Return the `Set-Cookie` value with a pass for a year.
@@ -90,17 +81,10 @@ class PageAdmission:
         has_pass: bool = False,
         words: Words = ENGLISH,
     ) -> str:
-        """Check a request.
+        """Check a request; return the reason of a refusal and its remedy, empty if it is admitted.
 
-        Parameters
-        ----------
-        client : str
-            Address of the other end of the connection, which no header field can change.
-
-        Returns
-        -------
-        str
-            Reason of a refusal and its remedy; empty if the request is admitted.
+        `client` is the address of the other end of the connection, which no header field can
+        change.
         """
         origins = fields["Origin"]
         if self.ingress and client != self.ingress:
@@ -185,14 +169,9 @@ class Board:
         return monotonic() - self._seen <= _STALE_SECONDS
 
     def wait(self, known: Mapping[str, int], seconds: float) -> dict[str, PagePart]:
-        """Wait for parts that differ from a reader's; empty on timeout or when closed.
+        """Wait some seconds for parts that differ from a reader's, known by number.
 
-        Parameters
-        ----------
-        known : mapping of str to int
-            Numbers of the reader's parts.
-        seconds : float
-            Timeout.
+        Empty on timeout or when closed.
         """
 
         def newer() -> dict[str, PagePart]:
@@ -278,15 +257,8 @@ class PageContent(Protocol):
 class PageServer(HttpServer):
     """Serves the page from a separate thread.
 
-    Parameters
-    ----------
-    frames : sequence of str, optional
-        Origins of pages that may show this page in a frame.
-
-    Raises
-    ------
-    BridgeError
-        If the address or port cannot be bound.
+    `frames` are origins of pages that may show this page in a frame. Raise `BridgeError` if the
+    address or port cannot be bound.
     """
 
     def __init__(

@@ -32,18 +32,10 @@ _MOST_DOUBTFUL = 4  # bouts of a day
 
 
 class Bout(NamedTuple):
-    """Events of one class at one microphone, with pauses of five minutes at most.
+    """Events of one class at one microphone, with pauses of five minutes at most."""
 
-    Attributes
-    ----------
-    events : sequence of SoundEvent
-        The oldest first; its id is that of the bout.
-    doubts : sequence of DoubtfulSound
-        The same events if they are in doubt and need a look; else none.
-    """
-
-    events: Sequence[SoundEvent]
-    doubts: Sequence[DoubtfulSound] = ()
+    events: Sequence[SoundEvent]  # the oldest first; its id is that of the bout
+    doubts: Sequence[DoubtfulSound] = ()  # the same events if they are in doubt and need a look
 
     @property
     def first(self) -> SoundEvent:
@@ -64,10 +56,8 @@ class Bout(NamedTuple):
 def bouts(events: Iterable[SoundEvent], doubts: Doubts = MappingProxyType({})) -> list[Bout]:
     """Fold events to bouts, the newest first.
 
-    Parameters
-    ----------
-    doubts : mapping of str to DoubtfulSound, optional
-        Events that need a look, by id: the loudest of them are bouts of their own, at most four.
+    Events that need a look are in `doubts`, by id: the loudest of them are bouts of their own, at
+    most four.
     """
     events = list(events)
     folded = _folded(events, doubts)
@@ -117,24 +107,16 @@ def uncounted_ids(
 
 
 class ShownBouts(NamedTuple):
-    """How bouts are shown.
-
-    Attributes
-    ----------
-    correction : callable
-        Returns the correction of an event in words; empty if there is none.
-    uncounted : collection of str
-        Ids of the events that do not count, because of a television beside.
-    """
+    """How bouts are shown."""
 
     now: int
     zone: tzinfo
     words: Words
-    correction: Callable[[SoundEvent], str]
+    correction: Callable[[SoundEvent], str]  # of an event in words; empty if there is none
     is_alone: bool
     sureness: Sureness = UNMEASURED
     common_names: Mapping[str, str] = MappingProxyType({})
-    uncounted: Collection[str] = ()
+    uncounted: Collection[str] = ()  # ids of events that do not count, because of a television
     hidden: Collection[str] = ()
     is_past: bool = False
 
@@ -235,15 +217,8 @@ class KeptSounds:
     def wav(self, event: SoundEvent, hidden: Iterable[SoundEvent]) -> bytes:
         """Return the sound of an event, up to its first minute, as a WAV file.
 
-        Parameters
-        ----------
-        hidden : iterable of SoundEvent
-            Events that nobody may hear: silence takes their place.
-
-        Raises
-        ------
-        BridgeError
-            If no sound was kept, or it cannot be read.
+        Silence takes the place of hidden events, which nobody may hear. Raise `BridgeError` if no
+        sound was kept, or it cannot be read.
         """
         start, end = _limits(event)
         try:

@@ -124,12 +124,8 @@ def health_list(
 ) -> list[Any]:
     """Return the health of all subjects for JSON.
 
-    Parameters
-    ----------
-    started : int
-        Start of the bridge, in nanoseconds of UTC.
-    recurring : str, optional
-        Problem with the recurring sounds; empty for none.
+    `started` is the start of the bridge, in nanoseconds of UTC; `recurring` is a problem with the
+    recurring sounds, if any.
     """
     lines = [*_lines(news, node, started, words)]
     if recurring:
