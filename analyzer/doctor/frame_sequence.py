@@ -67,13 +67,9 @@ class FrameSequence:
         self._begins = np.empty(0, bool)  # which of the settled frames begin a run
 
     def add(self, kind: str, rows: Int64) -> None:
-        """Add messages of one kind.
+        """Add rows [shape=(n, 3)] of one kind, as described in the class; times are ns of UTC.
 
-        Parameters
-        ----------
-        rows : np.ndarray [shape=(n, 3)], int64
-            As described in the class (times in nanoseconds of UTC), in order of log time, after
-            earlier rows of this kind.
+        They are in order of log time, after earlier rows of this kind.
         """
         self._pending.setdefault(kind, []).append(rows)
 

@@ -281,17 +281,11 @@ class ReplayComparison:
     def add_segments(
         self, recorded: Sequence[RawMessages], replayed: Sequence[EncodedMessage], end: int
     ) -> None:
-        """Count the segments of one span of time.
+        """Count the segments of one span; none earlier than `end` (nanoseconds of UTC) comes after.
 
-        Raise `LogError` if a recorded message does not have the type stated by its channel.
-
-        Parameters
-        ----------
-        replayed : sequence of EncodedMessage
-            Replayed segments. A segment that closes at a gap is recorded earlier than it is
-            replayed.
-        end : int
-            End of the last replayed frame, in nanoseconds of UTC: no earlier segment comes after.
+        That is the end of the last replayed frame. A segment that closes at a gap is recorded
+        earlier than it is replayed. Raise `LogError` if a recorded message does not have the type
+        stated by its channel.
         """
         for absent, same in _by_version(recorded).items():
             self._unmatched.update((time, absent, data) for time, data in _recorded(same, absent))
