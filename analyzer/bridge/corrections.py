@@ -201,13 +201,7 @@ class EventCorrections:
         return found | {event.id: own[event.id].label for event in events if event.id in own}
 
     def added(self, microphone: str, events: Sequence[SoundEvent], since: int) -> list[SoundEvent]:
-        """Return the marked sounds since a time that no event of the microphone has.
-
-        Parameters
-        ----------
-        events : sequence of SoundEvent
-            Events of all classes.
-        """
+        """Return the marked sounds since a time that no event of the microphone (any class) has."""
         marks = [
             mark
             for mark in self._marks

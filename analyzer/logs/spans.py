@@ -140,7 +140,7 @@ def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
 
 
 def rows_at(spans: Timed, times: Int64) -> Int64:
-    """Return the row of the span that contains each time (nanoseconds of UTC), or -1."""
+    """Return the row of the span with each time (nanoseconds of UTC, in any order), or -1."""
     if not len(spans.starts):
         return np.full(len(times), -1)
     rows = np.searchsorted(spans.starts, times, side="right") - 1

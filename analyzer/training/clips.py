@@ -104,7 +104,10 @@ class RoomCopy(NamedTuple):
 def in_room(
     frames: Float32, features: FeatureSet, rng: np.random.Generator, *, silence: bool
 ) -> RoomCopy:
-    """Compute the features of frames, at least one, in a random room with noise and microphone."""
+    """Compute the features of frames in a random room with steady noise and microphone.
+
+    There is at least one frame [shape=(n, FRAME_SAMPLES)].
+    """
     sound, level = other_room(frames, rng, silence=silence)
     return in_noise(sound, level, features, rng, silence=silence)
 
@@ -114,9 +117,9 @@ def other_room(
 ) -> tuple[Float64, float]:
     """Return frames in a random room [shape=(n * FRAME_SAMPLES,)], and the noise level in dBFS.
 
-    There is at least one frame. Reverberation is exponentially decaying noise after the direct
-    sound, as in Moorer, "About this reverberation business", 1979; a microphone has tilt, bumps and
-    band limits.
+    There is at least one frame [shape=(n, FRAME_SAMPLES)]. Reverberation is exponentially decaying
+    noise after the direct sound, as in Moorer, "About this reverberation business", 1979; a
+    microphone has tilt, bumps and band limits.
     """
     sound = frames.ravel().astype(np.float64) * 10.0 ** (rng.uniform(*_GAIN_DB) / 20.0)
     if rng.random() < _COPIED_SHARE:
@@ -240,9 +243,10 @@ def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
 
 
 def captured(sound: Float64, features: FeatureSet) -> Float32:
-    """Compute the features of sound [shape=(n,)] captured by a 16-bit microphone, which clips it.
+    """Compute the features of sound captured by a 16-bit microphone, which clips at full scale.
 
-    The sound has complete frames at 16 kHz.
+    The sound [shape=(n,)] has complete frames at 16 kHz; the features have shape (n /
+    FRAME_SAMPLES, d).
     """
     samples = np.clip(np.rint(sound * 32767.0), -32768, 32767) / 32768.0
     return features.extractor()(samples.astype(np.float32).reshape(-1, FRAME_SAMPLES))

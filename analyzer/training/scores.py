@@ -140,7 +140,10 @@ def calibration_error(probabilities: NDArray[np.floating], target: Integers) -> 
 
 
 def reliability(probabilities: NDArray[np.floating], target: Integers) -> list[Bin]:
-    """Compute confidence and accuracy of probabilities [shape=(n, C)] by non-empty bins."""
+    """Compute confidence and accuracy of probabilities [shape=(n, C)] by bins.
+
+    Bins are by confidence, ascending, without empty ones.
+    """
     place, confidence, right = _binned(probabilities, target)
     count = np.bincount(place, minlength=_BINS)
     sure = np.bincount(place, confidence, minlength=_BINS)

@@ -107,9 +107,9 @@ _DURATION_SECONDS = 10.0  # of a class outside the table of classes
 def default_transitions(classes: Sequence[str]) -> Float64:
     """Return transition probabilities [shape=(C, C)] of two or more classes from their durations.
 
-    A value is for the column's class in the frame after a frame of the row's class. A sound is
-    mostly followed by silence, if that is a class, and seldom by another sound: most changes from
-    one sound to another are errors within one of them.
+    A value is for the column's class in the frame after a frame of the row's class. Durations are
+    `expected_durations`. A sound is mostly followed by silence, if that is a class, and seldom by
+    another sound: most changes from one sound to another are errors within one of them.
     """
     leave = 1.0 / np.maximum(expected_durations(classes) / FRAME_SECONDS, 1.0)
     is_sound = np.array([class_name(name) != SILENCE for name in classes])

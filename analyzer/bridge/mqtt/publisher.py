@@ -149,13 +149,7 @@ class MqttPublisher:
             self._connection.send(topic, json.dumps(event_fields(event, news)))
 
     def alert(self, name: str, text: str, time: int) -> bool:
-        """Publish an alert; call again until the method returns True (acknowledged).
-
-        Parameters
-        ----------
-        time : int
-            Time of the notification, in nanoseconds of UTC.
-        """
+        """Publish an alert with a time in ns of UTC; call again until this returns True."""
         since = iso_time(time, self._home.zone)
         fields = {"event_type": "alert", "name": name, "text": text, "time": since}
         return self._connection.deliver(self._topics.at("alert"), json.dumps(fields))
