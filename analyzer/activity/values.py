@@ -14,8 +14,6 @@ _MIN = " min"
 
 
 class _Quantity(ABC):
-    """A quantity of a report."""
-
     @property
     @abstractmethod
     def middle(self) -> float:

@@ -295,7 +295,6 @@ class _Writing:
     def _write(
         self, topic: str, channels: Sequence[Described], pieces: Sequence[TypedColumns]
     ) -> None:
-        """Append messages of one topic."""
         if topic not in self._tables:
             same = [each for each in channels if self._type in {"", type_name(each)}]
             self._tables[topic] = tables_of(topic, same)

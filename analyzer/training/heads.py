@@ -128,7 +128,7 @@ def _calibrated(
 
 
 class _Sums:
-    """Sums over windows by class, collection and unit, each of which can be held out."""
+    """Sums of windows [shape=(m, d)] by class, collection and unit; each can be held out."""
 
     def __init__(
         self, values: Float64, target: Indices, collection: Indices, unit: Indices

@@ -261,10 +261,10 @@ def scenario_of(model: Model) -> Scenario:
 
 
 def load_scenario(name: str) -> Scenario:
-    """Return a built-in scenario, `bathroom` or `general`, or read one from a TOML file.
+    """Return a built-in scenario, `bathroom` or `general`, or read one from the path of a file.
 
-    The file has a table `[classes]`, `name = ["label", ...]`, and may have `ignore = ["label",
-    ...]` above it; its stem becomes the name.
+    The `.toml` file has a table `[classes]`, `name = ["label", ...]`, and may have `ignore =
+    ["label", ...]` above it; its stem becomes the name.
 
     Raise `DataError` if there is no such scenario, or if the file cannot be read, is no TOML, has
     an unknown key, fewer than 2 classes or more than `MOST_CLASSES`, an invalid name of a class, or

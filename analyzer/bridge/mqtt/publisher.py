@@ -225,7 +225,6 @@ class MqttPublisher:
         self._has_published_muted = True
 
     def _topic(self, place: Place) -> str:
-        """Return the topic of a place."""
         kind, microphone, _ = place
         node = self._topics.node
         if kind == CONFIG:

@@ -296,8 +296,6 @@ class PageServer(HttpServer):
 
 
 class _Handler(HttpHandler):
-    """Handler of one request."""
-
     body_limit = 4 << 10
 
     @property
@@ -311,7 +309,6 @@ class _Handler(HttpHandler):
 
     @property
     def _words(self) -> Words:
-        """The words for this browser."""
         return self._server.content.words(self.headers.get("Accept-Language", ""))
 
     def do_GET(self) -> None:

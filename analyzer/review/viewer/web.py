@@ -177,8 +177,6 @@ class _Server(HttpServer):
 
 
 class _Handler(HttpHandler):
-    """Handler of the page's requests."""
-
     timeout = _SECONDS
     body_limit = _LIMIT
 
