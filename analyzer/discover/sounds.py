@@ -301,9 +301,10 @@ def discover(
 
     Groups of an earlier run stay unchanged; None for the first run. `least` is the minimum of
     sounds in a new group. Groups are searched in at most 20,000 sounds, drawn deterministically.
-    Return also the group row of each sound, `NO_CLUSTER` without a group, and the points [shape=(n,
-    d)] of the sounds in the feature space. Raise `DataError` if the groups use other features, or
-    there are too few sounds to group.
+
+    Return also the group row of each sound, `NO_CLUSTER` without a group, and the points of the
+    sounds in the feature space [shape=(n, d)]. Raise `DataError` if the groups use other features,
+    or there are too few sounds to group.
     """
     count = len(sounds.descriptors)
     if groups is not None and groups.features != sounds.features:

@@ -167,13 +167,8 @@ def write_log(
 ) -> WrittenLog:
     """Write the messages of a selection to a stream, as `merge_logs` does to a file.
 
-    Raise `LogError` if a log is damaged, there is no message, or there are more channels than a log
-    can have.
-
-    Parameters
-    ----------
-    progress : callable
-        Receives the completed share, 0 to 1.
+    `progress` receives the completed share, 0 to 1. Raise `LogError` if a log is damaged, there is
+    no message, or there are more channels than a log can have.
     """
     batches = selection.messages(progress, once=True)
     first = next(batches, None)

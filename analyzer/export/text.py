@@ -24,13 +24,7 @@ _MINUS_ZERO = re.compile(r"(?<![\w])-0(?![.\d])")  # many readers parse it as an
 def in_order(
     pieces: Iterable[TypedColumns], lines: Callable[[TypedColumns], list[str]]
 ) -> list[str]:
-    """Return one line per message, in log-time order.
-
-    Parameters
-    ----------
-    pieces : iterable of TypedColumns
-        None where no message could be decoded.
-    """
+    """Return one line per message, in log-time order."""
     texts: list[str] = []
     times: list[Int64] = []
     for piece in pieces:

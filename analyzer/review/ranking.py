@@ -57,9 +57,9 @@ def cover(points: Float64, gamma: float, weights: Float64, eligible: Bool, count
     """Choose up to `count` points that are similar to most of the weight of all points.
 
     Each step adds the eligible point with the largest gain in the sum of weight times similarity to
-    the nearest chosen point. The similarity of x and y is exp(-gamma |x - y|^2); a point [shape=(n,
-    width)] that is not finite is similar to none. Weights are not negative. Points are in the order
-    of choice, without points of no gain.
+    the nearest chosen point; the rows are in this order, without points of no gain. The similarity
+    of x and y is exp(-gamma |x - y|^2). Points have shape (n, width); one that is not finite is
+    similar to none. Weights are not negative.
     """
     similar = _similarities(points, gamma)
     nearest = np.zeros(len(points), np.float32)

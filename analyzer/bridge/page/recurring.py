@@ -137,17 +137,9 @@ class GroupNaming:
         self._lock = Lock()
 
     def start(self, key: str, number: int, label: str, words: Words = ENGLISH) -> str:
-        """Start marking the sounds of a group; return a status text.
+        """Start marking the sounds of a group, or unmarking for an empty label; return a status.
 
-        Parameters
-        ----------
-        label : str
-            Class of the sounds; empty to remove the marks.
-
-        Raises
-        ------
-        BridgeError
-            If another group is being named, or the folder is not writable.
+        Raise `BridgeError` if another group is being named, or the folder is not writable.
         """
         options = ["--undo", str(number)]
         text = words.text("recurring.undoing")
