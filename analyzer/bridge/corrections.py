@@ -120,7 +120,7 @@ class EventCorrections:
         self._reading: threading.Thread | None = None
 
     def refresh(self, say: Callable[[str], None], wait: float = 0.0) -> None:
-        """Read marks made elsewhere, such as in a review, in a thread; wait for it some seconds.
+        """Read marks made elsewhere, such as in a review, in a thread; wait for it up to `wait` s.
 
         A call within a minute of the last reading does nothing.
         """

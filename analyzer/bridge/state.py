@@ -355,7 +355,7 @@ Content = TypeVar("Content")
 
 
 class StateEntry(Generic[Content]):
-    """An entry of the bridge's state, checked by pydantic as of `kind` when it is read.
+    """An entry of the bridge's state, checked by pydantic against `kind` when it is read.
 
     `damaged` and `unsaved` are the consequence, for `say`, of an entry that cannot be read, or
     written.

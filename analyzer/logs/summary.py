@@ -51,9 +51,9 @@ class TopicSummary:
         return (self.messages - 1) * NANOSECONDS / (last - first) if last > first else 0.0
 
     def add(self, count: int, size: int | None, span: Span | None) -> None:
-        """Add messages of this topic; payload bytes before compression, or span, None if unknown.
+        """Add messages of this topic; `size` is payload bytes before compression, None if unknown.
 
-        The span has the first and last log time, in nanoseconds of UTC.
+        The span has the first and last log time, in nanoseconds of UTC; None if unknown.
         """
         self.messages += count
         self.bytes = None if self.bytes is None or size is None else self.bytes + size

@@ -59,7 +59,7 @@ def _of_network(label: str) -> str:
 def unknown_microphone(
     rule: AlertRule, microphones: Collection[str], *, recorded: bool = False
 ) -> str:
-    """Report that the microphone of a rule is not in the configuration, or not in recorded logs.
+    """Report that a rule's microphone is not configured or, if `recorded`, not in the logs.
 
     Empty if it is.
     """

@@ -321,7 +321,7 @@ class RuleState:
 
     last: int = -NEVER  # time of the last notification
     has_rung: bool = False  # whether the condition at the end has given its notification
-    since: int = -NEVER  # when the rule came into force: a recorder before is unknown
+    since: int = -NEVER  # when the rule came into force; whether a recorder ran before is unknown
     until: int = 0  # end of the evaluation; 0 for a new rule
 
 
