@@ -22,24 +22,14 @@ CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
 class SoundClass(NamedTuple):
-    """A class of sound.
-
-    Attributes
-    ----------
-    colour : (int, int, int)
-        Red, green and blue, 0 to 255.
-    several : str
-        Plural name of its events for counts; empty if events are not counted.
-    aliases : tuple of str
-        Names of the same class in other datasets, in the spelling of `find_class`; without
-        subclasses.
-    """
+    """A class of sound."""
 
     name: str
-    colour: tuple[int, int, int]
+    colour: tuple[int, int, int]  # red, green and blue, 0 to 255
     seconds: float
     words: str
-    several: str = ""
+    several: str = ""  # plural name of its events for counts; empty if events are not counted
+    # names of the same class in other datasets, in the spelling of `find_class`; without subclasses
     aliases: tuple[str, ...] = ()
 
 

@@ -127,20 +127,12 @@ _PLURALS = {"array": "lists", "integer": "whole numbers", "number": "numbers", "
 
 
 class _Place(NamedTuple):
-    """Location of an error in a configuration.
-
-    Attributes
-    ----------
-    about : Schema
-        Schema of the value; empty if unknown.
-    name : str
-        The innermost key with a schema; the value may be one element of its value.
-    """
+    """Location of an error in a configuration."""
 
     key: Key
-    about: Schema
+    about: Schema  # schema of the value; empty if unknown
     table: Schema
-    name: str
+    name: str  # the innermost key with a schema; the value may be one element of its value
     named: Schema
 
 

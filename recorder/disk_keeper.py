@@ -112,18 +112,10 @@ _AT_ONCE = 100  # logs thinned per run, so that deletion does not wait for an ho
 
 
 class DiskReport(NamedTuple):
-    """Result of a disk check.
+    """Result of a disk check."""
 
-    Attributes
-    ----------
-    done : str
-        Deletions and thinnings; empty for none.
-    problem : str
-        Failures; empty for none.
-    """
-
-    done: str
-    problem: str
+    done: str  # deletions and thinnings; empty for none
+    problem: str  # failures; empty for none
     values: Mapping[str, str]
     more: bool = False
 

@@ -27,22 +27,13 @@ class SourceHealth:
 
 @dataclass(frozen=True)
 class Frames:
-    """Successive frames of sound.
-
-    Attributes
-    ----------
-    samples : np.ndarray [shape=(n, 800)], float32
-        Samples in full scale, -1 to 1.
-    stamps : np.ndarray [shape=(n,)], int64
-        Time of each frame's first sample in nanoseconds of UTC.
-    channels : np.ndarray [shape=(n, 800, c)], float32, or None
-        Samples of all microphones of an array, with `samples` as the first; None for a single
-        microphone.
-    """
+    """Successive frames of sound."""
 
     first: int
-    samples: Float32
-    stamps: Int64
+    samples: Float32  # [shape=(n, 800)] samples in full scale, -1 to 1
+    stamps: Int64  # [shape=(n,)] time of each frame's first sample in nanoseconds of UTC
+    # [shape=(n, 800, c)] samples of all microphones of an array, with `samples` as the first; None
+    # for a single microphone
     channels: Float32 | None = None
     reports: tuple[SourceHealth, ...] = ()
 

@@ -199,16 +199,11 @@ class RecordingSummary:
 
 @dataclass
 class RecorderState:
-    """State of a recorder, for a terminal; other threads may read it at any time.
-
-    Attributes
-    ----------
-    trouble : dict of str to str
-        Fault by microphone; empty if there is none.
-    """
+    """State of a recorder, for a terminal; other threads may read it at any time."""
 
     sound: dict[str, Frames] = field(default_factory=dict)
     labels: dict[str, FrameLabels | None] = field(default_factory=dict)
+    # fault by microphone; empty if there is none
     trouble: dict[str, str] = field(default_factory=dict)
     clip_frames: int = 0
     keeps: bool = False

@@ -29,20 +29,12 @@ _NO_EARLIER = int(datetime(2024, 1, 1, tzinfo=UTC).timestamp()) * NANOSECONDS
 
 
 class RecordedLog(NamedTuple):
-    """A finished log of a node, with its layers.
-
-    Attributes
-    ----------
-    start : int
-        From its name, in nanoseconds of UTC.
-    size : int
-        Disk usage of log and layers in bytes.
-    """
+    """A finished log of a node, with its layers."""
 
     path: Path
-    start: int
+    start: int  # from its name, in nanoseconds of UTC
     layers: tuple[Path, ...]
-    size: int
+    size: int  # disk usage of log and layers in bytes
     locked: bool
 
     @property
@@ -139,22 +131,12 @@ def _size(path: Path) -> int:
 
 
 class Limits(NamedTuple):
-    """Limits of retention; 0 for no limit.
+    """Limits of retention; 0 for no limit."""
 
-    Attributes
-    ----------
-    days : int
-        Days with recordings.
-    size : int
-        Bytes of finished logs and their layers.
-    free : int
-        Minimum free bytes on the disk.
-    """
-
-    days: int = 0
+    days: int = 0  # days with recordings
     files: int = 0
-    size: int = 0
-    free: int = 0
+    size: int = 0  # bytes of finished logs and their layers
+    free: int = 0  # minimum free bytes on the disk
 
 
 class ThinningDays(NamedTuple):
@@ -238,15 +220,10 @@ class Deletion(NamedTuple):
 
 @dataclass
 class RetentionPlan:
-    """Planned deletions.
-
-    Attributes
-    ----------
-    kept : dict of Path to str
-        Logs beyond a limit that are kept, and the reason.
-    """
+    """Planned deletions."""
 
     deletions: list[Deletion] = field(default_factory=list)
+    # logs beyond a limit that are kept, and the reason
     kept: dict[Path, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     wipes: bool = False

@@ -25,22 +25,12 @@ from hearthlog.schemas.messages.topics import EmbeddingSource
 
 
 class LabelTiming(NamedTuple):
-    """The frames that a label needs, and the frame that it labels.
-
-    Attributes
-    ----------
-    label_frame : int
-        Index in the window, from 0, of the labelled frame.
-    needs_floor : bool
-        Whether the room floor is required at every frame of the window.
-    ahead : int
-        Further frames required after the window, for embeddings that begin in it.
-    """
+    """The frames that a label needs, and the frame that it labels."""
 
     window_frames: int
-    label_frame: int
-    needs_floor: bool
-    ahead: int = 0
+    label_frame: int  # index in the window, from 0, of the labelled frame
+    needs_floor: bool  # whether the room floor is required at every frame of the window
+    ahead: int = 0  # further frames required after the window, for embeddings that begin in it
 
     @property
     def delay(self) -> int:

@@ -26,19 +26,12 @@ MOST_EVIDENCE = 5.0  # limit of the log-likelihood ratio of a class given a dire
 
 @dataclass(frozen=True, eq=False)
 class Directions(FrameSpans):
-    """Directions of the blocks of one stream of frames in which a sound was located.
-
-    Attributes
-    ----------
-    azimuths : np.ndarray [shape=(m,)], float32
-        In radians, -pi to pi, counter-clockwise from x.
-    confidences : np.ndarray [shape=(m,)], float32
-        Agreement of the microphones on this direction relative to any direction, 0 to 1.
-    """
+    """Directions of the blocks of one stream of frames in which a sound was located."""
 
     LENGTH = BLOCK_FRAMES
 
-    azimuths: Float32
+    azimuths: Float32  # [shape=(m,)] in radians, -pi to pi, counter-clockwise from x
+    # [shape=(m,)] agreement of the microphones on this direction relative to any direction, 0 to 1
     confidences: Float32
 
 

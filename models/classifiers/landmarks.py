@@ -21,17 +21,11 @@ _LANDMARKS_AT_ONCE = 256  # no BLAS splits a product of this size among threads
 
 
 class LandmarkParameters(BaseModel):
-    """Parameters of the kernel.
-
-    Attributes
-    ----------
-    gamma : float
-        Of the kernel exp(-gamma |x - l|^2).
-    """
+    """Parameters of the kernel."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
-    gamma: Annotated[float, Field(gt=0.0, le=1e6)]
+    gamma: Annotated[float, Field(gt=0.0, le=1e6)]  # of the kernel exp(-gamma |x - l|^2)
     steps: Annotated[int, Field(ge=1, le=1024)]
 
 

@@ -72,16 +72,7 @@ class PublicCollection(_Record):
 
 
 class TrainingData(_Record):
-    """The training data; the digest covers segments, not files.
-
-    Attributes
-    ----------
-    home_spans : list of [start, end]
-        Time spans of the home's sound used for training, in nanoseconds of UTC, in order; over all
-        microphones, with gaps of less than a minute closed.
-    base_sha256 : str
-        SHA-256 of the model file before adaptation, or empty.
-    """
+    """The training data; the digest covers segments, not files."""
 
     sha256: _Digest
     classes: dict[_ClassName, Amount]
@@ -89,8 +80,10 @@ class TrainingData(_Record):
     home: dict[_ClassName, Amount] = {}
     home_confirmed: dict[_ClassName, _Count] = {}
     home_frames: _Count = 0
+    # time spans of the home's sound used for training, in nanoseconds of UTC, in order; over all
+    # microphones, with gaps of less than a minute closed
     home_spans: Annotated[list[_Span], Field(max_length=MOST_SPANS)] = []
-    base_sha256: _Text = ""
+    base_sha256: _Text = ""  # SHA-256 of the model file before adaptation, or empty
 
     @property
     def simulated(self) -> bool:
@@ -122,28 +115,19 @@ class Metrics(_Record):
 
 
 class Elsewhere(_Record):
-    """Scores on datasets outside the training data, which represent a new home.
-
-    Attributes
-    ----------
-    right : float
-        Share of correctly recognised segments.
-    macro_f1 : float or None
-        Over the classes of these segments and `unknown`; None if the model has no such score.
-    macro_f1_interval : list of float, or None
-        95 %, bootstrap over source groups.
-    calibration_errors : dict of str to float
-        By class, if at least ten of these segments were labelled as the class: distance of the mean
-        probability from the share of correct labels.
-    """
+    """Scores on datasets outside the training data, which represent a new home."""
 
     collections: _Count
     segments: _Count
-    right: _Share
+    right: _Share  # share of correctly recognised segments
     expected_calibration_error: _Share
+    # over the classes of these segments and `unknown`; None if the model has no such score
     macro_f1: _Share | None = None
+    # 95 %, bootstrap over source groups
     macro_f1_interval: Annotated[list[_Share], Field(min_length=2, max_length=2)] | None = None
     classes: dict[_ClassName, _Share] = {}
+    # by class, if at least ten of these segments were labelled as the class: distance of the mean
+    # probability from the share of correct labels
     calibration_errors: dict[_ClassName, _Share] = {}
 
 
@@ -151,24 +135,17 @@ SmoothingMethod = Literal["hmm", "merge"]
 
 
 class Smoothing(_Record):
-    """How labels become segments.
-
-    Attributes
-    ----------
-    weight : float
-        Weight of a frame's probabilities in the hidden Markov model.
-    reach_seconds : float
-        Largest shift of a border of silence, to the change of level.
-    class_exponent : float or None
-        Exponent of the likelihood of a class other than silence, relative to the likeliest of them;
-        the probability of silence is then separate. None: the probabilities are used unchanged.
-    """
+    """How labels become segments."""
 
     method: SmoothingMethod
     lag_seconds: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
+    # weight of a frame's probabilities in the hidden Markov model
     weight: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)] = 1.0
+    # largest shift of a border of silence, to the change of level
     reach_seconds: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
     shortest_seconds: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
+    # exponent of the likelihood of a class other than silence, relative to the likeliest of them;
+    # the probability of silence is then separate. None: the probabilities are used unchanged
     class_exponent: Annotated[float, Field(gt=0.0, le=MOST_WEIGHT)] | None = None
 
 
@@ -191,18 +168,7 @@ class NamesHead(_Record):
 
 
 class EmbeddingMix(_Record):
-    """How a model mixes its classifier with heads on network embeddings.
-
-    Attributes
-    ----------
-    inverse_temperature : float
-        Of the mix, the weighted mean of the logarithms of probabilities.
-    base_inverse_temperature : float or None
-        The value before adaptation to a home; None if the model was never adapted.
-    of_home : bool
-        Whether there is an additional linear head of a home: its decision values are not logarithms
-        of probabilities, but are added to the sum over the other heads.
-    """
+    """How a model mixes its classifier with heads on network embeddings."""
 
     network: _Text
     projection_sha256: _Digest
@@ -213,9 +179,13 @@ class EmbeddingMix(_Record):
     ]
     names: Annotated[list[NamesHead], Field(max_length=MOST_HEADS)] = []
     machine_weight: Annotated[float, Field(ge=0.0, le=MOST_WEIGHT)]
+    # of the mix, the weighted mean of the logarithms of probabilities
     inverse_temperature: Annotated[float, Field(gt=0.0, le=200.0)]
+    # the value before adaptation to a home; None if the model was never adapted
     base_inverse_temperature: Annotated[float, Field(gt=0.0, le=200.0)] | None = None
     bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]] = {}
+    # whether there is an additional linear head of a home: its decision values are not logarithms
+    # of probabilities, but are added to the sum over the other heads
     of_home: bool = False
 
     @property
@@ -225,30 +195,7 @@ class EmbeddingMix(_Record):
 
 
 class Description(_Record):
-    """Everything about a model except its arrays.
-
-    Attributes
-    ----------
-    feature_set_sha256 : str
-        SHA-256 of the network that computes the features; empty for other feature sets.
-    label_frame : int
-        Index in the window, from 0, of the labelled frame.
-    gate : float
-        In dB: a window is silence unless some band is this much above the room floor; 0 for no
-        gate.
-    base_inverse_temperature : float or None
-        The value before adaptation to a home; None if the model was not adapted.
-    novelty : str
-        `doubt`: the probability that a label is wrong. `machine`: the value of the kind of
-        classifier, in older models.
-    elsewhere : Elsewhere or None
-        Scores on held-out datasets, which also set the temperature; None if held-out sources set
-        it, for lack of datasets.
-    direction_microphones : list of str
-        Names of the microphone arrays whose directions the model uses; if any, the format is 6.
-    embedding : EmbeddingMix or None
-        Use of network embeddings; if present, the format is 7.
-    """
+    """Everything about a model except its arrays."""
 
     format: Literal[5, 6, 7]
     kind: _Text
@@ -257,26 +204,35 @@ class Description(_Record):
     classes: Annotated[list[_ClassName], Field(min_length=2, max_length=MOST_CLASSES)]
     feature_set: _Text
     feature_set_version: Annotated[int, Field(ge=1, lt=1 << 31)]
+    # SHA-256 of the network that computes the features; empty for other feature sets
     feature_set_sha256: _Digest | Literal[""] = ""
     feature_names: Annotated[list[_Text], Field(min_length=1, max_length=MOST_FEATURES)]
     inputs: _Text
     window_seconds: _Positive
+    # index in the window, from 0, of the labelled frame
     label_frame: Annotated[int, Field(ge=0, lt=1000)]
+    # in dB: a window is silence unless some band is this much above the room floor; 0 for no gate
     gate: Annotated[float, Field(ge=0.0, le=40.0)]
     scenario_name: _Text
     scenario: dict[_ClassName, list[_Text]]
     copies: _Count = 0
     calibration: Literal["temperature"]
     inverse_temperature: _Positive
+    # the value before adaptation to a home; None if the model was not adapted
     base_inverse_temperature: _Positive | None = None
     decision_bias: dict[_ClassName, Annotated[float, Field(ge=-100.0, le=100.0)]]
+    # `doubt`: the probability that a label is wrong. `machine`: the value of the kind of
+    # classifier, in older models
     novelty: Literal["doubt", "machine"]
+    # scores on held-out datasets, which also set the temperature; None if held-out sources set it,
+    # for lack of datasets
     elsewhere: Elsewhere | None
     smoothing: Smoothing
     training_data: TrainingData
     metrics: Metrics
+    # names of the microphone arrays whose directions the model uses; if any, the format is 6
     direction_microphones: Annotated[list[_Text], Field(max_length=MOST_ARRAYS)] = []
-    embedding: EmbeddingMix | None = None
+    embedding: EmbeddingMix | None = None  # use of network embeddings; if present, the format is 7
     seed: _Count = 0
     versions: dict[_Text, _Text]
 

@@ -50,15 +50,7 @@ _Logged = Annotated[int, Field(ge=-128, le=127)]
 
 
 class NameRule(BaseModel):
-    """Decision rule of a name on its logged value.
-
-    Attributes
-    ----------
-    seconds : float
-        Expected duration without a pause; of simultaneous names, the one with the shortest wins.
-    precision : float
-        Share of correct labels where the threshold was measured.
-    """
+    """Decision rule of a name on its logged value."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -66,7 +58,9 @@ class NameRule(BaseModel):
     begins: _Logged
     goes_on: _Logged
     windows: Annotated[int, Field(ge=1, le=MOST_WINDOWS)]
+    # expected duration without a pause; of simultaneous names, the one with the shortest wins
     seconds: Annotated[float, Field(gt=0.0, le=1e6)]
+    # share of correct labels where the threshold was measured
     precision: Annotated[float, Field(gt=0.5, le=1.0)]
 
 

@@ -13,18 +13,12 @@ _FARTHEST = 1 << 20  # steps: with a thousand inputs, sums of squares are exact 
 
 
 class Prepared(NamedTuple):
-    """Windows or vectors.
+    """Windows or vectors."""
 
-    Attributes
-    ----------
-    values : np.ndarray [shape=(n, width + 2) or (width + 2, m)], float32 or float64
-        Windows in rows, vectors in columns.
-    longest : float
-        Length of the longest window or vector, in steps; 0 without steps.
-    """
-
+    # [shape=(n, width + 2) or (width + 2, m), float32 or float64] windows in rows, vectors in
+    # columns
     values: NDArray[Any]
-    longest: float
+    longest: float  # length of the longest window or vector, in steps; 0 without steps
 
 
 class Distances(Protocol):

@@ -31,21 +31,14 @@ _Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
 class SvmParameters(BaseModel):
-    """Parameters of a machine.
-
-    Attributes
-    ----------
-    gamma : float
-        Of the kernel exp(-gamma |x - s|^2).
-    steps : int or None
-        Rounding steps per standard deviation of the inputs; None for models of hearthlog 0.1, which
-        do not round.
-    """
+    """Parameters of a machine."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
     cost: _Positive
-    gamma: _Positive
+    gamma: _Positive  # of the kernel exp(-gamma |x - s|^2)
+    # rounding steps per standard deviation of the inputs; None for models of hearthlog 0.1, which
+    # do not round
     steps: Annotated[int, Field(ge=1, le=1024)] | None = None
 
 

@@ -103,19 +103,11 @@ _PATIENCE_SECONDS = 5.0
 
 @dataclass(frozen=True)
 class NetworkFile:
-    """A file with a network.
-
-    Attributes
-    ----------
-    size : int
-        In bytes.
-    url : str
-        Download address; empty for a file identified by its digest alone.
-    """
+    """A file with a network."""
 
     sha256: str
-    size: int
-    url: str = ""
+    size: int  # in bytes
+    url: str = ""  # download address; empty for a file identified by its digest alone
 
 
 class KnownAnswer(NamedTuple):
@@ -129,17 +121,11 @@ class KnownAnswer(NamedTuple):
 
 @dataclass(frozen=True)
 class EmbeddingNetwork:
-    """A pretrained network whose embedding and names are logged.
-
-    Attributes
-    ----------
-    window : int
-        Input samples at 16 kHz, at most a second.
-    """
+    """A pretrained network whose embedding and names are logged."""
 
     name: str
     files: tuple[NetworkFile, ...]
-    window: int
+    window: int  # input samples at 16 kHz, at most a second
     width: int
     names: int
     projection: Path

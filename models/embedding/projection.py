@@ -28,20 +28,12 @@ from hearthlog.schemas.files import read_limited
 
 @dataclass(frozen=True, eq=False)
 class FrameSpans:
-    """Spans of equal length, with one row per span in every field.
-
-    Attributes
-    ----------
-    frames : np.ndarray [shape=(m,)], int64
-        Number of the first frame of each span; increasing.
-    stamps : np.ndarray [shape=(m,)], int64
-        Starts of these frames in nanoseconds of UTC.
-    """
+    """Spans of equal length, with one row per span in every field."""
 
     LENGTH: ClassVar[int]  # frames
 
-    frames: Int64
-    stamps: Int64
+    frames: Int64  # [shape=(m,)] number of the first frame of each span; increasing
+    stamps: Int64  # [shape=(m,)] starts of these frames in nanoseconds of UTC
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -90,17 +82,11 @@ Int8 = NDArray[np.int8]
 
 @dataclass(frozen=True, eq=False)
 class Embeddings(FrameSpans):
-    """Embeddings of windows in which there was sound; windows begin at multiples of ten frames.
-
-    Attributes
-    ----------
-    values : np.ndarray [shape=(m, W)], int8
-        From `Projection.quantise`.
-    """
+    """Embeddings of windows in which there was sound; windows begin at multiples of ten frames."""
 
     LENGTH = WINDOW_FRAMES
 
-    values: Int8
+    values: Int8  # [shape=(m, W)] from `Projection.quantise`
 
 
 NO_EMBEDDINGS = Embeddings(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 0), np.int8))
@@ -113,23 +99,12 @@ _HIGHEST = 127  # of an int8; symmetric: the lowest is -127
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """A projection onto W integers: k components, then the groups.
+    """A projection onto W integers: k components, then the groups."""
 
-    Attributes
-    ----------
-    mean : np.ndarray [shape=(E,)], float32
-        In half precision, like the components.
-    components : np.ndarray [shape=(E, k)], float32
-    steps : np.ndarray [shape=(W,)], float32
-        Step between adjacent integers.
-    lows : np.ndarray [shape=(W,)], float32
-        Lower limit of the values.
-    """
-
-    mean: Float32
-    components: Float32
-    steps: Float32
-    lows: Float32
+    mean: Float32  # [shape=(E,)] in half precision, like the components
+    components: Float32  # [shape=(E, k)]
+    steps: Float32  # [shape=(W,)] step between adjacent integers
+    lows: Float32  # [shape=(W,)] lower limit of the values
     groups: Mapping[str, Sequence[int]]
     sha256: str = ""
 

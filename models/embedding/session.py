@@ -22,17 +22,10 @@ _loading = threading.Lock()
 
 
 class NetworkOutput(NamedTuple):
-    """The output of a network for a window.
+    """The output of a network for a window."""
 
-    Attributes
-    ----------
-    embedding : np.ndarray [shape=(E,)], float32
-    logits : np.ndarray [shape=(N,)], float32
-        Of the classes with names.
-    """
-
-    embedding: Float32
-    logits: Float32
+    embedding: Float32  # [shape=(E,)]
+    logits: Float32  # [shape=(N,)] of the classes with names
 
 
 class NetworkSession(Protocol):

@@ -22,14 +22,6 @@ class SoundName(NamedTuple):
     """A name of a sound, and its detection accuracy.
 
     The table `audioset_names.csv` contains the names, as measured by `hearthlog.tools.lab.names`.
-
-    Attributes
-    ----------
-    is_event : bool
-        Whether its measured precision is sufficient for an event; else it is a hint.
-    precision, recall, false_an_hour : float
-        For an event, on sources not used to choose its threshold; for a hint, on all sources; NaN
-        for too few sources.
     """
 
     name: str
@@ -38,9 +30,12 @@ class SoundName(NamedTuple):
     seconds: float
     windows: int
     threshold: float = 0.0
+    # whether its measured precision is sufficient for an event; else it is a hint
     is_event: bool = False
     clips: int = 0
     sources: int = 0
+    # for an event, on sources not used to choose its threshold; for a hint, on all sources; NaN for
+    # too few sources
     precision: float = math.nan
     recall: float = math.nan
     false_an_hour: float = math.nan
@@ -75,16 +70,10 @@ def write_names(names: Sequence[SoundName], path: Path) -> None:
 
 
 class NamedSound(NamedTuple):
-    """A sound named by the network.
-
-    Attributes
-    ----------
-    first, end : int
-        Number of its first frame, and of the frame after its last.
-    """
+    """A sound named by the network."""
 
     name: SoundName
-    first: int
+    first: int  # number of its first frame, and of the frame after its last
     end: int
     logit: float
 

@@ -26,25 +26,15 @@ NOMINAL = 1e-7  # power, -70 dBFS: differences below it come from codecs
 
 
 class Floors(NamedTuple):
-    """Floors at successive frames.
+    """Floors at successive frames."""
 
-    Attributes
-    ----------
-    powers : np.ndarray [shape=(m, b)], float64
-        Powers of the bands; the last is of the complete frame.
-    room : np.ndarray [shape=(m, b)], float64
-        The same, including steady sound that continues and is not loud: sound not above it is
-        silence.
-    sound : np.ndarray [shape=(m, b)], float64
-        Band powers of the frames themselves.
-    converged : bool
-        Whether these floors, and the floors of the preceding second, are independent of frames
-        before the start of the stream.
-    """
-
-    powers: Float64
+    powers: Float64  # [shape=(m, b)] powers of the bands; the last is of the complete frame
+    # [shape=(m, b)] the same, including steady sound that continues and is not loud: sound not
+    # above it is silence
     room: Float64
-    sound: Float64
+    sound: Float64  # [shape=(m, b)] band powers of the frames themselves
+    # whether these floors, and the floors of the preceding second, are independent of frames before
+    # the start of the stream
     converged: bool
 
 

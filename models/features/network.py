@@ -52,23 +52,15 @@ class _Content(BaseModel):
 
 @dataclass(frozen=True)
 class NetworkCard:
-    """The content of a card.
-
-    Attributes
-    ----------
-    window, hop : int
-        Samples at 16 kHz of one input, and between successive inputs.
-    input, output : str
-        Names in the network; empty for its only input or output.
-    """
+    """The content of a card."""
 
     path: Path
     sha256: str
     sample_rate: int
-    window: int
+    window: int  # samples at 16 kHz of one input, and between successive inputs
     hop: int
     names: tuple[str, ...]
-    input: str
+    input: str  # names in the network; empty for its only input or output
     output: str
 
     @property
@@ -355,15 +347,9 @@ def _levels(samples: Float32) -> Float32:
 
 @dataclass(frozen=True)
 class LastEmbedding:
-    """The embedding at the last frame of a window, as `Inputs`.
+    """The embedding at the last frame of a window, as `Inputs`."""
 
-    Attributes
-    ----------
-    window_frames : int
-        Large enough for the complete sound of that embedding to lie in the window.
-    """
-
-    window_frames: int
+    window_frames: int  # large enough for the complete sound of that embedding to lie in the window
     width: int
     needs_floor: bool = False
 

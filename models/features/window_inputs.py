@@ -113,20 +113,14 @@ def window_places(segment_frames: int, window_frames: int) -> range:
 
 @dataclass(frozen=True)
 class WindowStatistics:
-    """Mean and standard deviation over a window of features, or of values derived from them.
-
-    Attributes
-    ----------
-    values : callable
-        Maps features, shape (n, d), to the values of each frame, shape (n, d').
-    needs_floor : bool
-        Whether `values` takes floors, shape (n, b), or None as a second argument.
-    """
+    """Mean and standard deviation over a window of features, or of values derived from them."""
 
     window_frames: int
+    # maps features, shape (n, d), to the values of each frame, shape (n, d')
     values: Callable[..., NDArray[Any]]
     values_width: int
     changes: bool = False
+    # whether `values` takes floors, shape (n, b), or None as a second argument
     needs_floor: bool = False
 
     @property

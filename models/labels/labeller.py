@@ -24,37 +24,21 @@ from hearthlog.schemas.messages.topics import EmbeddingSource
 
 
 class FrameLabels(NamedTuple):
-    """Classifier results of successive frames, each from the window around the frame.
+    """Classifier results of successive frames, each from the window around the frame."""
 
-    Attributes
-    ----------
-    classes : tuple of str
-        Names behind the columns of the probabilities.
-    frames : np.ndarray [shape=(n,)], int64
-        Numbers of the frames.
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
-    known_at : np.ndarray [shape=(n,)], int64
-        Starts of the last frames of the windows, which complete the labels.
-    probabilities : np.ndarray [shape=(n, C)], float32
-    by_features : np.ndarray [shape=(n, C)], float32
-        Probabilities from the features alone, which the privacy filter uses.
-    novelty : np.ndarray [shape=(n,)], float32
-        From 0 to 1; NaN if the classifier computes none.
-    by_names : np.ndarray [shape=(n, C)], float64, or None
-        Highest network logit of the names of each class around the frame; NaN without an embedding,
-        or for a class without names.
-    """
-
-    classes: tuple[str, ...]
-    frames: Int64
-    stamps: Int64
+    classes: tuple[str, ...]  # names behind the columns of the probabilities
+    frames: Int64  # [shape=(n,)] numbers of the frames
+    stamps: Int64  # [shape=(n,)] starts of the frames in nanoseconds of UTC
+    # [shape=(n,)] starts of the last frames of the windows, which complete the labels
     known_at: Int64
-    probabilities: Float32
+    probabilities: Float32  # [shape=(n, C)]
+    # [shape=(n, C)] probabilities from the features alone, which the privacy filter uses
     by_features: Float32
-    novelty: Float32
+    novelty: Float32  # [shape=(n,)] from 0 to 1; NaN if the classifier computes none
     calibrated_elsewhere: bool
     ahead: int = 0
+    # [shape=(n, C)] highest network logit of the names of each class around the frame; NaN without
+    # an embedding, or for a class without names
     by_names: Float64 | None = None
 
     def columns(self, microphone: str) -> dict[str, Column]:

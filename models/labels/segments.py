@@ -133,20 +133,12 @@ _UNITS = 1 << 30  # to 1: finer than the resolution of a float32 below 1
 
 
 class StateRun(NamedTuple):
-    """Successive frames of one state; the run may continue.
-
-    Attributes
-    ----------
-    start : int
-        Start of the first frame in nanoseconds of UTC.
-    confidence : int
-        Sum of the probabilities of the class in units of 2**-30: integer sums do not depend on
-        order.
-    """
+    """Successive frames of one state; the run may continue."""
 
     label: int
-    start: int
+    start: int  # start of the first frame in nanoseconds of UTC
     frames: int
+    # sum of the probabilities of the class in units of 2**-30: integer sums do not depend on order
     confidence: int
 
     def prepend(self, earlier: "StateRun | None") -> "StateRun":
@@ -164,19 +156,12 @@ class StateRun(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """A run that has ended.
-
-    Attributes
-    ----------
-    end : int
-        End of the last frame in nanoseconds of UTC.
-    decided_at : int
-        Start of the frame that decided the end, in nanoseconds of UTC; at the end of the sound,
-        that end.
-    """
+    """A run that has ended."""
 
     run: StateRun
-    end: int
+    end: int  # end of the last frame in nanoseconds of UTC
+    # start of the frame that decided the end, in nanoseconds of UTC; at the end of the sound, that
+    # end
     decided_at: int
 
     @property
@@ -196,23 +181,12 @@ class Segment(NamedTuple):
 
 
 class SegmenterInput(NamedTuple):
-    """Successive frames with class probabilities.
+    """Successive frames with class probabilities."""
 
-    Attributes
-    ----------
-    probabilities : np.ndarray [shape=(n, C)], float32
-    powers : np.ndarray [shape=(n,)]
-        Mean squares of the samples.
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
-    known_at : np.ndarray [shape=(n,)], int64
-        Starts of the frames that completed the probabilities.
-    """
-
-    probabilities: Float32
-    powers: NDArray[Any]
-    stamps: Int64
-    known_at: Int64
+    probabilities: Float32  # [shape=(n, C)]
+    powers: NDArray[Any]  # [shape=(n,)] mean squares of the samples
+    stamps: Int64  # [shape=(n,)] starts of the frames in nanoseconds of UTC
+    known_at: Int64  # [shape=(n,)] starts of the frames that completed the probabilities
 
     def followed_by(self, later: "SegmenterInput") -> "SegmenterInput":
         """Concatenate these frames and later frames."""

@@ -39,22 +39,16 @@ class Judgement(BaseModel):
 
     The file name contains the hash of the model, so another model of the same name has no
     judgement.
-
-    Attributes
-    ----------
-    champion : str
-        SHA-256 of the model used for comparison; empty if there was none.
-    judged : int
-        Time of the judgement in nanoseconds of UTC.
-    reasons : tuple of str
-        Reasons for a refusal, one sentence each; empty if the model may label.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     model: Annotated[str, StringConstraints(pattern=f"^{_SHA256}$")]
+    # SHA-256 of the model used for comparison; empty if there was none
     champion: Annotated[str, StringConstraints(pattern=f"^({_SHA256})?$")]
+    # time of the judgement in nanoseconds of UTC
     judged: Annotated[int, Field(ge=0, lt=1 << 63, strict=True)]
+    # reasons for a refusal, one sentence each; empty if the model may label
     reasons: Annotated[tuple[_Text, ...], Field(max_length=_MOST_REASONS)] = ()
     insisted: Annotated[bool, Field(strict=True)] = False
 

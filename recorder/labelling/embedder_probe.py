@@ -45,16 +45,10 @@ _SIGNALS: dict[int, str] = {
 
 
 class Probe(NamedTuple):
-    """Result of a network test.
-
-    Attributes
-    ----------
-    megabytes : float
-        Peak memory of a process that only runs the network; 0 if unknown.
-    """
+    """Result of a network test."""
 
     seconds: float
-    megabytes: float
+    megabytes: float  # peak memory of a process that only runs the network; 0 if unknown
     different_answers: list[str]
 
     @property

@@ -61,16 +61,10 @@ def _classes(model: Model) -> dict[str, str]:
 
 
 class ModelChange(NamedTuple):
-    """A change of the model of a labelling.
-
-    Attributes
-    ----------
-    model : Model or None
-        None for no labels.
-    """
+    """A change of the model of a labelling."""
 
     labelling: str
-    model: Model | None
+    model: Model | None  # None for no labels
     classifier: Classifier | None
 
 

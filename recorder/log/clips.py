@@ -41,17 +41,10 @@ _AFTER_FRAMES = NANOSECONDS // FRAME_NANOSECONDS
 
 
 class KeptSound(NamedTuple):
-    """Successive frames of a clip.
+    """Successive frames of a clip."""
 
-    Attributes
-    ----------
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
-    samples : np.ndarray [shape=(n, 800)], int16
-    """
-
-    stamps: Int64
-    samples: Int16
+    stamps: Int64  # [shape=(n,)] starts of the frames in nanoseconds of UTC
+    samples: Int16  # [shape=(n, 800)]
 
 
 class ClipFinder:

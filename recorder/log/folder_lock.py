@@ -125,20 +125,12 @@ def check_writable(folder: Path) -> None:
 
 
 class NodeLock(NamedTuple):
-    """Lock of a node found in a folder.
-
-    Attributes
-    ----------
-    process : int
-        The last holder; 0 if the file has no number.
-    is_held : bool or None
-        None if this account may not read the file.
-    """
+    """Lock of a node found in a folder."""
 
     path: Path
     node: str
-    process: int
-    is_held: bool | None
+    process: int  # the last holder; 0 if the file has no number
+    is_held: bool | None  # None if this account may not read the file
 
 
 def node_locks(folder: Path) -> Iterator[NodeLock]:

@@ -33,19 +33,11 @@ _CHUNK_SPAN = 10 * NANOSECONDS  # of a finished log, which is read completely, n
 
 @dataclass(frozen=True)
 class Recovered:
-    """A completed log.
-
-    Attributes
-    ----------
-    damage : str
-        Damage in the file and losses; empty if the file only ended early.
-    completed : bool
-        False for a log that cannot be completed now, or was empty.
-    """
+    """A completed log."""
 
     path: Path
-    damage: str
-    completed: bool = True
+    damage: str  # damage in the file and losses; empty if the file only ended early
+    completed: bool = True  # False for a log that cannot be completed now, or was empty
 
 
 def recover_active(root: Path, node: str) -> list[Recovered]:

@@ -87,19 +87,12 @@ _CARDS = Path("/sys/class/sound")
 
 
 class UsbPlace(NamedTuple):
-    """USB location of a sound card.
+    """USB location of a sound card."""
 
-    Attributes
-    ----------
-    port : str
-        `usb:` with bus and ports, such as "usb:1-1.2"; stable over reboots for the same socket.
-        Empty for a card that is not on USB.
-    serial : str
-        `serial:` with the serial number; empty without one.
-    """
-
+    # `usb:` with bus and ports, such as "usb:1-1.2"; stable over reboots for the same socket. Empty
+    # for a card that is not on USB
     port: str = ""
-    serial: str = ""
+    serial: str = ""  # `serial:` with the serial number; empty without one
 
 
 def usb_place(card: int, cards: Path = _CARDS) -> UsbPlace:
@@ -124,20 +117,12 @@ _CARD_NUMBER = re.compile(r" ?\((?:hw|plughw):(\d+),\d+\)$")
 
 @dataclass(frozen=True)
 class Device:
-    """A microphone that PortAudio can open.
-
-    Attributes
-    ----------
-    name : str
-        Name without the number of the sound card, which changes between starts.
-    default_rate : float
-        In Hz.
-    """
+    """A microphone that PortAudio can open."""
 
     index: int
-    name: str
+    name: str  # name without the number of the sound card, which changes between starts
     channels: int
-    default_rate: float
+    default_rate: float  # in Hz
     is_default: bool
     port: str = ""
     serial: str = ""

@@ -72,20 +72,12 @@ _DIRECTIVES = {
 
 
 class FileTime(NamedTuple):
-    """Start of an audio file.
-
-    Attributes
-    ----------
-    step : int
-        Resolution of the start, in nanoseconds.
-    remark : str
-        Why the start may be wrong; empty if there is no doubt.
-    """
+    """Start of an audio file."""
 
     start: int
-    step: int
+    step: int  # resolution of the start, in nanoseconds
     origin: str
-    remark: str = ""
+    remark: str = ""  # why the start may be wrong; empty if there is no doubt
 
 
 class _Moment(NamedTuple):

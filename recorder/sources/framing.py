@@ -180,25 +180,16 @@ _INT16_FULL_SCALE = np.float32(32768.0)
 
 @dataclass(frozen=True)
 class SampleBlock:
-    """One block of samples from the capture process.
-
-    Attributes
-    ----------
-    samples : np.ndarray [shape=(n,) or (n, c)], int16
-        With a channel axis for an array of microphones.
-    overflowed : bool
-        The sound card lost samples before the last sample of this block, or a little earlier.
-    adc_time : float
-        Capture time of the first sample, in seconds of a clock of the driver's choice.
-    arrival : float
-        Arrival of the block, in seconds of CLOCK_MONOTONIC.
-    """
+    """One block of samples from the capture process."""
 
     index: int
+    # [shape=(n,) or (n, c)] with a channel axis for an array of microphones
     samples: NDArray[np.int16]
+    # the sound card lost samples before the last sample of this block, or a little earlier
     overflowed: bool
+    # capture time of the first sample, in seconds of a clock of the driver's choice
     adc_time: float
-    arrival: float
+    arrival: float  # arrival of the block, in seconds of CLOCK_MONOTONIC
 
     @property
     def has_adc_time(self) -> bool:

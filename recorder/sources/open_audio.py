@@ -64,24 +64,16 @@ _REDIRECTED = RLock()
 
 
 class OpenAudio(NamedTuple):
-    """An open audio file.
-
-    Attributes
-    ----------
-    frames : int or None
-        Samples per channel according to the header; None if the header has no length.
-    blocks : callable
-        `blocks(first, last)` yields the readable samples of a range as float32 of shape (n,
-        channels). Call it once.
-    fault : callable
-        After the blocks were read, returns why they end before the sound does; empty if they do
-        not.
-    """
+    """An open audio file."""
 
     rate: int
     channels: int
+    # samples per channel according to the header; None if the header has no length
     frames: int | None
+    # `blocks(first, last)` yields the readable samples of a range as float32 of shape (n,
+    # channels). Call it once
     blocks: Callable[[int, float], Iterator[Float32]]
+    # after the blocks were read, returns why they end before the sound does; empty if they do not
     fault: Callable[[], str]
 
 

@@ -31,34 +31,20 @@ _LINE = 0.02  # maximum breadth of a line, relative to its length
 
 
 class DirectionGrid(NamedTuple):
-    """Grid of candidate directions.
+    """Grid of candidate directions."""
 
-    Attributes
-    ----------
-    azimuths : np.ndarray [shape=(a,)], float64
-        In radians, counter-clockwise from x, in equal steps.
-    before, after : np.ndarray [shape=(a,)], intp
-        Indices of the neighbours of each direction.
-    step : float
-        In radians.
-    """
-
-    azimuths: Float64
-    before: Indices
+    azimuths: Float64  # [shape=(a,)] in radians, counter-clockwise from x, in equal steps
+    before: Indices  # [shape=(a,)] indices of the neighbours of each direction
     after: Indices
-    step: float
+    step: float  # in radians
 
 
 @dataclass(frozen=True)
 class ArrayGeometry:
-    """Microphone positions of an array.
+    """Microphone positions of an array."""
 
-    Attributes
-    ----------
-    positions : np.ndarray [shape=(c, 3)], float64
-        Position of each channel's microphone, in metres: x forward, y to the left, z up.
-    """
-
+    # [shape=(c, 3)] position of each channel's microphone, in metres: x forward, y to the left, z
+    # up
     positions: Float64
 
     @property
@@ -180,21 +166,15 @@ _WIDTHS = np.diff([*_STARTS, _BINS])
 
 
 class Located(NamedTuple):
-    """Directions of the blocks in which a source was located.
+    """Directions of the blocks in which a source was located."""
 
-    Attributes
-    ----------
-    places : np.ndarray [shape=(m,)], int64
-        Start of each block in frames relative to the first pushed frame; negative if the block
-        began earlier.
-    azimuths : np.ndarray [shape=(m,)], float32
-        In radians, -pi to pi, counter-clockwise from x; in steps of 1/512.
-    confidences : np.ndarray [shape=(m,)], float32
-        Excess of the phase agreement in this direction over the mean of all directions, 0 to 1.
-    """
-
+    # [shape=(m,)] start of each block in frames relative to the first pushed frame; negative if the
+    # block began earlier
     places: Int64
+    # [shape=(m,)] in radians, -pi to pi, counter-clockwise from x; in steps of 1/512
     azimuths: Float32
+    # [shape=(m,)] excess of the phase agreement in this direction over the mean of all directions,
+    # 0 to 1
     confidences: Float32
 
 

@@ -124,21 +124,12 @@ class _Frames(NamedTuple):
 
 
 class LoggedFrames(NamedTuple):
-    """Features of successive frames, as logged.
+    """Features of successive frames, as logged."""
 
-    Attributes
-    ----------
-    features : np.ndarray [shape=(n, d)], float32
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
-    private : np.ndarray [shape=(n,)], bool
-        Whether a frame may contain speech.
-    """
-
-    features: Float32
+    features: Float32  # [shape=(n, d)]
     first: int
-    stamps: Int64
-    private: Bool
+    stamps: Int64  # [shape=(n,)] starts of the frames in nanoseconds of UTC
+    private: Bool  # [shape=(n,)] whether a frame may contain speech
 
 
 class PrivacyFilter:

@@ -112,21 +112,11 @@ def active_path(path: Path) -> Path:
 
 
 class LogName(NamedTuple):
-    """Parts of the file name of a log or a layer.
+    """Parts of the file name of a log or a layer."""
 
-    Attributes
-    ----------
-    log : str
-        Name of the log without suffix; for a layer, the name of its log.
-    layer : str
-        `audio`, `review` or `relabel-<model>`; empty for a log.
-    node, time : str
-        `20260301T120000Z` with an optional ending; empty if the name is not a recorder's.
-    """
-
-    log: str
-    layer: str
-    node: str
+    log: str  # name of the log without suffix; for a layer, the name of its log
+    layer: str  # `audio`, `review` or `relabel-<model>`; empty for a log
+    node: str  # `20260301T120000Z` with an optional ending; empty if the name is not a recorder's
     time: str
 
 
@@ -286,18 +276,13 @@ def walk_logs(
 
 
 class Inside(NamedTuple):
-    """Content of a local folder.
-
-    Attributes
-    ----------
-    is_all : bool
-        Whether any change of the content changes the folder itself. Targets of links may change
-        elsewhere.
-    """
+    """Content of a local folder."""
 
     folders: list["os.DirEntry[str]"]
     logs: list["os.DirEntry[str]"]
     compressed: list[str]
+    # whether any change of the content changes the folder itself. Targets of links may change
+    # elsewhere
     is_all: bool
 
 

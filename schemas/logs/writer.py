@@ -156,16 +156,10 @@ class Attachment:
 
 
 class TopicBatch(NamedTuple):
-    """Messages of one topic as columns.
-
-    Attributes
-    ----------
-    log_times : np.ndarray [shape=(n,)], int64
-        Nanoseconds; also the publish times.
-    """
+    """Messages of one topic as columns."""
 
     topic: str
-    log_times: Int64
+    log_times: Int64  # [shape=(n,)] nanoseconds; also the publish times
     fields: Mapping[str, Column]
 
 

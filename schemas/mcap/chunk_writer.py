@@ -37,24 +37,14 @@ from hearthlog.schemas.mcap.records import (
 
 
 class Block(NamedTuple):
-    """Messages of one channel with payloads of one size.
-
-    Attributes
-    ----------
-    log_times, publish_times : np.ndarray [shape=(n,)], int64
-        Nanoseconds of UTC.
-    sequences : np.ndarray [shape=(n,)], uint32
-    payloads : np.ndarray [shape=(n,)], of a dtype of the payloads' size
-    rank : np.ndarray [shape=(n,)], int64
-        Order of messages with equal log times.
-    """
+    """Messages of one channel with payloads of one size."""
 
     channel: int
-    log_times: Int64
+    log_times: Int64  # [shape=(n,)] nanoseconds of UTC
     publish_times: Int64
-    sequences: NDArray[np.uint32]
+    sequences: NDArray[np.uint32]  # [shape=(n,)]
     payloads: NDArray[np.void]
-    rank: Int64
+    rank: Int64  # [shape=(n,)] order of messages with equal log times
 
     def records(self) -> NDArray[np.void]:
         """Encode the messages as MCAP records.
@@ -93,27 +83,13 @@ def message_blocks(messages: RawMessages, channel: int, first_rank: int = 0) -> 
 
 
 class MessageRecords(NamedTuple):
-    """Message records of one or more channels, in the order of their log times.
+    """Message records of one or more channels, in the order of their log times."""
 
-    Attributes
-    ----------
-    data : np.ndarray [shape=(b,)], uint8
-        Concatenated records.
-    ends : np.ndarray [shape=(n,)], int64
-        End offset of each record in the data.
-    sizes : np.ndarray [shape=(n,)], int64
-        Bytes of each record.
-    channels : np.ndarray [shape=(n,)], int64
-        Channel ID of each record.
-    times : np.ndarray [shape=(n,)], int64
-        Log time of each in nanoseconds, ascending.
-    """
-
-    data: Bytes
-    ends: Int64
-    sizes: Int64
-    channels: Int64
-    times: Int64
+    data: Bytes  # [shape=(b,)] concatenated records
+    ends: Int64  # [shape=(n,)] end offset of each record in the data
+    sizes: Int64  # [shape=(n,)] bytes of each record
+    channels: Int64  # [shape=(n,)] channel ID of each record
+    times: Int64  # [shape=(n,)] log time of each in nanoseconds, ascending
 
 
 def join_messages(

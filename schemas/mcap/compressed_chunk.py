@@ -401,25 +401,13 @@ def stated_size(compression: bytes, data: bytes) -> int | None:
 
 
 class Part(NamedTuple):
-    """Some records of a chunk, one behind the other.
+    """Some records of a chunk, one behind the other."""
 
-    Attributes
-    ----------
-    first : int
-        Offset of the part in the content.
-    size : int
-        Size of the part in bytes.
-    messages : array of int
-        Offsets of messages in `content`.
-    others : list of (int, int)
-        Start and end offsets of schemas and channels in `content`.
-    """
-
-    first: int
-    size: int
+    first: int  # offset of the part in the content
+    size: int  # size of the part in bytes
     content: bytes
-    messages: "array[int]"
-    others: list[tuple[int, int]]
+    messages: "array[int]"  # offsets of messages in `content`
+    others: list[tuple[int, int]]  # start and end offsets of schemas and channels in `content`
 
 
 def read_parts(stream: ContentStream) -> Iterator[Part]:

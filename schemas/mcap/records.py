@@ -197,28 +197,14 @@ def encode(record: McapRecord) -> bytes:
 
 
 class ChunkHead(NamedTuple):
-    """The head of a chunk.
+    """The head of a chunk."""
 
-    Attributes
-    ----------
-    start, end : int
-        Log times of the first and the last message, in nanoseconds.
-    size : int
-        Uncompressed bytes of the records.
-    crc : int
-        CRC-32 of the uncompressed records; 0 for none.
-    compression : bytes
-        `zstd`, `lz4`, or empty for uncompressed records.
-    data : slice
-        Range of the compressed records in the chunk's content.
-    """
-
-    start: int
+    start: int  # log times of the first and the last message, in nanoseconds
     end: int
-    size: int
-    crc: int
-    compression: bytes
-    data: slice
+    size: int  # uncompressed bytes of the records
+    crc: int  # CRC-32 of the uncompressed records; 0 for none
+    compression: bytes  # `zstd`, `lz4`, or empty for uncompressed records
+    data: slice  # range of the compressed records in the chunk's content
 
 
 def chunk_head(content: bytes | memoryview) -> ChunkHead:

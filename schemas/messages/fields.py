@@ -19,22 +19,13 @@ _FIELDS_LIMIT = 10_000
 
 
 class Field(NamedTuple):
-    """Field of a message type, as in `Columns`.
+    """Field of a message type, as in `Columns`."""
 
-    Attributes
-    ----------
-    type : str
-        Name of a number type, "string", `TIME`, `DURATION`, or empty for a message.
-    size : int or None
-        Number of elements of an array, 0 if it differs between messages; None for a field that is
-        no array.
-    elements : mapping of str to Field
-        Fields of each element of an array of messages.
-    """
-
-    type: str
+    type: str  # name of a number type, "string", `TIME`, `DURATION`, or empty for a message
+    # number of elements of an array, 0 if it differs between messages; None for a field that is no
+    # array
     size: int | None = None
-    elements: Mapping[str, "Field"] = {}
+    elements: Mapping[str, "Field"] = {}  # fields of each element of an array of messages
 
 
 @lru_cache(256)

@@ -38,17 +38,12 @@ _OF_ROSOUT = Quality(depth=1000, transient_local=True, lifespan_seconds=10)  # R
 
 @dataclass(frozen=True)
 class Topic:
-    """Channel of a log.
-
-    Attributes
-    ----------
-    array_names : mapping of str to sequence of str
-        Names of the array elements, by the name of the array field.
-    """
+    """Channel of a log."""
 
     name: str
     type: str
     quality: Quality = Quality()
+    # names of the array elements, by the name of the array field
     array_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
     metadata: Mapping[str, str] = field(default_factory=dict)
 

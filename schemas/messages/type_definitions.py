@@ -67,19 +67,13 @@ AnyLeaf = Leaf | MessageArray | Default
 
 
 class Layout(NamedTuple):
-    """Field offsets of messages with given lengths of strings and sequences.
+    """Field offsets of messages with given lengths of strings and sequences."""
 
-    Attributes
-    ----------
-    dtype : np.dtype
-        Type of the payload. Fields are named by their paths. The length word before a string or a
-        sequence has the name of the field and " length".
-    fixed : dict of str to int or np.void
-        Values common to all payloads of this layout: byte order, lengths, ends of strings.
-    """
-
+    # type of the payload. Fields are named by their paths. The length word before a string or a
+    # sequence has the name of the field and " length"
     dtype: np.dtype[np.void]
     leaves: tuple[AnyLeaf, ...]
+    # values common to all payloads of this layout: byte order, lengths, ends of strings
     fixed: dict[str, Any]
 
     def fits(self, rows: NDArray[np.void]) -> NDArray[np.bool_]:

@@ -57,22 +57,14 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class HomeClip:
-    """One sound of a simulated home.
-
-    Attributes
-    ----------
-    path : Path or None
-        None for a synthetic sound.
-    start : float
-        Start in the recording, in seconds.
-    """
+    """One sound of a simulated home."""
 
     name: str
     label: str
     source_group: str
-    path: Path | None
+    path: Path | None  # None for a synthetic sound
     frames: int
-    start: float = 0.0
+    start: float = 0.0  # start in the recording, in seconds
     seed: int = 0
 
 

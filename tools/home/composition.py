@@ -182,16 +182,10 @@ _TINY = 1e-9
 
 
 class AudibleSound(NamedTuple):
-    """A planned sound at the level received by the microphone.
-
-    Attributes
-    ----------
-    power : np.ndarray [shape=(n,)], float64
-        Mean square of each frame from its start on, with pauses filled.
-    """
+    """A planned sound at the level received by the microphone."""
 
     plan: PlannedSound
-    power: Float64
+    power: Float64  # [shape=(n,)] mean square of each frame from its start on, with pauses filled
 
 
 class Composition:

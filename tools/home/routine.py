@@ -37,20 +37,14 @@ LONGEST_FRAMES = 1200  # of one sound
 
 @dataclass(frozen=True)
 class PlannedSound:
-    """One sound.
-
-    Attributes
-    ----------
-    level : float
-        In dBFS, for a microphone in the same room.
-    """
+    """One sound."""
 
     start: int
     frames: int
     clip: HomeClip
     origin: str
     room: str
-    level: float
+    level: float  # in dBFS, for a microphone in the same room
     activity: str
 
     @property
@@ -61,16 +55,10 @@ class PlannedSound:
 
 @dataclass(frozen=True)
 class PlannedNoise:
-    """A steady noise during some time.
-
-    Attributes
-    ----------
-    start, end : int
-        First frame, and the frame after the last frame; including fades of a second each.
-    """
+    """A steady noise during some time."""
 
     name: str
-    start: int
+    start: int  # first frame, and the frame after the last frame; including fades of a second each
     end: int
 
 
@@ -177,20 +165,11 @@ _VISIT_CHANCE = (0.3, 0.7)  # on a weekday, at a weekend
 
 @dataclass(frozen=True)
 class Habits:
-    """The habits of a simulated person.
+    """The habits of a simulated person."""
 
-    Attributes
-    ----------
-    seed : int
-        Not negative; determines the days and the clips.
-    first_weekday : int
-        Weekday of the first day, 0 for Monday.
-    coughs_from : int or None
-        Day, from 0, from which every night has more coughs than the night before.
-    """
-
-    seed: int = 0
-    first_weekday: int = 0
+    seed: int = 0  # not negative; determines the days and the clips
+    first_weekday: int = 0  # weekday of the first day, 0 for Monday
+    # day, from 0, from which every night has more coughs than the night before
     coughs_from: int | None = None
 
 

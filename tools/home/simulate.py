@@ -150,29 +150,18 @@ _TINY = 1e-30
 
 
 class TrueEvent(NamedTuple):
-    """A planned sound at the level received by the microphone.
-
-    Attributes
-    ----------
-    level : float
-        Level of its loudest frame as received, in dBFS.
-    """
+    """A planned sound at the level received by the microphone."""
 
     plan: PlannedSound
-    level: float
+    level: float  # level of its loudest frame as received, in dBFS
     audible_frames: int
 
 
 class Truth(NamedTuple):
-    """The true labels and sounds of a composition.
+    """The true labels and sounds of a composition."""
 
-    Attributes
-    ----------
-    spans : list of LabelledSpan
-        Without gaps. A frame has the label of its loudest audible sound, else silence; a
-        sound is audible if it is at least as loud as all steady noise.
-    """
-
+    # without gaps. A frame has the label of its loudest audible sound, else silence; a sound is
+    # audible if it is at least as loud as all steady noise
     spans: list[LabelledSpan]
     events: list[TrueEvent]
 

@@ -83,21 +83,11 @@ class AddonOptions(_Options):
 
 @dataclass(frozen=True)
 class AddonFolders:
-    """Folders that the Supervisor mounts.
+    """Folders that the Supervisor mounts."""
 
-    Attributes
-    ----------
-    data : Path
-        Of the add-on alone; the restoration of a backup empties it.
-    config : Path
-        Of the add-on, for files of the user.
-    share : Path
-        Of the whole home, which no backup of the add-on touches.
-    """
-
-    data: Path
-    config: Path
-    share: Path
+    data: Path  # of the add-on alone; the restoration of a backup empties it
+    config: Path  # of the add-on, for files of the user
+    share: Path  # of the whole home, which no backup of the add-on touches
 
     @property
     def configuration(self) -> Path:

@@ -50,28 +50,16 @@ class Broker:
 
 @dataclass(frozen=True)
 class Answers:
-    """The answers of a person from which a configuration is made.
+    """The answers of a person from which a configuration is made."""
 
-    Attributes
-    ----------
-    microphones : list of (str, str)
-        Device and room.
-    network : str
-        Empty for a network wherever one is installed.
-    page : int or None
-        Port.
-    alerts : Path or None
-        File of the addresses.
-    """
-
-    microphones: list[tuple[str, str]]
+    microphones: list[tuple[str, str]]  # device and room
     node: str
     timezone: str
     keep_sound: bool = False
-    network: str = ""
-    page: int | None = None
+    network: str = ""  # empty for a network wherever one is installed
+    page: int | None = None  # port
     broker: Broker | None = None
-    alerts: Path | None = None
+    alerts: Path | None = None  # file of the addresses
     secrets: dict[Path, str] = field(default_factory=dict, repr=False)  # content of secret files
 
     def has_bridge(self) -> bool:
