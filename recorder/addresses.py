@@ -18,10 +18,7 @@ def is_address(device: str) -> bool:
 
 
 class TopicAddress(NamedTuple):
-    """A ROS 2 topic with sound.
-
-    `rate` (Hz) and `channels` apply to messages without these fields.
-    """
+    """A ROS 2 topic; `rate` (Hz) and `channels` apply to messages without these fields."""
 
     topic: str
     rate: int = SAMPLE_RATE
@@ -39,14 +36,9 @@ def is_topic(device: str) -> bool:
 
 
 def read_topic(address: str) -> TopicAddress:
-    """Parse the address of a topic.
+    """Parse the address of a topic, such as "ros2:///robot/audio?rate=48000&channels=4".
 
     Raise `SourceError` if it is no such address.
-
-    Parameters
-    ----------
-    address : str
-        Such as "ros2:///robot/audio?rate=48000&channels=4".
     """
     form = "write it as ros2:///robot/audio, or ros2:///robot/audio?rate=48000&channels=4"
     topic, _, parameters = address.removeprefix(f"{_TOPIC_SCHEME}://").partition("?")

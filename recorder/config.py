@@ -332,17 +332,11 @@ _OTHERS: dict[str, type[BaseModel]] = {  # tables with keys to suggest
 def load_settings(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
 ) -> Settings:
-    """Load settings from the command line, the environment, the file and the defaults.
+    """Load settings from the command line, the environment, the file (if any) and the defaults.
 
-    Earlier sources take precedence.
-
-    Raise `ConfigurationError` if the file is unreadable or not TOML, if an environment variable is
-    unknown or not JSON, or if a key is unknown or its value invalid; the message names it.
-
-    Parameters
-    ----------
-    file : Path or None
-        The TOML file; None for no file.
+    Earlier sources take precedence. Raise `ConfigurationError` if the file is unreadable or not
+    TOML, if an environment variable is unknown or not JSON, or if a key is unknown or its value
+    invalid; the message names it.
     """
     return load_with_origins(file, command_line, microphone)[0]
 
@@ -365,10 +359,7 @@ def _without_scenarios(content: dict[str, Any]) -> dict[str, Any]:
 def load_with_origins(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
 ) -> tuple[Settings, Origins]:
-    """Load settings as `load_settings` does; also return the origins of the values.
-
-    Raise `ConfigurationError` as `load_settings`.
-    """
+    """Load settings and their origins; raise as `load_settings` does."""
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
     content.pop(BRIDGE, None)
     lines = {} if file is None else key_lines(file.read_text("utf-8-sig"))

@@ -60,17 +60,9 @@ class Origins(NamedTuple):
 
 
 def key_lines(text: str) -> dict[Key, int]:
-    """Return the line on which each key and table of a TOML file begins.
+    """Return the line, from 1, on which each key and table of a TOML file begins.
 
-    Parameters
-    ----------
-    text : str
-        Content of the file. Keys of inline tables are not found.
-
-    Returns
-    -------
-    dict of Key to int
-        Counted from 1.
+    Keys of inline tables are not found.
     """
     lines: dict[Key, int] = {}
     table: Key = ()
@@ -143,13 +135,7 @@ def configuration_error(
     table: Key = (),
     others: Mapping[str, type[BaseModel]] | None = None,
 ) -> ConfigurationError:
-    """Format all errors, one line each.
-
-    Parameters
-    ----------
-    others : mapping of str to type of BaseModel, optional
-        Other tables of the file, by their header, for suggestions of misplaced keys.
-    """
+    """Format all errors, one line each; `others` are tables to suggest for misplaced keys."""
     schema = model.model_json_schema()
     unknown: list[str] = []
     rest: list[tuple[Key, str]] = []

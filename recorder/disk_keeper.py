@@ -73,17 +73,8 @@ def plan_thinning(
 def thin(log: Path, step: int) -> bool:
     """Replace a log atomically by a thinned copy.
 
-    Returns
-    -------
-    bool
-        False if another process uses the log, or it was reviewed in the meantime.
-
-    Raises
-    ------
-    LogError
-        If the log is damaged.
-    OSError
-        If the copy cannot be written.
+    Return False if another process uses the log, or it was reviewed in the meantime. Raise
+    `LogError` if the log is damaged, `OSError` if the copy cannot be written.
     """
     from hearthlog.schemas.salvage.recover import lock_abandoned, thin_log  # noqa: PLC0415
 

@@ -37,10 +37,7 @@ class Disk(NamedTuple):
 
 
 def disk_of(folder: Path) -> Disk:
-    """Measure the disk of a folder, or of its nearest existing parent.
-
-    Raise `OSError` if it cannot be measured.
-    """
+    """Measure the disk of a folder or its nearest existing parent; raise `OSError` on failure."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     usage = shutil.disk_usage(there)
     return Disk(usage.total, usage.free)
@@ -196,13 +193,7 @@ class ServiceManager:
 
 
 def notify(lines: Sequence[str]) -> None:
-    """Send lines to systemd, if it has started this process.
-
-    Parameters
-    ----------
-    lines : sequence of str
-        Such as `READY=1`; see `sd_notify(3)`.
-    """
+    """Send lines of `sd_notify(3)`, such as `READY=1`, to systemd, if it started this process."""
     address = _address()
     if address is None or not lines:
         return

@@ -30,13 +30,7 @@ class QuietHours(NamedTuple):
     end: int
 
     def minutes_left(self, minute: int) -> int:
-        """Return the remaining minutes, 0 outside of the hours.
-
-        Parameters
-        ----------
-        minute : int
-            Minute of the day.
-        """
+        """Return the minutes left at a minute of the day; 0 outside of the hours."""
         length = (self.end - self.start) % _DAY or _DAY
         return max(length - (minute - self.start) % _DAY, 0)
 
@@ -45,10 +39,7 @@ _DASHES = frozenset("\N{HYPHEN}\N{NON-BREAKING HYPHEN}\N{EN DASH}\N{EM DASH}\N{M
 
 
 def quiet_hours(text: str) -> QuietHours:
-    """Parse hours such as `22:00-06:30`.
-
-    Raise `ConfigurationError` if the format is wrong.
-    """
+    """Parse hours such as `22:00-06:30`; raise `ConfigurationError` for another format."""
     found = _FORM.fullmatch(text)
     if found is None:
         hyphen = ", with a plain hyphen" if _DASHES & set(text) else ""
@@ -60,10 +51,7 @@ def quiet_hours(text: str) -> QuietHours:
 
 
 def check_quiet_hours(text: str) -> str:
-    """Validate hours as `quiet_hours` does, and return them.
-
-    Raise `ConfigurationError` if the format is wrong.
-    """
+    """Return hours if valid; raise `ConfigurationError` as `quiet_hours`."""
     quiet_hours(text)
     return text
 
@@ -104,14 +92,9 @@ class PauseSchedule:
 
 
 def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
-    """Request the recorders of a folder to close their microphones.
+    """Request the recorders of a folder to close their microphones; by default until `resume`.
 
     Raise `LogError` if the folder is not writable.
-
-    Parameters
-    ----------
-    duration : timedelta or None
-        None until `resume`.
     """
     end = "" if duration is None else str(int(time.time() + duration.total_seconds()))
     # A recorder of another account must be able to read the end.
@@ -122,10 +105,7 @@ def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
 
 
 def resume(folder: Path) -> bool:
-    """End a pause; return whether there was one.
-
-    Raise `OSError` if the folder is not writable.
-    """
+    """End a pause, if there is one; raise `OSError` if the folder is not writable."""
     was_paused = _is_paused(folder)
     (folder / _PAUSE_FILE).unlink(missing_ok=True)
     return was_paused
@@ -171,14 +151,9 @@ _DATABASE = "zoneinfo/"
 
 
 def time_zone(name: str) -> tzinfo:
-    """Return a time zone by its name.
+    """Return a time zone by its name in the IANA database, such as "Europe/Berlin", or "UTC".
 
     Raise `LogError` if this machine has no such zone.
-
-    Parameters
-    ----------
-    name : str
-        Name in the IANA database, such as "Europe/Berlin", or "UTC".
     """
     if name == DEFAULT:
         return UTC  # available without a database
@@ -191,10 +166,7 @@ def time_zone(name: str) -> tzinfo:
 
 
 def check_time_zone(name: str) -> str:
-    """Validate the name of a time zone, and return it.
-
-    Raise `LogError` if this machine has no such zone.
-    """
+    """Return the name of a time zone; raise `LogError` if this machine has no such zone."""
     time_zone(name)
     return name
 

@@ -43,23 +43,12 @@ def record_files(
 ) -> RecordingSummary:
     """Record audio files as if a microphone had captured them.
 
-    Parameters
-    ----------
-    reload_requests : ReloadRequests or None
-        Trigger immediate checks for a replaced model file.
-
-    Raises
-    ------
-    SourceError
-        If a file is damaged, or all files together are shorter than a frame.
-    ModelError
-        If the model cannot be used, or the configured feature set is not installed.
-    ConfigurationError
-        If the model is for another feature set than the configured one, or sound is to be kept and
-        the model lacks a class that must not be kept.
-    LogError
-        If another recorder of this name uses the folder. If the log cannot be written; then the
-        written part remains and is completed at the next start.
+    Raise `SourceError` if a file is damaged, or all files together are shorter than a frame;
+    `ModelError` if the model cannot be used, or the feature set is not installed;
+    `ConfigurationError` if the model is for another feature set than the configured one, or sound
+    is to be kept and the model lacks a class that must not be kept; `LogError` if another recorder
+    of this name uses the folder, or the log cannot be written: then the written part remains and is
+    completed at the next start.
     """
     keep_freed_blocks()
     with FolderLock(settings.output, settings.node):
@@ -80,20 +69,9 @@ def record_microphones(
 ) -> RecordingSummary:
     """Record the configured microphones until `stop` is set, regardless of their failures.
 
-    Parameters
-    ----------
-    reload_requests : ReloadRequests or None
-        Trigger immediate checks for a replaced model file.
-
-    Raises
-    ------
-    SourceError
-        If this machine cannot capture microphones.
-    LogError
-        If another recorder of this name uses the folder, or the folder is unusable; at the end, if
-        the disk has not accepted the complete log.
-    ModelError, ConfigurationError
-        As `record_files`.
+    Raise `SourceError` if this machine cannot capture microphones; `LogError` if another recorder
+    of this name uses the folder, or the folder is unusable, and at the end, if the disk has not
+    accepted the complete log; `ModelError` and `ConfigurationError` as `record_files`.
     """
     from hearthlog.recorder.sources.microphone import MicrophoneSource  # noqa: PLC0415  not for files
 
@@ -208,17 +186,7 @@ def record(
 ) -> RecordingSummary:
     """Record a source, as the first microphone, until it ends or `stop` is set.
 
-    Parameters
-    ----------
-    reload_requests : ReloadRequests or None
-        Trigger immediate checks for a replaced model file.
-
-    Raises
-    ------
-    SourceError
-        If the source raises it.
-    ModelError, ConfigurationError, LogError
-        As `record_files`.
+    Raise `SourceError` if the source does, and the other errors of `record_files`.
     """
     return _record(settings, {settings.microphone[0].name: source}, stop, reload_requests)
 

@@ -84,13 +84,7 @@ class MicrophoneStream:
             )
 
     def accepted(self, event: Event, *, log_is_full: bool) -> list[Event]:
-        """Return the events to record now.
-
-        Parameters
-        ----------
-        log_is_full : bool
-            Whether the log accepts no sound now; dropped frames become a gap later.
-        """
+        """Return the events to record now; frames dropped by a full log become a gap later."""
         if isinstance(event, Frames):
             return self._accepted_frames(event, log_is_full=log_is_full)
         if log_is_full or (self._drops and isinstance(event, Gap)):
@@ -121,19 +115,9 @@ class MicrophoneStream:
     def change_models(
         self, changes: list[ModelChange], frames: Frames | None, now: int
     ) -> tuple[list[EncodedMessage], list[EncodedMessage]]:
-        """Switch to other models at the next frame.
+        """Switch models at the next frames, or at `now`, in nanoseconds of UTC, without frames.
 
-        Parameters
-        ----------
-        frames : Frames or None
-            The next frames; None if they have not arrived yet.
-        now : int
-            Time of the change for a stream without frames, in nanoseconds of UTC.
-
-        Returns
-        -------
-        closing, opening : list of EncodedMessage
-            Last messages of the earlier models' log, and first messages of the new models' log.
+        Return the last messages of the earlier models' log, and the first of the new models' log.
         """
         number, stamp = self._next_frame, self._end or now
         if frames is not None:
@@ -211,22 +195,12 @@ class RecorderState:
 
 
 class RecordingSession:
-    """A recording of some sources: their log, the clips next to it, and the labelling models.
+    """A recording of sources by microphone: their log, the clips next to it, and the models.
 
-    Parameters
-    ----------
-    sources : mapping of str to SoundSource
-        By the name of the microphone; for audio files no log may exist already.
-    state : RecorderState or None
-        Updated with every event; None without a reader.
-
-    Raises
-    ------
-    ModelError
-        If the configured feature set is not installed.
-    ConfigurationError
-        If the model is for another feature set than the configured one, or sound is to be kept and
-        the model lacks a class that must not be kept.
+    For audio files no log may exist already. `state` is updated with every event. Raise
+    `ModelError` if the configured feature set is not installed; `ConfigurationError` if the model
+    is for another feature set, or sound is to be kept and the model lacks a class that must not be
+    kept.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -276,10 +250,7 @@ class RecordingSession:
                     say(f"{name}: model {model.name}: {why}")
 
     def add(self, microphone: str, event: Event) -> None:
-        """Record one event of a source.
-
-        Raise `LogError` as `RollingLog.write`, if audio files are recorded.
-        """
+        """Record an event of a source; for audio files raise `LogError` as `RollingLog.write`."""
         stream = self._streams[microphone]
         if self._log.is_full:
             self._log.write([])  # retries: the disk may accept data now
@@ -402,8 +373,7 @@ class RecordingSession:
     def _change_models(self, stream: MicrophoneStream, frames: Frames) -> None:
         """Switch the models of their microphones, for one microphone from these frames on.
 
-        Their labels begin a new log: the class names belong to the channel, and the model card to
-        the file.
+        A new log begins, as class names belong to the channel, and the model card to the file.
         """
         before = stream.models.model
         changes = stream.models.change()

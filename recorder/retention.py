@@ -44,28 +44,17 @@ class RecordedLog(NamedTuple):
 
 
 class RecordedDays:
-    """Days with recordings: the clock of retention.
+    """Days with recordings, from starts of logs in nanoseconds of UTC: the clock of retention.
 
     A wrong clock adds days with few recordings, and never makes a recording older than the number
     of days on which the recorder ran.
-
-    Parameters
-    ----------
-    starts : iterable of int
-        Starts of logs, in nanoseconds of UTC.
     """
 
     def __init__(self, starts: Iterable[int]) -> None:
         self._days = sorted({start // _DAY for start in starts if start >= _NO_EARLIER})
 
     def since(self, start: int) -> int:
-        """Count the recorded days after the day of a time.
-
-        Returns
-        -------
-        int
-            0 for the last day, and for times of an unset clock.
-        """
+        """Count the recorded days after the day of a time; 0 for times of an unset clock."""
         if start < _NO_EARLIER:
             return 0
         return len(self._days) - bisect_right(self._days, start // _DAY)
@@ -79,13 +68,7 @@ def walk(root: Path, failures: list[OSError]) -> Iterator[tuple[Path, list[str]]
 
 
 def start_of(name: str, node: str) -> int | None:
-    """Return the start of a node's log or layer from its name.
-
-    Returns
-    -------
-    int or None
-        In nanoseconds of UTC; None if the file is no log of this node.
-    """
+    """Return the start in the name of a node's log or layer, in nanoseconds of UTC, or None."""
     parts = log_name(Path(name))
     match = re.fullmatch(r"(\d{8}T\d{6}Z)(?:_\d+)?", parts.time)
     if parts.node != node or match is None:
@@ -147,13 +130,7 @@ class ThinningDays(NamedTuple):
     rest: int = 0
 
     def step(self, age: int) -> int:
-        """Return the thinning step: an index of `hearthlog.schemas.salvage.recover.STEPS`.
-
-        Parameters
-        ----------
-        age : int
-            Recorded days since.
-        """
+        """Return the thinning step, an index of `STEPS` in `recover`, after `age` recorded days."""
         due = [step for step, days in enumerate(self, 1) if days and age >= days]
         return max(due, default=0)
 
@@ -172,15 +149,7 @@ _LARGEST = 10**18
 
 
 def parse_size(value: object) -> int:
-    """Parse a size.
-
-    Raise `ValueError` if it is neither.
-
-    Parameters
-    ----------
-    value : object
-        A number of bytes, or a text such as "500M" or "1.5 GB".
-    """
+    """Parse bytes, as a number or a text such as "500M" or "1.5 GB"; else raise `ValueError`."""
     match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,15})?) ?([kmgt]?)b?", str(value).lower())
     if match is None:
         raise ValueError(f"{str(value)[:40]!r} is not a size; write bytes, such as 500M or 20G")
@@ -191,13 +160,7 @@ def parse_size(value: object) -> int:
 
 
 def size_text(size: int) -> str:
-    """Format a size in a suitable unit.
-
-    Parameters
-    ----------
-    size : int
-        Bytes.
-    """
+    """Format bytes in a suitable unit."""
     for unit, text in (("g", "GB"), ("m", "MB"), ("k", "kB")):
         if size >= _UNITS[unit]:
             return f"{size / _UNITS[unit]:.1f} {text}"

@@ -104,19 +104,10 @@ def probe_network(name: str, path: Path) -> Probe:
 
 
 def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | None, str]:
-    """Load the recorder's embedding network, if there is one that this machine can run.
+    """Load the recorder's embedding network, if this machine can run it, and the reason if not.
 
-    Parameters
-    ----------
-    wanted : str, optional
-        Name of a network, or none; empty for yamnet if it is installed.
-
-    Returns
-    -------
-    embedder : Embedder or None
-        None: record without a network.
-    line : str
-        The reason; empty if there is nothing to report.
+    `wanted` is a network's name, `none`, or empty for yamnet if it is installed. The reason is
+    empty if there is nothing to report.
     """
     if wanted == NO_NETWORK:
         return None, ""
@@ -135,10 +126,7 @@ def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | No
 
 
 def likely_network(wanted: str = "") -> str:
-    """Return the name of the network to be used, if its file and runtime are installed.
-
-    The speed of this machine and the integrity of the file are not tested.
-    """
+    """Return the network to be used, if its file and runtime are installed; neither is tested."""
     name = wanted or DEFAULT_NETWORK
     if wanted == NO_NETWORK or not NETWORKS.has(name) or find_network(name) is None:
         return ""
@@ -152,20 +140,14 @@ def _probed(name: str, path: Path, _changed: int) -> Probe:
 
 
 def check_network(wanted: str, microphones: int = 1) -> None:
-    """Check the configured network, if one is named.
-
-    Raise `ModelError` if it is missing or unusable.
-    """
+    """Check the configured network, if any; raise `ModelError` if it is missing or unusable."""
     if wanted not in {"", NO_NETWORK}:
         path = network_path(wanted)
         check_pace(path, probe_network(wanted, path), microphones)
 
 
 def network_path(name: str) -> Path:
-    """Return the file of a network.
-
-    Raise `ModelError` if there is no such network, or its file was not fetched.
-    """
+    """Return the file of a network; raise `ModelError` if network or file does not exist."""
     path = find_network(name)
     if path is None:
         raise ModelError(
@@ -175,10 +157,7 @@ def network_path(name: str) -> Path:
 
 
 def check_pace(path: Path, probe: Probe, microphones: int = 1) -> None:
-    """Check whether this machine is fast enough for a network.
-
-    Raise `ModelError` if a window takes more than half of the hop.
-    """
+    """Raise `ModelError` if a window takes a network more than half of the hop on this machine."""
     if microphones * probe.seconds > _MOST_SHARE * _HOP_SECONDS:
         of = f" of each of {microphones} microphones" if microphones > 1 else ""
         raise ModelError(

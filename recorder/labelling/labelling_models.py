@@ -27,13 +27,9 @@ from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, scenario_labellin
 
 
 def class_conflict(model: Model, others: Mapping[str, Model]) -> str:
-    """Return a class conflict of a model with another one.
+    """Return the rest of a sentence that begins with the model, or an empty text without conflict.
 
-    Returns
-    -------
-    str
-        The rest of a sentence that begins with the model; empty without a conflict. Aliases of a
-        class are one class; every model may have `silence`, `unknown` and `other`.
+    Aliases of a class are one class; every model may have `silence`, `unknown` and `other`.
     """
     own = _classes(model)
     for labelling, other in others.items():
@@ -69,15 +65,10 @@ class ModelChange(NamedTuple):
 
 
 class LabellingModels:
-    """The models of some microphones, and their possible replacements.
+    """The models of some microphones, and their possible replacements; no labels without `watch`.
 
     Raise `ConfigurationError` if a scenario's model is for another feature set, or two models
     except the candidate label the same class.
-
-    Parameters
-    ----------
-    watch : ModelWatch or None
-        Source of the live models; None for no labels.
     """
 
     def __init__(
@@ -127,7 +118,7 @@ class LabellingModels:
         return {name: loaded for name, loaded in self.in_use.items() if name != LIVE}
 
     def leave_out(self, labelling: str, reason: str) -> None:
-        """Disable a scenario; `refusals()` reports the reason.
+        """Disable a scenario for a reason that `refusals()` reports.
 
         Raise `ConfigurationError` if scenarios may not be disabled.
         """
@@ -250,19 +241,8 @@ def open_models(  # noqa: PLR0913
 ) -> dict[str, LabellingModels]:
     """Load and watch the models of microphones; microphones with equal models share them.
 
-    Parameters
-    ----------
-    reload_requests : ReloadRequests or None
-        Trigger immediate checks for a replaced file.
-    leaves_out : bool
-        Whether scenarios that cannot label are disabled; else they are an error.
-
-    Raises
-    ------
-    ModelError
-        If a model cannot be used.
-    ConfigurationError
-        If models conflict with each other.
+    With `leaves_out`, scenarios that cannot label are disabled. Raise `ModelError` if a model
+    cannot be used, `ConfigurationError` if models conflict with each other.
     """
     reload_requests = reload_requests or ReloadRequests()
     chosen = {

@@ -60,23 +60,11 @@ class ReloadRequests:
 class ModelWatch:
     """Checks in a thread every second whether a model file was replaced.
 
-    Raise `ModelError` if the model at the start cannot be used.
-
-    Parameters
-    ----------
-    path : Path
-        A model file, a symbolic link to one, or the name of a starter model. While the file
-        `DEFAULT_MODEL` is missing, the starter model `general` replaces it.
-    requests : SimpleQueue
-        An item triggers an immediate check, which repeats earlier refusals. Unlike an event, a
-        queue is safe in a signal handler.
-
-    Attributes
-    ----------
-    starter : str
-        Name of the starter model at the start; empty for a file.
-    ready : Loaded or None
-        The last replacement; the user sets it to None.
+    `path` is a model file, a symbolic link to one, or the name of a starter model. While the file
+    `DEFAULT_MODEL` is missing, the starter model `general` replaces it. An item in `requests`
+    triggers an immediate check, which repeats earlier refusals; unlike an event, a queue is safe in
+    a signal handler. `starter` is the name of the starter model at the start, empty for a file; the
+    user of `ready` sets it to None. Raise `ModelError` if the model at the start cannot be used.
     """
 
     def __init__(
@@ -131,13 +119,7 @@ class ModelWatch:
             self.ready, self._last = self.held, self.held.model
 
     def refuse_ready(self, reason: str, in_use: Model) -> str:
-        """Refuse the ready model, and hold it.
-
-        Returns
-        -------
-        str
-            The refusal; empty if it was reported before.
-        """
+        """Hold the ready model, and return the refusal; empty if it was reported before."""
         assert self.ready is not None
         is_known, self.held, self.ready = self.ready is self.held, self.ready, None
         self._last = in_use
@@ -237,10 +219,7 @@ def _warn_if_simulated(model: Model) -> None:
 
 
 def _warn_if_changed(path: Path, champion: Model) -> None:
-    """Print a warning if a champion's file is not the promoted one.
-
-    A missing promotion check shows that the file was replaced or damaged.
-    """
+    """Print a warning if a champion's file is not the promoted one, hence without a judgement."""
     is_kept = path.is_symlink() and judgements_of(path.parent)
     is_known = is_starter(champion.name, champion.sha256)
     if is_kept and not is_known and read_judgement(path.parent, champion.sha256) is None:
@@ -252,10 +231,7 @@ def _warn_if_changed(path: Path, champion: Model) -> None:
 
 
 def load_checked(path: Path, on_damage: Callable[[str], object] | None = None) -> Loaded:
-    """Load a model, and check that it can classify.
-
-    Raise `ModelError` if it cannot be used.
-    """
+    """Load a model and check that it can classify; raise `ModelError` if it cannot be used."""
     model = load_model(path, on_damage)
     return Loaded(model, Classifier(model))
 
@@ -270,9 +246,9 @@ def file_identity(path: Path) -> FileIdentity:
 
 
 class CandidateWatch:
-    """Checks in a thread every second whether there is another candidate.
+    """Checks every second for another candidate, the optional link `candidate.safetensors`.
 
-    The candidate is the optional link `candidate.safetensors` next to the model in use.
+    The link is next to the model in use.
     """
 
     def __init__(self, folder: Path, features: FeatureSet) -> None:

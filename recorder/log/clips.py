@@ -50,15 +50,9 @@ class KeptSound(NamedTuple):
 class ClipFinder:
     """Buffers sound until it is decided whether to keep it: not private, and worth keeping.
 
-    `PrivateFrames` decides which frames are private.
-
-    Parameters
-    ----------
-    keep : Keep
-        `events`: sound around every label other than silence; `unsure`: sound around labels of low
-        confidence or high novelty; `always`: all sound.
-    window_frames : int
-        Length of a label's window, at least one second.
+    `PrivateFrames` decides which frames are private. `keep` is `events` (sound around every label
+    other than silence), `unsure` (around labels of low confidence or high novelty) or `always`.
+    `window_frames` is the length of a label's window, at least one second.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -80,10 +74,9 @@ class ClipFinder:
         self._begin()
 
     def _begin(self) -> None:
-        """Reset the buffers.
+        """Reset the buffers: `_private` covers the first buffered frames, `_worth` starts earlier.
 
-        `_private` covers the first buffered frames. `_worth` starts some frames before the buffer:
-        those frames are decided, but the frames after them are kept because of them.
+        The frames of `_worth` before the buffer are decided; later frames are kept because of them.
         """
         self._next = -1
         self._samples: Int16 = np.empty((0, FRAME_SAMPLES), np.int16)
@@ -94,14 +87,8 @@ class ClipFinder:
     def push(self, frames: Frames, labels: FrameLabels | None) -> list[KeptSound]:
         """Add frames and return the sound that is now certain to be kept.
 
-        Parameters
-        ----------
-        frames : Frames
-            If they do not follow the previous frames, the previous frames are decided first, as by
-            `close`.
-        labels : FrameLabels or None
-            Labels of the last of these frames; their classes include all classes that are never
-            kept.
+        `labels` are those of the last of these frames; their classes include all that are never
+        kept. Frames that do not follow the previous ones first decide these, as `close` does.
         """
         sounds = []
         if frames.first != self._next:
@@ -164,13 +151,7 @@ _EVERY = 3600 * NANOSECONDS
 
 
 class ClipRetention:
-    """Deletes old clips of a recorder once an hour; age is counted in recorded days.
-
-    Parameters
-    ----------
-    days : int
-        Age limit: a layer is deleted once so many later days have recordings.
-    """
+    """Deletes clips once an hour: layers older than `days`, counted in recorded days."""
 
     def __init__(self, root: Path, node: str, days: int) -> None:
         self._root = root
@@ -179,13 +160,7 @@ class ClipRetention:
         self._last: int | None = None
 
     def tick(self, now: int) -> list[Notice]:
-        """Delete old clips, at most once an hour.
-
-        Returns
-        -------
-        list of Notice
-            At most two: the number of deleted layers, and the first failure.
-        """
+        """Delete old clips, at most once an hour; report their number and the first failure."""
         if self._last is not None and abs(now - self._last) < _EVERY:
             return []
         self._last = now
@@ -212,13 +187,7 @@ class ClipRetention:
 
 
 def find_clips(root: Path, node: str, failures: list[OSError]) -> Iterator[tuple[Path, int]]:
-    """Find the audio layers of a node, including damaged ones.
-
-    Yields
-    ------
-    start : int
-        Start of the log, in nanoseconds of UTC.
-    """
+    """Yield the audio layers of a node, also damaged ones, and starts in nanoseconds of UTC."""
     for folder, files in walk(root, failures):
         for file in files:
             name = file.removesuffix(".damaged")
@@ -244,13 +213,8 @@ _ALL_KEPT = "minutes of this day are kept already"
 class ClipWriter:
     """Writes clips to layers, within the daily minutes and the free space of the disk.
 
-    Errors become notices and are never raised, so that the logs continue.
-
-    Parameters
-    ----------
-    file_at : callable
-        Maps a time in nanoseconds of UTC to the log that contains it and the end of that log; see
-        `RollingLog.file_at`.
+    Errors become notices and are never raised, so that the logs continue. `file_at` is
+    `RollingLog.file_at`.
     """
 
     def __init__(
@@ -273,13 +237,7 @@ class ClipWriter:
         self.kept_frames = 0
 
     def write(self, microphone: str, sounds: Sequence[KeptSound]) -> list[Notice]:
-        """Append sound to the layers of the logs that contain its time.
-
-        Returns
-        -------
-        list of Notice
-            One when clips stop being written, and one when they are written again.
-        """
+        """Append sound to the layers of its logs; report when clips stop and continue."""
         notices = []
         for sound in sounds:
             first = 0
@@ -419,14 +377,8 @@ def _frames_in(layer: Path, start: int, end: int) -> int:
 class ClipRecorder:
     """Writes the clips of a recording, if configured, and always deletes old clips.
 
-    Raise `ConfigurationError` if sound is to be kept and a model lacks a class that must not be
-    kept.
-
-    Parameters
-    ----------
-    file_at : callable
-        Maps a time in nanoseconds of UTC to the log that contains it and the end of that log; see
-        `RollingLog.file_at`.
+    `file_at` is `RollingLog.file_at`. Raise `ConfigurationError` if sound is to be kept and a model
+    lacks a class that must not be kept.
     """
 
     def __init__(
@@ -451,23 +403,11 @@ class ClipRecorder:
         return self._writer.kept_frames
 
     def before(self, microphone: str, event: Event) -> list[Notice]:
-        """Prepare for an event that is about to be logged: a gap ends the sound before it.
-
-        Returns
-        -------
-        list of Notice
-            Clips failed, or are kept again.
-        """
+        """Prepare for an event about to be logged: a gap ends the sound before it."""
         return self._microphones[microphone].close() if isinstance(event, Gap) else []
 
     def after(self, microphone: str, event: Event, labels: FrameLabels | None) -> list[Notice]:
-        """Keep the sound of a logged event, and delete old clips.
-
-        Returns
-        -------
-        list of Notice
-            Failures to write or delete clips, recovery, and the number of deleted clips.
-        """
+        """Keep the sound of a logged event, and delete old clips; report failures and deletions."""
         now = event_time(event)
         notices = [*self._retention.tick(now), *self._writer.tick(now)]
         if isinstance(event, Frames):
@@ -475,13 +415,7 @@ class ClipRecorder:
         return notices
 
     def finish(self) -> list[Notice]:
-        """Write the remaining sound, and complete the layer.
-
-        Returns
-        -------
-        list of Notice
-            Clips failed, or are kept again.
-        """
+        """Write the remaining sound, and complete the layer."""
         notices = [notice for each in self._microphones.values() for notice in each.close()]
         return [*notices, *self._writer.finish()]
 

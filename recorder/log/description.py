@@ -50,15 +50,7 @@ def describe_log(  # noqa: PLR0913, PLR0917
     secondary: Mapping[str, Model] | None = None,
     embedding: EmbeddingSource | None = None,
 ) -> LogDescription:
-    """Return the description of the logs of one microphone.
-
-    Parameters
-    ----------
-    model : Model or None
-        Labelling model; None for no labels.
-    embedding : EmbeddingSource, optional
-        Source of the embeddings; None without a network.
-    """
+    """Return the description of the logs of one microphone."""
     secondary = secondary or {}
     microphone = info.header.frame_id
     models = {"model", "scenarios"}

@@ -114,10 +114,7 @@ def _lock(descriptor: int, folder: Path, node: str) -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Check whether a folder is writable, or can be created, without side effects.
-
-    Raise `LogError` if not.
-    """
+    """Raise `LogError` if a folder is not writable and cannot be created; change nothing."""
     folder = folder.absolute()
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):

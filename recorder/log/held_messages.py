@@ -16,15 +16,10 @@ Held = EncodedMessage | LogDescription  # a description begins another log
 
 
 class HeldMessages:
-    """Queue of messages, and of the descriptions of logs that begin between them.
+    """Queue of messages, and of the descriptions of logs that begin between them; `size` in bytes.
 
     The bytes are in one block of memory: many small objects would leave holes in the heap that the
     process never returns to the system.
-
-    Attributes
-    ----------
-    size : int
-        Bytes held.
     """
 
     def __init__(self) -> None:

@@ -41,17 +41,12 @@ class Recovered:
 
 
 def recover_active(root: Path, node: str) -> list[Recovered]:
-    """Complete all logs of a node that no recorder is writing.
+    """Complete all logs of a node that no recorder is writing; return those with messages, by name.
 
     Intact messages are copied to the final name, read again and counted; only then the original is
     removed. A log that is damaged, or has no message, is also kept as `*.damaged`. Audio layers are
     not kept, as they must expire some day. A log that cannot be completed is left for the next
     start; an empty file, as left by a power cut, is deleted.
-
-    Returns
-    -------
-    list of Recovered
-        By name; logs without messages are omitted.
     """
     completed = []
     for active in active_logs(root, node):
@@ -70,19 +65,9 @@ def active_logs(root: Path, node: str) -> list[Path]:
 
 
 def complete_log(active: Path) -> list[Recovered]:
-    """Complete one log as `recover_active` does.
+    """Complete one log as `recover_active` does, unless it is gone, or another process uses it.
 
     Raise `LogError` or `OSError` if it cannot be read or completed.
-
-    Parameters
-    ----------
-    active : Path
-        Ignored if it is gone, or in use by another process.
-
-    Returns
-    -------
-    list of Recovered
-        Zero or one.
     """
     if not active.exists():
         return []
@@ -99,17 +84,10 @@ def complete_log(active: Path) -> list[Recovered]:
 
 
 def end_of_sound(root: Path, node: str, microphone: str, before: int) -> int:
-    """Return the end of a node's recordings of a microphone, over all its logs.
+    """Return the end of a node's recordings of a microphone, in nanoseconds of UTC; 0 for none.
 
-    Parameters
-    ----------
-    before : int
-        Logs that begin later are ignored, as their clock was wrong. In nanoseconds of UTC.
-
-    Returns
-    -------
-    int
-        End of the last frame, or of the gap after it, in nanoseconds of UTC; 0 if there is none.
+    It is the end of the last frame, or of the gap after it, over all logs that begin before
+    `before`, in nanoseconds of UTC; the clock of later logs was wrong.
     """
     latest = log_path(root, node, before).name
     ours = [path for path in root.rglob(f"{node}_*{SUFFIX}*") if _is_log_of(path, node)]
@@ -219,9 +197,9 @@ class LogFinisher:
             threading.Thread(target=process.wait, daemon=True).start()
 
     def close(self) -> None:
-        """Give all logs their final names, as far as possible.
+        """Give all logs their final names, as far as possible, in the foreground.
 
-        This runs in the foreground: on a busy machine a process of low priority takes minutes.
+        On a busy machine a process of low priority takes minutes.
         """
         for process in self._processes:
             process.kill()
@@ -240,11 +218,8 @@ class LogFinisher:
 def finish_log(active: Path) -> None:
     """Rewrite a completed log under its final name; if that fails, only rename it.
 
-    Parameters
-    ----------
-    active : Path
-        Active name of the log. Ignored if it is gone, or in use by another process. Damage is
-        reported on standard error.
+    A log that is gone, or in use by another process, is ignored. Damage is reported on standard
+    error.
     """
     try:
         for recovered in complete_log(active):

@@ -35,22 +35,11 @@ _SPARE_BYTES = 1 << 20  # free space required in addition to the held messages
 
 
 class RollingLog:
-    """Writes messages into successive files.
+    """Writes messages into successive files, which begin at multiples of `file_seconds` in UTC.
 
-    Parameters
-    ----------
-    file_seconds : int
-        Files begin at multiples of this, in UTC.
-    flush_seconds : float
-        A killed process loses at most this much sound.
-    sync_seconds : float
-        A power cut loses at most this much sound.
-    file_bytes : int
-        Size at which the next file begins; 0 for no limit.
-    live : bool
-        Whether disk errors do not raise: messages are held in memory until they can be written.
-    lock : FolderLock, optional
-        Renewed after a disk error.
+    A killed process loses at most `flush_seconds` of sound, a power cut `sync_seconds`. The next
+    file also begins after `file_bytes`, unless 0. With `live`, disk errors do not raise: messages
+    are held in memory until they can be written. The lock is renewed after a disk error.
     """
 
     def __init__(  # noqa: PLR0913
@@ -94,11 +83,10 @@ class RollingLog:
         self._notices: list[Notice] = []
 
     def write(self, messages: Sequence[EncodedMessage]) -> None:
-        """Append messages.
+        """Append messages; begin a new file if time runs backwards, because the clock was set.
 
-        If time runs backwards, because the clock was set, a new file begins. Raise `LogError`,
-        unless live, on a disk error: the written part remains and is completed at the next start.
-        Also if the name of a new file is taken.
+        Raise `LogError`, unless live, on a disk error, or if the name of a new file is taken: the
+        written part remains and is completed at the next start.
         """
         if self._live:
             self._hold(messages)
@@ -125,10 +113,7 @@ class RollingLog:
         return waits or self._last >= self._flush_at
 
     def flush(self) -> None:
-        """Pass written data to the operating system.
-
-        Raise `OSError` on a disk error.
-        """
+        """Pass written data to the operating system; raise `OSError` on a disk error."""
         if self._writer is not None and self._flush_at is not None:
             self._writer.flush()
             self._flush_at = None
@@ -137,10 +122,7 @@ class RollingLog:
                 self._until = 0
 
     def sync(self) -> None:
-        """Wait until written data is on the disk.
-
-        Raise `OSError` on a disk error.
-        """
+        """Wait until written data is on the disk; raise `OSError` on a disk error."""
         self.flush()
         if self._writer is not None:
             self._writer.sync()
@@ -148,17 +130,10 @@ class RollingLog:
         self._synced = time.monotonic()
 
     def finish(self, messages: Sequence[EncodedMessage] = ()) -> None:
-        """Append the last messages to the open file, and complete it.
+        """Append the last messages, in the order of log time, to the open file, and complete it.
 
-        Parameters
-        ----------
-        messages : sequence of EncodedMessage
-            In the order of their log times; dropped if no file is open, unless live.
-
-        Raises
-        ------
-        LogError
-            On a disk error; the written part remains and is completed at the next start.
+        Without an open file the messages are dropped, unless live. Raise `LogError` on a disk
+        error; the written part remains and is completed at the next start.
         """
         if self._live:
             self._retry_at = 0.0
@@ -197,17 +172,9 @@ class RollingLog:
         return notices
 
     def file_at(self, stamp: int) -> tuple[Path, int]:
-        """Return the file that contains a time; the later one if the clock was set back.
+        """Return the file that contains a written time, and its end, in nanoseconds of UTC.
 
-        Parameters
-        ----------
-        stamp : int
-            A time that was written, in nanoseconds of UTC.
-
-        Returns
-        -------
-        end : int
-            Start of the next file, in nanoseconds of UTC.
+        If the clock was set back, it is the later file.
         """
         until = _NEVER
         if not self._begun:
@@ -254,10 +221,7 @@ class RollingLog:
             give_back()
 
     def _write_anew(self) -> None:
-        """Write all held items after a disk error.
-
-        Raise `LogError` or `OSError` if the error persists.
-        """
+        """Write all held items after a disk error; raise `LogError` or `OSError` if it persists."""
         self._check_disk()
         if self._lock is not None:
             self._lock.renew()

@@ -37,29 +37,16 @@ _NO_NUMBERS = "samples are not finite (NaN or infinity)"
 
 
 class FileSource:
-    """Several audio files in a row, as one stream of frames.
+    """Several audio files in a row, as one stream of frames; samples short of a frame are dropped.
 
-    Trailing samples that do not fill a frame are dropped.
+    `start` is the time of the first sample, in nanoseconds of UTC. `times` has the start of each
+    file, from `arrange`, or None for the end of the previous file; a later start makes a gap, an
+    earlier one is ignored. With `realtime`, frames come in real time. `channels` is that of an
+    array, which the files must have; None: mixed to one, as by `read_audio`. `channel` is the
+    selected one, from 1. `progress` receives the share of the sound read so far, 0 to 1.
 
     Raise `SourceError` if a file is missing, is not audio, is empty, has an unsupported sample
-    rate, other channels than the array, or not the selected one; if the times are out of the range
-    of a log.
-
-    Parameters
-    ----------
-    start : int
-        Time of the first sample in nanoseconds of UTC.
-    times : sequence of (FileTime or None), optional
-        Start of each file, from `arrange`; None, or no sequence: the end of the previous file. A
-        later start makes a gap; an earlier one is ignored, and the file follows.
-    realtime : bool
-        Whether to yield frames in real time.
-    channels : int or None
-        Channels of an array, which the files must have; None: mixed to one, as by `read_audio`.
-    channel : int or None
-        Selected channel, counted from 1.
-    progress : callable
-        Called with the share of the sound read so far, 0 to 1.
+    rate, other channels than the array, or not the selected one; if times are out of a log's range.
     """
 
     def __init__(  # noqa: PLR0913
@@ -116,11 +103,10 @@ class FileSource:
         return lines
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield the frames, the gaps between files, and the health of the source.
+        """Yield frames, gaps between files, and health after every ten seconds of sound.
 
-        With `joins_blocks`, as of `long_blocks`. The health comes every ten seconds of sound. Raise
-        `SourceError` if a file cannot be opened any more, or if all files together are shorter than
-        a frame.
+        With `joins_blocks`, as of `long_blocks`. Raise `SourceError` if a file cannot be opened any
+        more, or if all files together are shorter than a frame.
         """
         events = self._events(stop)
         return long_blocks(events) if self.joins_blocks else events
@@ -211,7 +197,7 @@ class FileSource:
 
 
 def long_blocks(events: Iterator[Event]) -> Iterator[Event]:
-    """Join frames to blocks of a minute; reports between frames become the `reports` of the frames.
+    """Join frames to blocks of a minute, with the reports between as `reports`.
 
     Pending events come before an error.
     """
@@ -294,14 +280,9 @@ def _runs(block: Float32) -> list[Float32]:
 def find_audio(
     paths: Sequence[Path], check: Callable[[Path], object] = str
 ) -> tuple[list[Path], list[str]]:
-    """Replace folders by the audio files in them and their subfolders.
+    """Replace folders by the audio files below them, in the order of names, without hidden ones.
 
     Raise `SourceError` if a folder has no readable audio.
-
-    Returns
-    -------
-    list of Path
-        Files of a folder in the order of their names, without hidden ones.
     """
     found: list[Path] = []
     refused: list[str] = []
@@ -325,10 +306,7 @@ def find_audio(
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Yield all files below a folder, following links, sorted by folder.
-
-    Hidden folders are skipped.
-    """
+    """Yield all files below a folder, following links, sorted by folder, without hidden folders."""
     seen: set[tuple[int, int]] = set()
     for parent, folders, names in os.walk(folder, followlinks=True):
         status = Path(parent).stat()

@@ -33,14 +33,10 @@ _TOLERANCE_SECONDS = 1.0
 
 
 class ArrivalPace:
-    """Tracks arrivals of sound to estimate the capture time of its first sample.
+    """Estimates the capture time of the first sample from the arrivals of sound.
 
-    The estimate is the earliest time that any arrival allows: sound can be late, but not early.
-
-    Parameters
-    ----------
-    began : float
-        Time of the connection to the source, in seconds of CLOCK_MONOTONIC.
+    It is the earliest time that any arrival allows: sound can be late, but not early. `began` is
+    the time of the connection, in seconds of CLOCK_MONOTONIC.
     """
 
     def __init__(self, began: float) -> None:
@@ -58,12 +54,8 @@ class ArrivalPace:
     def settle(self) -> tuple[int, float]:
         """Separate live sound from the buffered sound that a server sends first.
 
-        Returns
-        -------
-        older : int
-            Number of samples from before the connection.
-        now : float
-            Capture time of the last sample, in seconds of CLOCK_MONOTONIC.
+        Return the number of samples from before the connection, and the capture time of the last
+        sample, in seconds of CLOCK_MONOTONIC.
         """
         start = self._window
         self._windows.append(start)
@@ -134,10 +126,7 @@ class Device:
 
 
 def load_portaudio() -> ModuleType:
-    """Import sounddevice, which finds and starts PortAudio.
-
-    Raise `SourceError` if PortAudio is missing or cannot start.
-    """
+    """Import sounddevice; raise `SourceError` if PortAudio is missing or cannot start."""
     try:
         import sounddevice  # noqa: PLC0415  starting PortAudio may fail, and takes time
     except OSError as error:
@@ -150,13 +139,7 @@ def load_portaudio() -> ModuleType:
 
 
 def list_devices(sounddevice: ModuleType) -> list[Device]:
-    """List the microphones.
-
-    Returns
-    -------
-    list of Device
-        In PortAudio's order; equal names become `<name> #1`, `<name> #2`.
-    """
+    """List microphones in PortAudio's order; equal names become `<name> #1`, `<name> #2`."""
     default = sounddevice.default.device[0]
     devices = [
         _device(info, is_default=info["index"] == default)
@@ -174,16 +157,10 @@ def list_devices(sounddevice: ModuleType) -> list[Device]:
 
 
 def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Device:
-    """Find a microphone by its name.
+    """Find a microphone by its name or part of it, in any case; empty for the default one.
 
-    Raise `DeviceError` if there is no microphone, or none or several match; then the message lists
-    all of them.
-
-    Parameters
-    ----------
-    name : str
-        A case-insensitive name or part of one; or a port or serial number in the form of
-        `UsbPlace`; empty for the default microphone.
+    `name` may also be a port or serial number in the form of `UsbPlace`. Raise `DeviceError` with
+    all names if there is no microphone, or none or several match.
     """
     if not devices:
         raise DeviceError(closed_card() or _NO_MICROPHONE)
@@ -201,7 +178,7 @@ def find_device(devices: list[Device], name: str, *, exact: bool = False) -> Dev
 
 
 def closed_card(folder: Path = _NODES) -> str:
-    """Return why sound cards that are there cannot be opened by this account; empty if they can.
+    """Return why sound cards cannot be opened by this account; empty if they can.
 
     ALSA leaves such cards out of its list, as if there were none.
     """

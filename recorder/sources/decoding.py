@@ -42,13 +42,7 @@ _INT16_FULL_SCALE = np.float32(32768.0)
 
 
 def missing_channel(there: int, wanted: int) -> str:
-    """Return the error text for a channel number that does not exist.
-
-    Parameters
-    ----------
-    wanted : int
-        Counted from 1.
-    """
+    """Return the error text for a missing channel, counted from 1."""
     has = f"{there} channels" if there > 1 else "one channel"
     return f"has {has}, and `channel` asks for number {wanted}: take one from 1 to {there}"
 
@@ -57,13 +51,7 @@ _Samples = TypeVar("_Samples", Float32, Float64)
 
 
 class ChannelMixer:
-    """Mixes several channels to one, in blocks of ten seconds.
-
-    Parameters
-    ----------
-    channel : int or None
-        Fixed channel, counted from 1, used regardless of content.
-    """
+    """Mixes several channels to one, in blocks of ten seconds, or takes one `channel`, from 1."""
 
     def __init__(self, channel: int | None = None, chosen: Callable[[str], object] = str) -> None:
         self._fixed = None if channel is None else channel - 1
@@ -71,17 +59,7 @@ class ChannelMixer:
         self._chosen = chosen
 
     def __call__(self, block: Float32) -> Float32:
-        """Mix a block of all channels.
-
-        Parameters
-        ----------
-        block : np.ndarray [shape=(n, c)], float32
-
-        Returns
-        -------
-        np.ndarray [shape=(n,)], float32
-            NaN where samples are not finite.
-        """
+        """Mix a block [shape=(n, c)] to one channel; NaN where samples are not finite."""
         block = finite_or_nan(block)
         count = block.shape[1]
         if count == 1 or self._fixed is not None:
@@ -104,17 +82,9 @@ class ChannelMixer:
 class StreamMixer:
     """Mixes several channels of live sound to one, independent of the block size.
 
-    The channels of a piece are selected before it starts, so mixing adds no delay.
-
-    Parameters
-    ----------
-    takes_first : bool
-        Default to the first channel rather than the mean.
-
-    Attributes
-    ----------
-    news : str
-        Unreported change of the selected channels and its reason; the reader clears it.
+    The channels of a piece are selected before it starts, so mixing adds no delay. By default they
+    are averaged, or the first one if `takes_first`. `news` holds the unreported change of channels
+    and its reason; the reader clears it.
     """
 
     def __init__(self, *, takes_first: bool) -> None:
@@ -127,14 +97,7 @@ class StreamMixer:
         self._begins = True
 
     def __call__(self, samples: NDArray[np.int16], rate: int) -> NDArray[np.int16]:
-        """Mix the next samples.
-
-        Parameters
-        ----------
-        samples : np.ndarray [shape=(n, c)], int16
-        rate : int
-            Samples per second.
-        """
+        """Mix the next samples [shape=(n, c)] at a rate in Hz."""
         block = samples.astype(np.float32) / _INT16_FULL_SCALE
         if self._choice is None:
             self._choice = _Choice(block.shape[1], self._choose, takes_first=self._takes_first)
@@ -184,12 +147,7 @@ class _Choice:
         self._sounded = np.zeros(count)  # last piece within 9 dB of the loudest channel
 
     def mix(self, samples: Float32) -> Float32:
-        """Mix samples of the selected channels.
-
-        Parameters
-        ----------
-        samples : np.ndarray [shape=(n, c)], float32
-        """
+        """Mix samples [shape=(n, c)] of the selected channels."""
         return self._mixed(samples, self._in_mix if self._instead is None else self._instead)
 
     def _mixed(self, samples: _Samples, channels: list[int], axis: int = -1) -> _Samples:
@@ -210,12 +168,7 @@ class _Choice:
         return float(self._mixed(rows, channels, axis=0).var(axis=-1).mean())
 
     def look_at_piece(self, piece: Float32) -> None:
-        """Switch channels if the selected ones hold no sound and another does.
-
-        Parameters
-        ----------
-        piece : np.ndarray [shape=(n, c)], float32
-        """
+        """Switch if the selected channels hold no sound in a piece [shape=(n, c)], but another."""
         finite = _rows_of(piece, max(len(piece) // _SAMPLES, 1))
         is_lost = np.zeros(self._count, bool)
         if np.isnan(piece.sum()):  # much faster than a look at each sample
@@ -237,12 +190,7 @@ class _Choice:
         self._instead = self._without(is_lost, powers) if is_lost[self._in_mix].any() else None
 
     def look_at_block(self, block: Float32, *, is_full: bool = True) -> None:
-        """Select channels from ten seconds, long enough to recognise steady noise.
-
-        Parameters
-        ----------
-        block : np.ndarray [shape=(n, c)], float32
-        """
+        """Select channels from ten seconds [shape=(n, c)], enough to recognise steady noise."""
         step = max(len(block) // (_PIECES * _SAMPLES), 1)
         rows = _rows_of(block, step)
         count = rows.shape[1] // _PIECES * _PIECES
@@ -370,12 +318,6 @@ def _without_holes(rows: Float64) -> Float64:
 
 
 def finite_or_nan(block: Float32) -> Float32:
-    """Replace infinity by NaN.
-
-    Parameters
-    ----------
-    block : np.ndarray, float32
-    """
     if np.isinf(block).any():
         block = np.where(np.isfinite(block), block, np.float32(np.nan))
     return block
@@ -391,30 +333,16 @@ def read_audio(  # noqa: PLR0913
     incomplete: Callable[[str], object] = str,
     chosen: Callable[[str], object] = str,
 ) -> Iterator[Float32]:
-    """Read an audio file of any rate and channel count, block by block.
+    """Yield blocks of an audio file of any rate, at 16 kHz [shape=(n,) or (n, channels)], -1 to 1.
 
     Channels are averaged, unless they cancel or hide each other; then the best channel is used.
-    Other rates are resampled. Samples that are not finite are NaN.
+    With `channels`, the number in an array, they stay separate; `channel`, from 1, selects one.
+    Samples that are not finite are NaN. `start` and `end` are in seconds, limited to the length of
+    the file. `chosen` receives which channels are selected and why on a change, and an empty text
+    on return to the default.
 
     Raise `SourceError` if the file is missing, is not audio, is empty, or has a sample rate below 1
     kHz or above 768 kHz.
-
-    Parameters
-    ----------
-    start, end : float
-        Part to read, in seconds, limited to the length of the file.
-    channels : int or None
-        Number of channels of an array, as in `check_channels`; they stay separate.
-    channel : int or None
-        Channel to read, counted from 1.
-    chosen : callable
-        Called with a sentence (which channels and why) when the selected channels change, and with
-        an empty text on return to the default.
-
-    Yields
-    ------
-    np.ndarray [shape=(n,) or (n, channels)], float32
-        Samples in full scale, -1 to 1, at 16 kHz.
     """
     mix = finite_or_nan if channels is not None else ChannelMixer(channel, chosen)
     with open_audio(path) as audio:
@@ -427,21 +355,11 @@ def read_audio(  # noqa: PLR0913
 
 
 def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
-    """Convert samples of any rate and channel count; bit-equal to reading an audio file.
+    """Convert sound [shape=(n,) or (n, channels)] as `read_audio` does, to [shape=(m,)].
 
-    Raise `SourceError` if the shape, the type or the rate is not supported.
-
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n,) or (n, channels)]
-        Signed integers of the full range of their type, or floats in full scale, -1 to 1.
-    rate : int
-        Samples per second, 1000 to 768,000.
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], float32
-        Same as `read_audio`, in one piece.
+    The result is bit-equal to that of a file. `sound` has signed integers of the full range of
+    their type, or floats in full scale, -1 to 1; `rate` is in Hz, 1000 to 768,000. Raise
+    `SourceError` if shape, type or rate is not supported.
     """
     sound = np.asarray(sound)
     if sound.ndim not in {1, 2} or sound.dtype.kind not in "if":
@@ -458,16 +376,9 @@ def convert_sound(sound: NDArray[Any], rate: int) -> Float32:
 
 
 def check_channels(path: Path, channels: int | None, channel: int | None = None) -> None:
-    """Check that an audio file has the channels of an array, or a selected channel.
+    """Check that an audio file has the channels of an array, or a channel, from 1; None for any.
 
     Raise `SourceError` if the channels do not match; also as `open_audio`.
-
-    Parameters
-    ----------
-    channels : int or None
-        Channels of the array; None allows any number.
-    channel : int or None
-        Selected channel, counted from 1; None allows any.
     """
     with open_audio(path) as audio:
         if channel is not None and channel > audio.channels:

@@ -71,10 +71,7 @@ _MEANINGS = {
 
 
 def check_ffmpeg() -> None:
-    """Check that ffmpeg is installed.
-
-    Raise `SourceError` with an installation hint if not.
-    """
+    """Raise `SourceError` with an installation hint if ffmpeg is not installed."""
     if shutil.which("ffmpeg") is None:
         raise SourceError(
             "ffmpeg, which reads sound from the network, is missing: install it (Debian: apt "
@@ -114,7 +111,7 @@ class FileDecoder:
         return "" if self._held else self.fault() or _NO_SOUND
 
     def read(self, frames: int) -> bytes:
-        """Return the next samples as big-endian float32, fewer at the end.
+        """Return big-endian float32 samples, fewer at the end.
 
         Raise `SourceError` if ffmpeg stalls.
         """
@@ -214,12 +211,8 @@ def _start_decoding(path: Path) -> subprocess.Popen[bytes]:
 def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
     """Start to read the first audio stream of an address: AU, int16, 16 kHz, all channels.
 
-    ffmpeg ends with the thread that starts it, even if that is killed.
-
-    Returns
-    -------
-    subprocess.Popen
-        Sound is on standard output, error messages are on standard error.
+    Sound is on standard output, errors are on standard error. ffmpeg ends with the thread that
+    starts it, even if that is killed.
     """
     process = subprocess.Popen(  # noqa: S603
         [
@@ -245,13 +238,7 @@ def start_ffmpeg(address: str) -> subprocess.Popen[bytes]:
 
 
 def explain(address: str, message: str) -> str:
-    """Return why ffmpeg found no sound.
-
-    Parameters
-    ----------
-    message : str
-        Its standard error, which may contain the address.
-    """
+    """Return why ffmpeg found no sound, from its standard error, which may contain the address."""
     message = message.replace(address, "")
     found = next((meaning for text, meaning in _MEANINGS.items() if re.search(text, message)), None)
     if found == "":
@@ -331,7 +318,7 @@ class _Sound:
         return self._there if self._channel is None else 1
 
     def read(self) -> bytes:
-        """Wait for samples and return them; raise DeviceError if there will be no more.
+        """Wait for samples; raise DeviceError if there will be no more.
 
         `arrival` is their arrival in seconds of CLOCK_MONOTONIC, until the next call.
         """

@@ -90,22 +90,13 @@ class _Moment(NamedTuple):
 def file_time(
     path: Path, zone: tzinfo, pattern: str = "", *, has_zone: bool | None = None
 ) -> FileTime:
-    """Determine the start of an audio file.
+    """Determine the start of an audio file; `zone` is that of times without one.
 
     The sources are, in this order: the name of the file, its metadata (AudioMoth's comment, GUANO,
     Broadcast Wave), its modification time minus its length, as recorders close a file at its end.
-
-    Raise `SourceError` if the file is unreadable, or its name does not match the pattern.
-
-    Parameters
-    ----------
-    zone : tzinfo
-        Zone of times without one.
-    pattern : str
-        Format of the name, as for `strptime`; empty for the built-in formats.
-    has_zone : bool or None
-        Whether a dash and four digits after a time are a zone, unless the name decides it; None
-        (unknown): they are a number.
+    `pattern` is the name's format, as for `strptime`; empty for the built-in formats. `has_zone`
+    states whether a dash and four digits after a time are a zone, unless the name decides it; None
+    (unknown): a number. Raise `SourceError` if the file is unreadable, or its name does not match.
     """
     if not path.exists():
         raise SourceError(f"{path}: no such file")
@@ -130,25 +121,10 @@ def file_time(
 def arrange(
     paths: Sequence[Path], zone: tzinfo, pattern: str = "", start: int | None = None
 ) -> tuple[list[Path], list[FileTime | None]]:
-    """Sort audio files by time.
+    """Sort audio files by time, and return the start of each, or None if it follows without a gap.
 
-    Parameters
-    ----------
-    zone : tzinfo
-        Zone of times without one.
-    start : int or None
-        Start of the first file in nanoseconds of UTC, overriding its own; the others keep their
-        distance from it.
-
-    Returns
-    -------
-    list of (FileTime or None)
-        Start of each file; None: it follows the previous file without a gap.
-
-    Raises
-    ------
-    SourceError
-        As `file_time`.
+    `zone` is that of times without one. `start`, in nanoseconds of UTC, overrides that of the first
+    file; the others keep their distance from it. Raise `SourceError` as `file_time`.
     """
     placed: list[tuple[FileTime, list[Path]]] = []
     if start is not None and len(paths) == 1:
@@ -171,10 +147,7 @@ def arrange(
 
 
 def check_pattern(pattern: str) -> None:
-    """Check that a pattern has a date and a time of day.
-
-    Raise `ConfigurationError` if it does not.
-    """
+    """Raise `ConfigurationError` if a pattern lacks a date or a time of day."""
     found = re.findall("%(.)", pattern)
     used = set(found)
     unknown = sorted(used - _DIRECTIVES.keys())

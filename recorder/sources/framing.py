@@ -17,14 +17,9 @@ from hearthlog.schemas.messages.message_types import CLOCK_SET
 
 
 class FrameCutter:
-    """Resamples one sound to 16 kHz and cuts it into frames.
+    """Resamples one sound from a rate in Hz to 16 kHz and cuts it into frames.
 
-    Parameters
-    ----------
-    rate : float
-        Samples per second of the sound.
-    channels : int or None
-        Channels of an array; None for samples without a channel axis.
+    `channels` is that of an array; None for samples without a channel axis.
     """
 
     def __init__(self, rate: float = SAMPLE_RATE, channels: int | None = None) -> None:
@@ -35,18 +30,7 @@ class FrameCutter:
             self._resampler = soxr.ResampleStream(rate, SAMPLE_RATE, channels or 1, dtype="float32")
 
     def push(self, samples: Float32, *, last: bool = False) -> Float32:
-        """Add samples and return the completed frames.
-
-        Parameters
-        ----------
-        samples : np.ndarray [shape=(m,) or (m, c)], float32
-            At the rate of the sound.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, 800) or (n, 800, c)], float32
-            At 16 kHz.
-        """
+        """Add samples [shape=(m,) or (m, c)]; return frames [shape=(n, 800) or (n, 800, c)]."""
         if self._resampler is not None:
             samples = self._resampler.resample_chunk(samples, last=last)
         self._held = np.concatenate([self._held, samples])
@@ -65,7 +49,7 @@ _ROUNDS = 10  # of reweighting
 
 
 class SampleClock:
-    """Maps a sample index to the capture time of the sample.
+    """Maps a sample index to the capture time of the sample; `rate` is nominal, in Hz.
 
     Observations are late, never early, by the delays of the sound card and the scheduler. So the
     earliest observation of each window of two seconds counts, and a line is fitted through these. A
@@ -73,11 +57,6 @@ class SampleClock:
     in Huber's loss), residuals below by their square. Behind a sound server the delays are a
     hundred times longer and no line can be fitted: then the earliest observation of all windows
     counts. The time is steered towards each new line, never set to it: time does not jump.
-
-    Parameters
-    ----------
-    rate : float
-        Nominal samples per second.
     """
 
     def __init__(self, rate: float) -> None:
@@ -105,14 +84,9 @@ class SampleClock:
         return -self._fitted_slope * 1e6
 
     def observe(self, index: int, time: float, *, is_exact: bool = True) -> None:
-        """Add an observation: an upper bound on the capture time of a sample.
+        """Add an upper bound on a sample's capture time, in seconds of CLOCK_MONOTONIC.
 
-        Parameters
-        ----------
-        time : float
-            Seconds of CLOCK_MONOTONIC.
-        is_exact : bool
-            Whether the time comes from the sound card rather than from an arrival.
+        It `is_exact` if it comes from the sound card rather than from an arrival.
         """
         self._is_exact = is_exact
         nominal = index / self._rate
@@ -127,17 +101,9 @@ class SampleClock:
             self._earliest, self._earliest_steered = (nominal, late), steered
 
     def time(self, index: Float64 | float) -> Float64:
-        """Compute the capture times of samples.
+        """Compute capture times, in seconds of CLOCK_MONOTONIC, of indices [shape=() or (n,)].
 
-        Parameters
-        ----------
-        index : float or np.ndarray [shape=(n,)], float64
-            Sample indices, possibly fractional. At least one observation is required.
-
-        Returns
-        -------
-        np.ndarray [shape=() or (n,)], float64
-            Seconds of CLOCK_MONOTONIC.
+        Indices may be fractional. At least one observation is required.
         """
         assert self._origin is not None
         nominal = np.asarray(index) / self._rate
@@ -197,18 +163,7 @@ class SampleBlock:
         return abs(self.adc_time - self.arrival) < _ADC_CLOCK_SECONDS
 
     def taken_at(self, rate: float) -> float:
-        """Return an upper bound on the capture time of the first sample.
-
-        Parameters
-        ----------
-        rate : float
-            Samples per second.
-
-        Returns
-        -------
-        float
-            Seconds of CLOCK_MONOTONIC.
-        """
+        """Return an upper bound on the first sample's time, in seconds of CLOCK_MONOTONIC."""
         return self.adc_time if self.has_adc_time else self.arrival - len(self.samples) / rate
 
 
@@ -216,11 +171,7 @@ class Framer:
     """Cuts the sound of one microphone into frames, over all runs of its capture process.
 
     Samples of a frame are contiguous: after a loss the next frame begins with the first new sample.
-
-    Attributes
-    ----------
-    last_stamp : int
-        Stamp of the last frame in nanoseconds of UTC; 0 before the first one.
+    `last_stamp` is the last frame's, in nanoseconds of UTC; 0 before the first one.
     """
 
     def __init__(self) -> None:
@@ -255,20 +206,10 @@ class Framer:
         lost_reason: str = "",
         channels: int | None = None,
     ) -> None:
-        """Restart with another capture process.
+        """Restart with another capture process, after a gap with a reason.
 
-        Parameters
-        ----------
-        rate : int
-            Samples per second of the capture process.
-        wall_offset : int
-            CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
-        reason : str
-            Reason of the gap in between.
-        lost_reason : str
-            Reason of missing blocks; by default the recorder was too slow.
-        channels : int or None
-            Channels of an array; None for a single microphone.
+        `rate` is in Hz, `wall_offset` is CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
+        `lost_reason` is that of missing blocks; by default the recorder was too slow.
         """
         self._rate = float(rate)
         self._channels = channels
@@ -284,23 +225,14 @@ class Framer:
     def step_clock(self, wall_offset: int) -> None:
         """Follow a step of the time of day; only the samples of the unfinished frame are lost.
 
-        Parameters
-        ----------
-        wall_offset : int
-            CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
+        `wall_offset` is CLOCK_REALTIME less CLOCK_MONOTONIC in nanoseconds.
         """
         step = (wall_offset - self._wall_offset) / NANOSECONDS
         self._restart(self._expected + self._lost, clock_set_by(step))
         self._wall_offset = wall_offset
 
     def add(self, block: SampleBlock) -> list[Frames | Gap]:
-        """Add a block and return the completed frames.
-
-        Returns
-        -------
-        list of Frames or Gap
-            At most one `Frames`, after the gap before it, if there is one.
-        """
+        """Add a block; return at most one `Frames`, after the gap before it, if there is one."""
         if block.index != self._expected:
             self._restart(block.index + self._lost, self._lost_reason)
         self._expected = block.index + len(block.samples)
@@ -372,13 +304,9 @@ def clock_set_by(seconds: float) -> str:
 
 
 def frames_of(first: int, frames: Float32, stamps: Int64) -> Frames:
-    """Create the event of frames of one microphone, or of an array.
+    """Create the event of frames [shape=(n, 800) or, of an array, (n, 800, c)].
 
-    Parameters
-    ----------
-    frames : np.ndarray [shape=(n, 800) or (n, 800, c)], float32
-    stamps : np.ndarray [shape=(n,)], int64
-        Starts of the frames in nanoseconds of UTC.
+    `stamps` [shape=(n,)] are their starts in nanoseconds of UTC.
     """
     if frames.ndim == 2:
         return Frames(first, frames, stamps)
@@ -396,11 +324,7 @@ class WallClock:
     """CLOCK_REALTIME, extrapolated while its time is out of the range of a log.
 
     Without an earlier valid time it continues from 1970, as on a machine with an unset clock.
-
-    Attributes
-    ----------
-    trouble : str
-        Fault of the clock; empty if there is none.
+    `trouble` is the fault of the clock; empty for none.
     """
 
     def __init__(self) -> None:
@@ -422,10 +346,7 @@ class WallClock:
 
 
 def check_times(first: int, last: int) -> None:
-    """Check that the times of audio files, in nanoseconds of UTC, are in the range of a log.
-
-    Raise `SourceError` if they are not.
-    """
+    """Raise `SourceError` if times, in nanoseconds of UTC, are out of the range of a log."""
     if first < 0 or last >= _LAST:
         day = _day(first if first < 0 else last)
         raise SourceError(f"a log cannot have sound of {day}, only of 1970 to 2037; say --start")

@@ -63,33 +63,17 @@ def check_device(device: str) -> None:
 
 
 class MicrophoneSource:
-    """One microphone as one stream of frames.
+    """One microphone as one stream of frames; later only the same device, or the fallback, is used.
 
-    After the first successful start only the same device is used again, or the fallback.
+    `device` is as listed by `hearthlog devices`, empty for the default one, or a network address;
+    the attribute is the current or last device, without user and password of an address.
+    `fallback`, no array, is used while it is missing. With `waits`, a device missing at the start
+    is awaited; one that lacks the channels of the array is an error without a fallback. `channels`
+    is that of an array. `channel`, from 1, is the device's; by default, and for the fallback, the
+    first, or the best one if the first has much less sound.
 
     Raise `SourceError` if this machine cannot capture microphones, or cannot capture this one and
     `waits` is false; if an address is invalid.
-
-    Parameters
-    ----------
-    device : str
-        As `hearthlog devices` lists it, empty for the default one, or a network address.
-    fallback : str, optional
-        Another device, used while this one is missing; by default none. It is no array.
-    waits : bool, optional
-        Whether to wait at the start for a missing device, as later. A device that lacks the
-        channels of the array is an error without a fallback.
-    channels : int or None
-        Channels of an array; None for a single microphone.
-    channel : int or None
-        Channel of the device, counted from 1; by default, and for the fallback, the first one, or
-        the best one if the first has much less sound.
-
-    Attributes
-    ----------
-    device : str
-        Name of the current or last device; before that, as given. Without the user and the password
-        of an address.
     """
 
     def __init__(  # noqa: PLR0913
@@ -129,12 +113,9 @@ class MicrophoneSource:
         self._wall_offset = self._clock.offset()
 
     def events(self, stop: Flag) -> Iterator[Event]:
-        """Yield frames, gaps and health until `stop` is set, even if the microphone is lost.
+        """Yield events in the order of time until `stop` is set, even if the microphone is lost.
 
-        Yields
-        ------
-        Event
-            In the order of time; health every ten seconds, and on change.
+        Health comes every ten seconds, and on change.
         """
         reason = "the microphone was started"
         while not stop.is_set():

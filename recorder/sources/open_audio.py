@@ -123,10 +123,9 @@ def _open(path: Path) -> Iterator[OpenAudio]:
 
 
 def audio_seconds(path: Path) -> float:
-    """Return the length of an audio file in seconds, from its header.
+    """Return the length in seconds from the header; without one, decode the complete file.
 
-    Without a length in the header, the complete file is decoded. Raise `SourceError` as
-    `open_audio`.
+    Raise `SourceError` as `open_audio`.
     """
     with open_audio(path) as audio:
         if audio.frames is not None:
@@ -149,7 +148,7 @@ def is_audio(name: str) -> bool:
 
 
 def text_fields(path: Path) -> list[str]:
-    """Return the text metadata that libsndfile finds in an audio file, such as a comment.
+    """Return the texts that libsndfile finds, such as a comment.
 
     Raise `SourceError` if the file is missing or unreadable.
     """
@@ -220,10 +219,7 @@ class _View(mmap.mmap):
 
 
 def _mended_wav(path: Path) -> _View | None:
-    """Return a WAV file with an empty data size as a view in which the size covers the rest.
-
-    A recorder that was switched off leaves such a file. The file itself is not written.
-    """
+    """Mend the view of a WAV file with an empty data size, as of a recorder switched off."""
     with path.open("rb") as file:
         view = _View(file.fileno(), 0, access=mmap.ACCESS_READ)
     place = 12
@@ -336,10 +332,9 @@ def _damage(seconds: float, begin: float = 0.0) -> str:
 
 
 def _hidden_seconds(path: Path, sound: soundfile.SoundFile) -> float:
-    """Return the seconds of an MP3 file that libsndfile omits because of a wrong length estimate.
+    """Return the seconds of an MP3 file that libsndfile omits.
 
-    Without a table at its beginning, libsndfile estimates from the first bit rate, which may
-    change.
+    Without a table at the start, it estimates the length from the first bit rate, which may change.
     """
     if sound.format != "MP3":
         return 0.0

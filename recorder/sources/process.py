@@ -58,10 +58,7 @@ def query_devices() -> list[Device]:
 
 
 def check_ros() -> None:
-    """Check that ROS 2 is installed for this Python.
-
-    Raise `SourceError` with an installation hint if not.
-    """
+    """Raise `SourceError` with an installation hint if this Python has no ROS 2."""
     if find_spec("rclpy") is None:
         raise SourceError(
             f"there is no rclpy for {sys.executable}, which reads ROS 2 topics: source "
@@ -71,22 +68,12 @@ def check_ros() -> None:
 
 
 class Capture:
-    """One run of a capture process, started and with a known format.
+    """One run of a capture process, with a known format, started within some `seconds`.
 
-    Parameters
-    ----------
-    seconds : float
-        Time to start.
-    hangs, crashes : str
-        Messages of the errors of a process that does not answer, or ends without a reason.
-
-    Raises
-    ------
-    DeviceError
-        If the device is missing, cannot be opened or has too few channels, or there is no sound,
-        with the message of the capture process; if it hangs, or was stopped.
-    SourceError
-        If PortAudio is missing, cannot start, or crashes.
+    `hangs` and `crashes` are the errors of a process that does not answer, or ends without a
+    reason. Raise `DeviceError` if the device is missing, cannot be opened or has too few channels,
+    or there is no sound, with the message of the capture process; if it hangs, or was stopped.
+    Raise `SourceError` if PortAudio is missing, cannot start, or crashes.
     """
 
     def __init__(
@@ -110,19 +97,9 @@ class Capture:
             raise
 
     def blocks(self, timeout: float) -> list[SampleBlock] | None:
-        """Return the blocks that have arrived.
+        """Return the blocks that arrive, waiting some seconds for the first; None at the end.
 
         Raise `DeviceError` if the process has ended with a reason.
-
-        Parameters
-        ----------
-        timeout : float
-            Seconds to wait for the first block.
-
-        Returns
-        -------
-        list of SampleBlock or None
-            In the order of their samples, may be empty; None if the process has ended.
         """
         if not self._wait(timeout):
             return []
@@ -190,18 +167,10 @@ def open_device(
     channel: int | None = None,
     latency: float = LATENCY_SECONDS,
 ) -> Capture:
-    """Start to capture from a local microphone.
+    """Start to capture from a microphone of `hearthlog devices`, or the default one if empty.
 
-    Parameters
-    ----------
-    device : str
-        As `hearthlog devices` lists it, or empty for the default one.
-    channels : int or None
-        Channels of an array; None for a single microphone.
-    channel : int or None
-        Selected channel, counted from 1; by default the blocks have all of up to eight.
-    latency : float
-        Length of PortAudio's buffer in seconds.
+    `channels` is that of an array; `channel`, from 1, selects one; by default the blocks have all
+    of up to eight. `latency` is the length of PortAudio's buffer in seconds.
     """
     arguments = [device, str(channels or 0), str(channel or 0), str(latency)]
     arguments += ["exact"] if exact else []
@@ -215,12 +184,9 @@ def open_device(
 
 
 def open_address(address: str, stop: Flag, channel: int | None = None) -> Capture:
-    """Start to capture from a network microphone.
+    """Start to capture from a network microphone; `channel`, from 1, selects one.
 
-    Parameters
-    ----------
-    channel : int or None
-        Selected channel, counted from 1; by default the blocks have all, for a topic the first one.
+    By default the blocks have all channels, for a topic the first one.
     """
     pipe = subprocess.PIPE
     process = subprocess.Popen(  # noqa: S603  our own modules

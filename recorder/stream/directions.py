@@ -81,17 +81,10 @@ class ArrayGeometry:
         return DirectionGrid(np.arctan2(y, x) + places * _STEP, np.abs(places - 1), after, _STEP)
 
     def delays(self, azimuths: Float64) -> Float64:
-        """Compute the delay of far-field sound at the second microphone of each pair.
+        """Compute delays in seconds [shape=(p, a)] of far-field sound from azimuths in radians.
 
-        Parameters
-        ----------
-        azimuths : np.ndarray [shape=(a,)], float64
-            Directions of the source, in the plane of x and y; in radians.
-
-        Returns
-        -------
-        np.ndarray [shape=(p, a)], float64
-            In seconds.
+        They are those at the second microphone of each pair; azimuths [shape=(a,)] are in the plane
+        of x and y.
         """
         towards = np.stack([np.cos(azimuths), np.sin(azimuths)])
         first, second = self.positions[self.pairs.T, :2]
@@ -100,15 +93,10 @@ class ArrayGeometry:
 
 
 def array_geometry(positions: Sequence[Sequence[float]]) -> ArrayGeometry:
-    """Check the microphone positions of an array.
+    """Check microphone positions: [x, y] or [x, y, z] of each channel, in metres.
 
     Raise `ConfigurationError` if the number of microphones is out of range, a position is invalid
     or used twice, or the distances are too small or too large for direction finding.
-
-    Parameters
-    ----------
-    positions : sequence of sequence of float
-        [x, y] or [x, y, z] of each channel's microphone, in metres.
     """
     count = len(positions)
     if not 2 <= count <= MOST_MICROPHONES:
@@ -205,13 +193,7 @@ class DirectionFinder:
         self._past = np.zeros((_ECHO_HOPS, len(_STARTS)), np.float32)  # powers of the last hops
 
     def __call__(self, frames: Float32, first: int) -> Located:
-        """Add successive frames.
-
-        Parameters
-        ----------
-        frames : np.ndarray [shape=(n, 800, c)], float32
-            Samples of all channels in full scale, -1 to 1.
-        """
+        """Add successive frames [shape=(n, 800, c)] of all channels in full scale, -1 to 1."""
         begin = 0
         if self._held is None:
             begin = -first % BLOCK_FRAMES
@@ -306,12 +288,7 @@ class ChannelWatch:
         self._dead = np.zeros(channels, np.int64)
 
     def add(self, frames: Float32) -> None:
-        """Add successive frames.
-
-        Parameters
-        ----------
-        frames : np.ndarray [shape=(n, 800, c)], float32
-        """
+        """Add successive frames [shape=(n, 800, c)]."""
         moving = (frames != frames[:, :1]).any(axis=1)
         sounding = moving.any(axis=1)
         frames, moving = frames[sounding], moving[sounding]
@@ -362,11 +339,7 @@ class ArrayDirections:
     def __call__(self, frames: Frames) -> Directions:
         """Find the directions of the blocks that these frames complete.
 
-        Parameters
-        ----------
-        frames : Frames
-            The next frames. Frames without channels, as from a fallback microphone, have no
-            direction.
+        Frames without channels, as from a fallback microphone, have no direction.
         """
         if frames.channels is None:
             self.restart()

@@ -63,13 +63,7 @@ def health_line(microphone: str, health: SourceHealth) -> EncodedMessage:
 
 
 def notice_line(microphone: str, stamp: int, notice: Notice) -> EncodedMessage:
-    """Format a notice as a line of `/rosout`.
-
-    Parameters
-    ----------
-    stamp : int
-        Time of the notice, in nanoseconds of UTC.
-    """
+    """Format a notice at a time in nanoseconds of UTC as a line of `/rosout`."""
     return _line(stamp, microphone, _LEVELS[notice.level], notice.text)
 
 
@@ -107,13 +101,7 @@ def column_messages(
 
 
 def stream_info(microphone: str, device: str, features: FeatureSet, model: Model | None) -> Any:
-    """Create the `AudioStreamInfo` of a microphone, with a stamp of zero.
-
-    Parameters
-    ----------
-    model : Model or None
-        Labelling model; None for no labels.
-    """
+    """Create the `AudioStreamInfo` of a microphone, with a stamp of zero."""
     return message(
         message_types.STREAM_INFO,
         header=header(0, microphone),
@@ -140,13 +128,7 @@ def opening_messages(info: Any, lines: Sequence[str] = ()) -> list[EncodedMessag
 
 
 def diagnostics(subject: str, health: SourceHealth, microphone: str = "") -> EncodedMessage:
-    """Encode the health of a subject.
-
-    Parameters
-    ----------
-    subject : str
-        Name of a microphone or recorder; after a space the part of it, if not all of it.
-    """
+    """Encode the health of a subject: a microphone or recorder, or a space and a part of it."""
     status = message(
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=health.level,

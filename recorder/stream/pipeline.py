@@ -59,20 +59,10 @@ _REMEMBERED_WINDOWS = 4  # of embeddings: two seconds
 class Pipeline:
     """All processing of one microphone's sound.
 
-    Parameters
-    ----------
-    private : sequence of str
-        Classes whose features are logged coarsely, as in `PrivacyFilter`. With any, all messages
-        are delayed by up to two seconds, so that log time never runs backwards.
-    array : ArrayGeometry or None
-        Geometry of a microphone array; None for no directions.
-
-    Attributes
-    ----------
-    embedding : EmbeddingSource or None
-        The network behind the embeddings; None without embeddings.
-    last_frames : Frames or None
-        Frames of the last push, after the infrasound filter.
+    `private` has classes whose features are logged coarsely, as in `PrivacyFilter`; with any, all
+    messages are delayed by up to two seconds, so that log time never runs backwards. Without
+    `array` there are no directions. `last_frames` are those of the last push, after the infrasound
+    filter.
     """
 
     def __init__(  # noqa: PLR0913, PLR0917
@@ -166,13 +156,9 @@ class Pipeline:
         stamps: Int64,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> list[EncodedMessage]:
-        """Convert the features of successive frames to messages.
+        """Convert features [shape=(n, d)] of frames to messages.
 
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds of UTC.
+        `stamps` [shape=(n,)] are their starts in nanoseconds of UTC.
         """
         floors = self._track_floor(features, first)
         if floors is not None:
@@ -241,8 +227,7 @@ class Pipeline:
     def _filtered(self, frames: LoggedFrames) -> list[EncodedMessage]:
         """Encode frames that may be logged, and the embeddings that end with them.
 
-        Streams that label by names get only these embeddings: without an embedding, as for possible
-        speech, there is no name.
+        Streams that label by names get only these embeddings: possible speech has none, so no name.
         """
         embeddings = self._embedding_filter.release(frames)
         known = frames.stamps[embeddings.last_frames - frames.first]
@@ -277,15 +262,7 @@ class Pipeline:
     def release(self, messages: Sequence[EncodedMessage]) -> list[EncodedMessage]:
         """Return the messages that may be logged: all, or those before the features still held.
 
-        Parameters
-        ----------
-        messages : sequence of EncodedMessage
-            In the order of their log times, none before the last event.
-
-        Returns
-        -------
-        list of EncodedMessage
-            In the order of their log times, including messages held earlier.
+        Both are in the order of log time; given messages are not before the last event.
         """
         if self._privacy_filter is None:
             return list(messages)
@@ -314,14 +291,9 @@ class Pipeline:
         stamp: int,
         labelling: str = LIVE,
     ) -> tuple[list[EncodedMessage], list[EncodedMessage]]:
-        """Switch to another model at a frame; everything else continues.
+        """Switch to a model for the same feature set, or to none; everything else continues.
 
-        Parameters
-        ----------
-        model : Model or None
-            For the same feature set; None for no labels.
-        frame, stamp : int
-            Number of the next frame, and its start in nanoseconds of UTC.
+        `frame` is the number of the next frame, `stamp` its start in nanoseconds of UTC.
         """
         held = self.flush()
         earlier = self._streams.pop(labelling, None)
@@ -358,13 +330,7 @@ class Pipeline:
         stream.labeller.follow(recent, floors, stamps, frame, unlabelled, known)
 
     def notice_messages(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
-        """Convert a notice to messages.
-
-        Parameters
-        ----------
-        stamp : int
-            Time of the notice, in nanoseconds of UTC.
-        """
+        """Convert a notice at a time in nanoseconds of UTC to messages."""
         subject = f"{self.microphone} {subject}"
         return self.release(
             [

@@ -21,18 +21,12 @@ _BEHIND_FRAMES = 12  # plus a window of 0.4 s before them: sound of the last sec
 
 
 class PrivateFrames:
-    """Determines which frames are private, as soon as it is certain.
+    """Determines which frames are private, as soon as it is certain; none without `classes`.
 
-    A label is available with the last frame of its window. A frame is private unless all windows
-    within one second before and after it were labelled, and none of them is likely to be of a
-    private class. Frames next to a gap have fewer windows, and are private.
-
-    Parameters
-    ----------
-    classes : sequence of str
-        Private classes; without any, no frame is private.
-    window_frames : int
-        Length of a label's window, at least one second.
+    A label is available with the last frame of its window, of `window_frames`, at least a second. A
+    frame is private unless all windows within one second before and after it were labelled, and
+    none of them is likely to be of a private class. Frames next to a gap have fewer windows, and
+    are private.
     """
 
     def __init__(self, classes: Sequence[str], window_frames: int, ahead: int = 0) -> None:
@@ -46,18 +40,7 @@ class PrivateFrames:
         self._unnamed = NAMED_FRAMES + 1  # frames since the last names of a private class
 
     def push(self, count: int, labels: FrameLabels | None) -> Bool:
-        """Add frames, which follow the previous ones.
-
-        Parameters
-        ----------
-        count : int
-            At least one.
-
-        Returns
-        -------
-        np.ndarray [shape=(m,)], bool
-            Whether each of the next m decided frames is private.
-        """
+        """Add at least one next frame; return whether the next decided frames are private."""
         self._likely = np.append(self._likely, self._unlabelled(count))
         if labels is not None and len(labels.novelty):
             end = len(self._likely) - min(labels.ahead, self._ahead)
@@ -65,12 +48,7 @@ class PrivateFrames:
         return self._decide()
 
     def close(self) -> Bool:
-        """Return whether each undecided frame is private, and reset.
-
-        Returns
-        -------
-        np.ndarray [shape=(m,)], bool
-        """
+        """Return whether each undecided frame is private, and reset."""
         self._likely = np.append(self._likely, self._unlabelled(self.delay))
         private = self._decide()
         self._begin()
@@ -152,33 +130,16 @@ class PrivacyFilter:
         return int(self._held.stamps[0]) if len(self._held.stamps) else _NEVER
 
     def unknown(self, classes: Sequence[str] | None) -> list[str]:
-        """Return the private classes that a model lacks.
-
-        Parameters
-        ----------
-        classes : sequence of str or None
-            Classes of the model; None without a model.
-        """
+        """Return the private classes that a model with these classes, or no model, lacks."""
         return sorted(self._classes.difference(classes or ()))
 
     def push(
         self, features: Float32, first: int, stamps: Int64, labels: FrameLabels | None
     ) -> LoggedFrames:
-        """Add frames, which follow the previous ones.
+        """Add the next frames [shape=(n, d)]; return those of the decided seconds, if any.
 
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds of UTC.
-        labels : FrameLabels or None
-            Labels of the last of these frames; if the model lacks a private class, everything is
-            private.
-
-        Returns
-        -------
-        LoggedFrames
-            Frames of the decided seconds; may be empty.
+        `stamps` [shape=(n,)] are their starts in nanoseconds of UTC; `labels` are those of the last
+        of these frames. If the model lacks a private class, everything is private.
         """
         held = self._held
         self._held = _Frames(
@@ -210,7 +171,7 @@ class PrivacyFilter:
 
 
 class EmbeddingPrivacyFilter:
-    """Buffers embeddings until it is decided whether their windows are private; drops private ones.
+    """Buffers embeddings until their windows are decided, and drops private ones.
 
     Frames that were not released are private.
     """

@@ -58,14 +58,9 @@ class SoundWatch:
         self._hum = _MainsHum()
 
     def add_samples(self, samples: Float32, filtered: Float32 | None = None) -> None:
-        """Add successive frames.
+        """Add frames [shape=(n, FRAME_SAMPLES)] in full scale, -1 to 1.
 
-        Parameters
-        ----------
-        samples : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            In full scale, -1 to 1.
-        filtered : np.ndarray [shape=(n, FRAME_SAMPLES)], float32, optional
-            The same samples after `InfrasoundFilter`.
+        `filtered` has the same samples after `InfrasoundFilter`.
         """
         filtered = samples if filtered is None else filtered
         self._infrasound.add(samples, filtered)
@@ -83,13 +78,7 @@ class SoundWatch:
         self._hum.add(samples)
 
     def add_floor(self, powers: Float64) -> None:
-        """Add the noise floor at successive frames.
-
-        Parameters
-        ----------
-        powers : np.ndarray [shape=(n,)], float64
-            Mean squares; full scale is 1.
-        """
+        """Add the noise floor of frames [shape=(n,)], as mean squares; full scale is 1."""
         low = np.flatnonzero(decibels(powers) <= _LOUD_DBFS)
         self._loud = len(powers) - 1 - int(low[-1]) if len(low) else self._loud + len(powers)
 
@@ -117,13 +106,7 @@ class ClipWatch:
         self._seconds: list[int] = []  # mains frequency of each second's hum, or 0
 
     def add_samples(self, samples: Float32) -> None:
-        """Add successive frames.
-
-        Parameters
-        ----------
-        samples : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            In full scale, -1 to 1.
-        """
+        """Add successive frames [shape=(n, FRAME_SAMPLES)] in full scale, -1 to 1."""
         self._frames += len(samples)
         self._clipped += int(_are_clipped(samples).sum())
         is_flat = np.ptp(samples, axis=1) <= _DEAD_RANGE

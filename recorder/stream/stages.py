@@ -41,19 +41,10 @@ class RollingStatistics:
         self._recent: Float32 = np.empty((0, self._width), np.float32)
 
     def __call__(self, features: Float32, places: Indices | None = None) -> tuple[Float32, Float32]:
-        """Compute the statistics at some of the successive frames.
+        """Compute mean and standard deviation [shape=(m, d)] at some frames, by default all.
 
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-        places : np.ndarray [shape=(m,)], intp, optional
-            Indices of the frames, ascending from 0; all by default.
-
-        Returns
-        -------
-        mean, std : np.ndarray [shape=(m, d)], float32
-            Over the last window, or over all frames since the start or the last restart if these
-            are fewer; the standard deviation divides by the number of frames.
+        `features` has shape (n, d), `places` (m,), ascending indices from 0. The window is shorter
+        after the start or the last restart; the deviation divides by the number of frames.
         """
         frames = np.concatenate([self._recent, features])
         places = np.arange(len(features)) if places is None else places
@@ -82,13 +73,9 @@ class FeatureMessages:
         self._statistics.restart()
 
     def __call__(self, features: Float32, first: int, stamps: Int64) -> list[EncodedMessage]:
-        """Encode the features of successive frames.
+        """Encode features [shape=(n, d)] of successive frames.
 
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds of UTC.
+        `stamps` [shape=(n,)] are their starts in nanoseconds of UTC.
         """
         if not len(features):
             return []
@@ -137,16 +124,10 @@ class MicrophoneEmbeddings:
     def push(
         self, frames: Float32, features: Float32, floors: Floors | None, first: int, stamps: Int64
     ) -> Embeddings:
-        """Add successive frames.
+        """Add frames [shape=(n, FRAME_SAMPLES)] and their features [shape=(n, d)].
 
-        Parameters
-        ----------
-        frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        features : np.ndarray [shape=(n, d)], float32
-        floors : Floors or None
-            Floors at the last of these frames; None if the feature set has no bands.
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds of UTC.
+        `stamps` [shape=(n,)] are their starts in nanoseconds of UTC. `floors` are those at the last
+        of these frames; None if the feature set has no bands.
         """
         recent = np.concatenate([self._features, features])
         sound = np.zeros(len(frames), bool)
@@ -175,12 +156,9 @@ class MicrophoneEmbeddings:
 def embedding_messages(
     microphone: str, embeddings: Embeddings, known: Int64
 ) -> list[EncodedMessage]:
-    """Encode embeddings.
+    """Encode embeddings; `known` [shape=(m,)] are the log times.
 
-    Parameters
-    ----------
-    known : np.ndarray [shape=(m,)], int64
-        Log times: starts of the last frames of the windows, in nanoseconds of UTC.
+    They are the starts of the last frames of the windows, in nanoseconds of UTC.
     """
     columns: dict[str, Column] = {
         "header.stamp": embeddings.stamps,
@@ -196,12 +174,9 @@ def embedding_messages(
 def direction_messages(
     microphone: str, directions: Directions, known: Int64
 ) -> list[EncodedMessage]:
-    """Encode directions.
+    """Encode directions; `known` [shape=(m,)] are the log times.
 
-    Parameters
-    ----------
-    known : np.ndarray [shape=(m,)], int64
-        Log times: starts of the last frames of the blocks, in nanoseconds of UTC.
+    They are the starts of the last frames of the blocks, in nanoseconds of UTC.
     """
     columns: dict[str, Column] = {
         "header.stamp": directions.stamps,
@@ -215,18 +190,10 @@ def direction_messages(
 
 
 class LabelStream:
-    """Labels and segments of one model for one stream of frames.
+    """Labels and segments of one model, named by `classes`, for one stream of frames.
 
-    Attributes
-    ----------
-    labeller : Labeller or NamesLabeller
-        Follows another stream.
-    classes : tuple of str
-        Names of the columns of the probabilities.
-    segments_converged : bool
-        Whether sound before the first frame would no longer change the segments to come.
-    last : FrameLabels or None
-        Labels of the frames of the last push; None if they have none.
+    `labeller` follows another stream. `segments_converged`: sound before the first frame would no
+    longer change the segments to come. `last` has the labels of the last push, if any.
     """
 
     def __init__(
@@ -252,13 +219,9 @@ class LabelStream:
         stamps: Int64,
         auxiliary: Auxiliary,
     ) -> list[EncodedMessage]:
-        """Convert successive frames to messages.
+        """Convert features [shape=(n, d)] of successive frames to messages.
 
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds of UTC.
+        `stamps` [shape=(n,)] are their starts in nanoseconds of UTC.
         """
         self.last = None
         labels, segments = self.labeller.push(features, floors, first, stamps, auxiliary)
@@ -273,13 +236,7 @@ class LabelStream:
         ]
 
     def close(self, end: int) -> list[EncodedMessage]:
-        """End the segments of a sound; the next frame starts a new stream.
-
-        Parameters
-        ----------
-        end : int
-            End of the sound, in nanoseconds of UTC.
-        """
+        """End the segments at the end of the sound, in nanoseconds of UTC, and reset."""
         segments = self.labeller.close(end)
         self.segments_converged |= bool(segments)
         return self._segment_messages(segments)
