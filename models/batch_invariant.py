@@ -14,18 +14,9 @@ _LINE = 64  # bytes of a cache line
 def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
     """Multiply `rows @ weights` so that a row's result does not depend on the other rows.
 
-    A BLAS chooses kernel and threads by the size of the product, and each choice sums in another
-    order. Stacks of one small, fixed shape prevent that.
-
-    Parameters
-    ----------
-    rows : np.ndarray [shape=(n, k)], float64
-    weights : np.ndarray [shape=(k, m)], float64
-        At most a few thousand values, else the BLAS may still split a stack among threads.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, m)], float64
+    The shapes are (n, k), (k, m) and (n, m). A BLAS chooses kernel and threads by the size of the
+    product, and each choice sums in another order. Stacks of one small, fixed shape prevent that,
+    if `weights` has at most a few thousand values.
     """
     count, width = rows.shape
     columns = weights.shape[1]
@@ -45,16 +36,9 @@ def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
 
 
 def aligned(weights: NDArray[Any]) -> NDArray[Any]:
-    """Copy weights to the start of a cache line, which makes products a third faster.
+    """Copy weights [shape=(k, m), float32 or float64, C order] to the start of a cache line.
 
-    Parameters
-    ----------
-    weights : np.ndarray [shape=(k, m)], float32 or float64
-
-    Returns
-    -------
-    np.ndarray [shape=(k, m)], of the same type
-        In C order.
+    That makes products a third faster.
     """
     room = np.empty(weights.size * weights.itemsize + _LINE, np.uint8)
     start = -room.ctypes.data % _LINE

@@ -78,30 +78,16 @@ _BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
 
 
 def find_class(label: str) -> SoundClass | None:
-    """Return the class of a label.
+    """Return the class of a label, its name or alias; None if the class is not in the table.
 
-    Parameters
-    ----------
-    label : str
-        Name or alias of a class. Case is ignored, and spaces, commas and hyphens equal `_`:
-        `Crying, sobbing` is `crying_sobbing`.
-
-    Returns
-    -------
-    SoundClass or None
-        None if the class is not in the table.
+    Case is ignored, and spaces, commas and hyphens equal `_`: `Crying, sobbing` is
+    `crying_sobbing`.
     """
     return _BY_NAME.get(spelt(label))
 
 
 def in_words(label: str) -> str:
-    """Return the display name of a class.
-
-    Parameters
-    ----------
-    label : str
-        A name of the class, in any spelling; the name of an unknown class is written without `_`.
-    """
+    """Return the display name of a class; that of an unknown class is the name without `_`."""
     row = find_class(label)
     return label.replace("_", " ").capitalize() if row is None else row.words
 
@@ -126,14 +112,9 @@ def ordered(labels: Iterable[str]) -> list[str]:
 
 
 def meant_by(label: str, names: Collection[str]) -> list[str]:
-    """Return the names that match a label: the label itself in any spelling, or all of its class.
+    """Return the `names` that match a label: the label itself in any spelling, or all of its class.
 
     Two names of one class in a dataset are distinct there, so a third name matches both.
-
-    Returns
-    -------
-    list of str
-        In the order of `names`; empty if none matches.
     """
     if label in names:
         return [label]
@@ -143,12 +124,6 @@ def meant_by(label: str, names: Collection[str]) -> list[str]:
 
 
 def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]:
-    """Translate labels to matching names.
-
-    Returns
-    -------
-    dict of str to str
-        The name of each label; the label itself if none or several of the names match.
-    """
+    """Return the matching name of each label; the label itself if none or several names match."""
     meant = {label: meant_by(label, names) for label in labels}
     return {label: same[0] if len(same) == 1 else label for label, same in meant.items()}

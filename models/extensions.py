@@ -32,12 +32,7 @@ class Extensions(Generic[T]):
     """Objects of one kind, by name: built-in objects, and entry points of other distributions.
 
     Entry points are only looked up for names that are not built in, so a recorder with a built-in
-    model imports nothing else.
-
-    Parameters
-    ----------
-    missing : type of HearthlogError
-        Raised if there is no object of a name.
+    model imports nothing else. The error `missing` is raised if there is no object of a name.
     """
 
     def __init__(
@@ -73,12 +68,8 @@ class Extensions(Generic[T]):
     def get(self, name: str) -> T:
         """Return an object by its name.
 
-        Raises
-        ------
-        HearthlogError
-            Of the type `missing`, if there is no object of this name.
-        ModelError
-            If its entry point cannot be imported, or is not an object of this kind and name.
+        Raise the error `missing` if there is none, `ModelError` if its entry point cannot be
+        imported, or is not an object of this kind and name.
         """
         if name not in self._loaded:
             for point in entry_points(group=self._group, name=name):

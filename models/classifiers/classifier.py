@@ -45,10 +45,7 @@ class LabelTiming(NamedTuple):
 
 
 def label_timing(description: Description) -> LabelTiming:
-    """Return the timing of a model's labels.
-
-    Raise `ModelError` if the feature set is not installed.
-    """
+    """Return the timing of a model's labels; raise `ModelError` without its feature set."""
     if description.kind == BY_NAMES:  # per frame, from the windows around the frame
         parameters = NamesParameters.model_validate(description.parameters)
         return LabelTiming(1, 0, needs_floor=False, ahead=parameters.ahead)
@@ -69,10 +66,7 @@ CLASSIFIERS = Extensions(
 
 
 def classifier_kind(name: str) -> ClassifierKind:
-    """Return a kind of classifier by name.
-
-    Raise `ModelError` if there is no such kind, or it cannot be imported.
-    """
+    """Return a kind of classifier; raise `ModelError` if it is missing or cannot be imported."""
     return CLASSIFIERS.get(name)
 
 
@@ -84,26 +78,17 @@ _STEPS = 1 << 16  # steps of a probability; finer digits are noise, partly of th
 class Classifier:
     """Inference of one model.
 
-    The probabilities of a row do not depend on the rows of the same batch, nor on threads.
-
-    Raise `ModelError` if the model's feature set or kind of classifier is not installed, or cannot
-    be imported.
-
-    Parameters
-    ----------
-    model : Model
-        From `load_model` or a training.
+    The probabilities of a row do not depend on the rows of the same batch, nor on threads. Raise
+    `ModelError` if the model's feature set or kind of classifier is not installed, or cannot be
+    imported.
 
     Attributes
     ----------
     classes : tuple of str
         Names of the columns of the probabilities.
-    inputs : Inputs
-        Inputs of the feature set for `classify`.
     gate : float
         In dB: a window is silence unless some band is this much above the floor; 0 for no gate.
     transitions : np.ndarray [shape=(C, C)], float64
-        Transition probabilities of the model.
     calibrated_elsewhere : bool
         Whether the calibration used datasets outside the training data, so that it holds in new
         homes.
@@ -140,13 +125,7 @@ class Classifier:
         self.names: NamesParameters | None = names_parameters(model) if by_names else None
 
     def direction_weights(self, microphone: str) -> Float64 | None:
-        """Return the direction weights of a microphone array, for `DirectionEvidence`.
-
-        Returns
-        -------
-        np.ndarray [shape=(C, S)], float64, or None
-            None if the model has no weights for this microphone.
-        """
+        """Return the direction weights [shape=(C, S)] of a microphone array, or None."""
         return self._direction_weights.get(microphone)
 
     def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
@@ -158,13 +137,7 @@ class Classifier:
         return self._mix is not None and source.space == self._mix.space
 
     def lacking_embeddings(self, source: EmbeddingSource | None) -> str:
-        """Describe the embeddings that the model needs but lacks; empty if it lacks none.
-
-        Parameters
-        ----------
-        source : EmbeddingSource or None
-            Source of the available embeddings.
-        """
+        """Describe the embeddings that the model needs but lacks; empty if it lacks none."""
         taken = self._mix or self.names
         if taken is None or self.takes_embeddings(source):
             return ""
@@ -186,21 +159,9 @@ class Classifier:
     ) -> tuple[Float32, Float32]:
         """Mix features and embeddings: features decide on silence, both on the class of a sound.
 
-        Parameters
-        ----------
-        probabilities : np.ndarray [shape=(n, C)], float32
-            From `classify` without evidence.
-        by_heads : np.ndarray [shape=(n, C)], float64
-            From `EmbeddingHeads.log_probabilities`; NaN where there is no embedding. Rows without
-            embedding and evidence keep their probabilities.
-        evidence : np.ndarray [shape=(n, C)], float64, optional
-            Further evidence, as in `classify`.
-
-        Returns
-        -------
-        probabilities : np.ndarray [shape=(n, C)], float32
-        novelty : np.ndarray [shape=(n,)], float32
-            As from `classify`.
+        All have shape (n, C), and rows without embedding (NaN in `by_heads`) and evidence keep
+        their probabilities, those from `classify` without evidence. `by_heads` is from
+        `EmbeddingHeads.log_probabilities`. The result is that of `classify`.
         """
         embedded = np.isfinite(by_heads.sum(axis=1))
         changed = embedded if evidence is None else embedded | evidence.any(axis=1)
@@ -215,18 +176,7 @@ class Classifier:
         return self._in_steps(probabilities)
 
     def probabilities(self, inputs: Float32) -> Float32:
-        """Compute the probability of each class in each window.
-
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-            Finite.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, C)], float32
-            In the order of the model's classes, as from `classify`.
-        """
+        """Compute the class probabilities [shape=(n, C)] of finite inputs [shape=(n, width)]."""
         return self.classify(inputs)[0]
 
     def classify(
@@ -235,25 +185,13 @@ class Classifier:
         evidence: Float64 | None = None,
         by_heads: Float64 | None = None,
     ) -> tuple[Float32, Float32]:
-        """Compute the probability of each class, and the novelty of each window.
+        """Compute class probabilities [shape=(n, C)] and the novelty of each window [shape=(n,)].
 
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-            Finite.
-        evidence : np.ndarray [shape=(n, C)], float64, optional
-            Further evidence, added to the logarithms of the probabilities.
-        by_heads : np.ndarray [shape=(n, C)], float64, optional
-            As in `mix`.
-
-        Returns
-        -------
-        probabilities : np.ndarray [shape=(n, C)], float32
-            In the order of the model's classes, in steps of 2**-16; every row sums to 1 within
-            half a step per class. Older models' probabilities are not rounded.
-        novelty : np.ndarray [shape=(n,)], float32
-            Probability that the sound is not of the likeliest class other than `unknown`, 0 to 1;
-            for older models the value of the kind of classifier, or NaN.
+        `inputs` [shape=(n, width)] are finite. `evidence` [shape=(n, C)] is added to the logarithms
+        of the probabilities; `by_heads` is as in `mix`. Probabilities are in steps of 2**-16, and
+        every row sums to 1 within half a step per class; older models' are not rounded. Novelty is
+        the probability, 0 to 1, that the sound is not of the likeliest class other than `unknown`;
+        for older models the value of the kind of classifier, or NaN.
         """
         if by_heads is not None:
             return self.mix(self.classify(inputs)[0], by_heads, evidence)

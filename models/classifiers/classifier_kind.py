@@ -42,11 +42,20 @@ class NoParameters(BaseModel):
 
 
 class ClassifierKind(ABC):
-    """The arrays of the models of one kind, their validation, and inference."""
+    """The arrays of the models of one kind, their validation, and inference.
 
-    name: str  # the field `kind` of a description
-    parameters: type[BaseModel]  # the field `parameters` of a description
-    # required and optional arrays of a model. No value may be larger than 1e9
+    Attributes
+    ----------
+    name : str
+        The field `kind` of a description.
+    parameters : type of BaseModel
+        The field `parameters` of a description.
+    arrays, optional : mapping of str to np.dtype
+        Required and optional arrays of a model. No value may be larger than 1e9.
+    """
+
+    name: str
+    parameters: type[BaseModel]
     arrays: Mapping[str, np.dtype[Any]]
     optional: Mapping[str, np.dtype[Any]] = {}
 

@@ -41,17 +41,9 @@ NOWHERE = Directions(
 
 
 def sectors_of(azimuths: Float32) -> Indices:
-    """Return the sectors of directions; the middle of the first sector is ahead.
+    """Return the sectors [shape=(n,)], 0 to 35 counter-clockwise, of azimuths in radians.
 
-    Parameters
-    ----------
-    azimuths : np.ndarray [shape=(n,)], float32
-        In radians.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], intp
-        0 to 35, counter-clockwise.
+    The middle of the first sector is ahead.
     """
     places = np.rint(azimuths.astype(np.float64) * (SECTORS / (2 * np.pi)))
     return places.astype(np.intp) % SECTORS
@@ -62,11 +54,7 @@ class DirectionEvidence:
 
     A window uses the blocks of the last second that are complete at its last frame. Their evidence
     is averaged, weighted by confidence, because the blocks of one sound are not independent.
-
-    Parameters
-    ----------
-    weights : np.ndarray [shape=(C, S)], float64
-        Log-likelihood ratio of each class in each sector.
+    `weights` [shape=(C, S)] are log-likelihood ratios of each class in each sector.
     """
 
     def __init__(self, weights: Float64) -> None:
@@ -83,13 +71,10 @@ class DirectionEvidence:
         return self._full_from is not None and frame >= self._full_from
 
     def push(self, directions: Directions, first: int, count: int, windows: int) -> Float64:
-        """Add successive frames.
+        """Add frames; return what is added to log-probabilities [shape=(windows, C)].
 
-        Returns
-        -------
-        np.ndarray [shape=(windows, C)], float64
-            Added to the logarithms of the probabilities; 0 where no sound was located. The same
-            frames give the same bits in blocks of any size.
+        It is 0 where no sound was located. The same frames give the same bits in blocks of any
+        size.
         """
         if self._full_from is None:
             self._full_from = first + BLOCK_FRAMES * (MEMORY_BLOCKS + 1)
@@ -149,12 +134,8 @@ _MIDDLE = WINDOW_FRAMES // 2
 class EmbeddingEvidence:
     """Interpolates the evidence of windows, one value per class, to frames.
 
-    A frame lies between the middles of two windows; one or both may be missing.
-
-    Parameters
-    ----------
-    of_windows : callable
-        Maps embeddings, shape (m, W), to values, shape (m, C).
+    A frame lies between the middles of two windows; one or both may be missing. `of_windows` maps
+    embeddings [shape=(m, W)] to values [shape=(m, C)].
     """
 
     def __init__(self, of_windows: Callable[[Int8], Float64], classes: int) -> None:
@@ -184,13 +165,7 @@ class EmbeddingEvidence:
         return self._first is not None and begin >= self._first
 
     def at(self, first: int, count: int) -> Float64:
-        """Interpolate the evidence to successive frames, and discard evidence of earlier frames.
-
-        Returns
-        -------
-        np.ndarray [shape=(count, C)], float64
-            NaN where there is no window.
-        """
+        """Return the evidence at frames [shape=(count, C)], NaN without window; discard earlier."""
         share = ((np.arange(first, first + count) - _MIDDLE) % HOP_FRAMES + 0.5) / HOP_FRAMES
         earlier, later = self._around(first, count)
         earlier = np.where(np.isnan(earlier), later, earlier)
@@ -236,16 +211,11 @@ class EmbeddingHeads:
 
     A network trained on millions of clips recognises household sounds unknown to the model, but not
     their start. So the feature classifier decides on silence, and all of them together decide on
-    the class of a sound.
+    the class of a sound. A window's result does not depend on other windows of the batch, nor on
+    threads.
 
-    A window's result does not depend on other windows of the batch, nor on threads.
-
-    Parameters
-    ----------
-    weights : np.ndarray [shape=(H, W, C)], int32
-        Of the linear heads, in units of `UNIT`.
-    bias : np.ndarray [shape=(H, C)], int32
-        In the same units; `UNTAUGHT` for a class that is left to the other heads.
+    The linear heads have `weights` [shape=(H, W, C), int32] and `bias` [shape=(H, C), int32], in
+    units of `UNIT`; a bias of `UNTAUGHT` leaves a class to the other heads.
     """
 
     def __init__(
@@ -262,18 +232,10 @@ class EmbeddingHeads:
         self._names = [_Names(head, names) for head in mix.names]
 
     def log_probabilities(self, values: Int8) -> Float64:
-        """Return the weighted log-probabilities of windows by the heads.
+        """Return the weighted log-probabilities [shape=(m, C)] of logged values [shape=(m, W)].
 
-        Parameters
-        ----------
-        values : np.ndarray [shape=(m, W)], int8
-            As logged.
-
-        Returns
-        -------
-        np.ndarray [shape=(m, C)], float64
-            Sums of the logarithms of the heads' probabilities, times their weights in the mix, plus
-            the head of a home; 0 for silence, which the heads do not cover.
+        They are sums of the logarithms of the heads' probabilities, times their weights in the mix,
+        plus the head of a home; 0 for silence, which the heads do not cover.
         """
         result = np.zeros((len(values), self._classes))
         for start in range(0, len(values), _ROWS_AT_ONCE):
@@ -325,12 +287,9 @@ def sounds_of(classes: Sequence[str]) -> Indices:
 
 
 def floored(decisions: Float64) -> Float64:
-    """Return the logarithms of probabilities, limited to about `LEAST` from below.
+    """Return log-probabilities [shape=(n, C)], limited to about `LEAST` from below.
 
-    Parameters
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        -inf is allowed, but not for a complete row.
+    -inf is allowed, but not for a complete row.
     """
     grown = np.exp(decisions - decisions.max(axis=1, keepdims=True))
     logarithms: Float64 = np.log(grown / grown.sum(axis=1, keepdims=True) + LEAST)
@@ -340,21 +299,10 @@ def floored(decisions: Float64) -> Float64:
 def mixed(
     decisions: Float64, by_heads: Float64, mix: EmbeddingMix, classes: Sequence[str]
 ) -> Float64:
-    """Mix the outputs of a classifier and of heads.
+    """Mix classifier and heads, from `log_probabilities`, to log-probabilities [shape=(n, C)].
 
-    Silence keeps the classifier's probability; the other classes share the rest.
-
-    Parameters
-    ----------
-    decisions : np.ndarray [shape=(n, C)], float64
-        Logarithms of the classifier's probabilities, plus any constant per row.
-    by_heads : np.ndarray [shape=(n, C)], float64
-        From `EmbeddingHeads.log_probabilities`.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
-        Logarithms of probabilities.
+    Silence keeps the classifier's probability; the other classes share the rest. `decisions` are
+    logarithms of the classifier's probabilities, plus any constant per row.
     """
     sounds = sounds_of(classes)
     of_sounds = decisions[:, sounds]

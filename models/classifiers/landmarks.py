@@ -33,7 +33,7 @@ class LandmarksKind(ClassifierKind):
     """Linear decisions on the kernels of landmarks; the arrays for C classes.
 
     scaler_mean, scaler_scale : [shape=(width,)], float64
-        Mean and standard deviation of the inputs.
+        Of the inputs.
     landmarks : [shape=(m, width)], float32
         Unscaled inputs, sorted by class.
     landmark_counts : [shape=(C,)], int64
@@ -129,18 +129,7 @@ class LandmarksMachine:
             self._blocks.append((block, aligned(weights[rows])))
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Return logarithms of probabilities up to a constant and a temperature; NaN as novelty.
-
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-            Finite.
-
-        Returns
-        -------
-        decisions : np.ndarray [shape=(n, C)], float64
-        novelty : np.ndarray [shape=(n,)], float64
-        """
+        """Return logarithms of probabilities up to a constant and a temperature; NaN as novelty."""
         rows = self._distances.rows(self._scaled(inputs))
         decisions = np.tile(self._bias, (len(inputs), 1))
         for landmarks, weights in self._blocks:

@@ -14,13 +14,7 @@ LEARNED: Mapping[str, np.dtype[Any]] = {
 
 
 def learned_shapes(width: int, arrays: Mapping[str, Array]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the arrays `LEARNED`; empty if a model keeps no windows.
-
-    Parameters
-    ----------
-    arrays : mapping of str to np.ndarray
-        Arrays of the model by name, of any type and shape.
-    """
+    """Return the shapes of the arrays `LEARNED`; empty if a model keeps no windows."""
     inputs = arrays.get("learned_inputs", np.empty(0))
     if not inputs.ndim or not len(inputs):
         return {}
@@ -30,10 +24,7 @@ def learned_shapes(width: int, arrays: Mapping[str, Array]) -> dict[str, tuple[i
 def target_problem(classes: int, arrays: Mapping[str, Array], *names: str) -> str | None:
     """Return an error in the class arrays; None if they are valid or absent.
 
-    Parameters
-    ----------
-    arrays : mapping of str to np.ndarray
-        By name; finite, with valid types and shapes.
+    `arrays` are finite, with valid types and shapes.
     """
     for name in names:
         target = arrays.get(name, np.empty(0, np.int64))

@@ -383,10 +383,7 @@ _FORBIDDEN = re.compile(
 def may_be_shipped(licence: str) -> bool:
     """Return whether a model trained on a recording may be shipped, with attribution.
 
-    Parameters
-    ----------
-    licence : str
-        As in the manifest. It must begin with CC0, public domain, CC BY, CC BY-SA, ODbL or
-        Apache-2.0, and contain no restriction or doubt.
+    The licence must begin with CC0, public domain, CC BY, CC BY-SA, ODbL or Apache-2.0, and contain
+    no restriction or doubt.
     """
     return bool(_ALLOWED.match(licence.strip())) and not _FORBIDDEN.search(licence)

@@ -190,10 +190,7 @@ def is_by_names(model: Model) -> bool:
 
 
 def require_trained(model: Model) -> None:
-    """Refuse a model that labels by names where a trained model is required.
-
-    Raise `ModelError` if the model labels by names.
-    """
+    """Raise `ModelError` if a model labels by names, where a trained model is required."""
     if is_by_names(model):
         raise ModelError(
             f"{model.name} labels by the names of a network and has learned nothing: clips are "

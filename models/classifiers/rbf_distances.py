@@ -86,18 +86,7 @@ class UnroundedDistances:
 
 
 def in_steps(scaled: Float64, steps: int) -> Float64:
-    """Round scaled inputs to whole steps.
-
-    Parameters
-    ----------
-    scaled : np.ndarray [shape=(n, width)], float64
-        In standard deviations from the mean.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, width)], float64
-        Whole numbers, from -2^20 to 2^20.
-    """
+    """Round standard deviations from the mean [shape=(n, width)] to whole steps, -2^20 to 2^20."""
     return np.clip(np.rint(steps * scaled), -_FARTHEST, _FARTHEST)
 
 

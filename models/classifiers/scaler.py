@@ -33,13 +33,7 @@ def scaler_shapes(width: int) -> dict[str, tuple[int, ...]]:
 
 
 def scaler_problem(arrays: Mapping[str, Array]) -> str | None:
-    """Return an error in the scaler of a model; None if there is none.
-
-    Parameters
-    ----------
-    arrays : mapping of str to np.ndarray
-        The arrays of `Scaler`; finite, with valid types and shapes.
-    """
+    """Return an error in the scaler arrays, finite and of valid types and shapes; else None."""
     if (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
         return None
     return "scaler_scale has values that are not positive"

@@ -157,19 +157,10 @@ class SvmMachine:
         self._first, self._second = np.triu_indices(self._count, 1)
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Compute decision values and novelty of windows.
+        """Compute decisions [shape=(n, C)] and novelty [shape=(n,)] of finite inputs.
 
-        Parameters
-        ----------
-        inputs : np.ndarray [shape=(n, width)], float32
-            Finite.
-
-        Returns
-        -------
-        decisions : np.ndarray [shape=(n, C)], float64
-        novelty : np.ndarray [shape=(n,)], float64
-            One minus the kernel of the nearest support vector, 0 to 1; NaN for a model whose
-            novelty is derived from its probabilities.
+        Novelty is one minus the kernel of the nearest support vector, 0 to 1; NaN for a model whose
+        novelty is derived from its probabilities.
         """
         rows = self._distances.rows(self._scaled(inputs))
         pairs, others, nearest = self._pairs(rows)
@@ -179,16 +170,11 @@ class SvmMachine:
         return decision, -np.expm1(nearest)
 
     def _pairs(self, rows: Prepared) -> tuple[Float64, Float64, Float64]:
-        """Return the decision values of every pair of classes.
+        """Return decisions of pairs [shape=(n, C (C - 1) / 2)], others and nearest.
 
-        Returns
-        -------
-        decisions : np.ndarray [shape=(n, C (C - 1) / 2)]
-        others : np.ndarray [shape=(n, 1)]
-            Sums of the sharp kernels of the support vectors; zeros without home vectors.
-        nearest : np.ndarray [shape=(n,)]
-            Logarithm of the kernel of the nearest support vector; NaN if the novelty is not
-            computed.
+        Others [shape=(n, 1)] are sums of the sharp kernels of the support vectors; zeros without
+        home vectors. Nearest [shape=(n,)] is the logarithm of the kernel of the nearest support
+        vector; NaN if the novelty is not computed.
         """
         count = len(rows.values)
         nearest = np.full(count, -np.inf if self._tells_novelty else np.nan)
@@ -244,18 +230,10 @@ class SvmMachine:
 
 
 def weakest_pairs(pairs: Float64, classes: int) -> Float64:
-    """Return the decision value of each class: the value of its weakest pair.
+    """Return the decision value of each class [shape=(n, C)]: the value of its weakest pair.
 
-    Unlike the number of pairs won by a class, this value can be calibrated.
-
-    Parameters
-    ----------
-    pairs : np.ndarray [shape=(n, C (C - 1) / 2)], float64
-        Decision values for the first class of (0, 1), (0, 2) … (1, 2) …, against the second.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
+    Unlike the number of pairs won by a class, this value can be calibrated. `pairs` [shape=(n, C (C
+    - 1) / 2)] are for the first class of (0, 1), (0, 2) … (1, 2) …, against the second.
     """
     decision = np.full((len(pairs), classes), np.inf)
     for place, (first, second) in enumerate(combinations(range(classes), 2)):
@@ -265,23 +243,13 @@ def weakest_pairs(pairs: Float64, classes: int) -> Float64:
 
 
 def home_votes(home: Float64, others: Float64) -> Float64:
-    """Compute the addition to decision values for inputs near the vectors of a home.
+    """Compute the addition to decisions near a home's vectors [shape=(n, C)], 0 to `HOME_VOTE`.
 
     A support vector machine learns a few segments of a home among thousands, but not similar
     sounds. A vote is the share of a home's class among all vectors nearby, so inputs far from all
-    home vectors stay unchanged.
-
-    Parameters
-    ----------
-    home : np.ndarray [shape=(n, C)], float64
-        Sums over the home vectors of kernels with gamma times `HOME_SHARPNESS`, by class.
-    others : np.ndarray [shape=(n, 1)], float64
-        The same sums over the support vectors.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
-        From 0 to `HOME_VOTE`.
+    home vectors stay unchanged. `home` [shape=(n, C)] are sums over the home vectors of kernels
+    with gamma times `HOME_SHARPNESS`, by class; `others` [shape=(n, 1)] are the same sums over the
+    support vectors.
     """
     home = HOME_SHARE * home
     return HOME_VOTE * home / (home.sum(axis=1, keepdims=True) + others + _TINY)

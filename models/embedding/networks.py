@@ -79,12 +79,9 @@ _SEED = 20_261_126
 
 @lru_cache(maxsize=2)
 def synthetic_sounds(samples: int) -> dict[str, Float32]:
-    """Return silence, a tone of 1 kHz, steady noise and four bursts of noise a second, by name.
+    """Return silence, a 1 kHz tone, steady noise and four bursts of noise a second, by name.
 
-    Parameters
-    ----------
-    samples : int
-        Number of samples at 16 kHz, from -1 to 1.
+    Each has a number of samples at 16 kHz, from -1 to 1.
     """
     seconds = np.arange(samples) / SAMPLE_RATE
     noise = 2.0 * np.random.default_rng(_SEED).random(samples) - 1.0
@@ -171,9 +168,7 @@ NETWORKS = Extensions(
 
 
 class Embedder:
-    """Computes the logged values of a window of sound.
-
-    The network is first run on synthetic sounds.
+    """Computes the logged values of a window of sound; first runs on synthetic sounds.
 
     Raise `ModelError` if the file is missing, is not the expected file, or cannot be used.
     """
@@ -199,17 +194,10 @@ class Embedder:
         return EmbeddingSource(self.network.name, self.sha256, sha256, self.projection.names, steps)
 
     def __call__(self, window: Float32) -> Int8:
-        """Compute the integers of a window.
+        """Compute the integers [shape=(W,)] of a window [shape=(WINDOW_FRAMES, FRAME_SAMPLES)].
 
-        Parameters
-        ----------
-        window : np.ndarray [shape=(WINDOW_FRAMES, FRAME_SAMPLES)], float32
-            The network's input lies in its middle.
-
-        Returns
-        -------
-        np.ndarray [shape=(W,)], int8
-            The values of silence if the network fails, with a `HearthlogWarning`.
+        The network's input lies in its middle. If the network fails, they are those of silence,
+        with a `HearthlogWarning`.
         """
         samples = window.reshape(-1)
         start = (len(samples) - self.network.window) // 2
@@ -269,7 +257,7 @@ def _check_projection(network: EmbeddingNetwork, projection: Projection) -> None
 
 
 def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str]:
-    """Read the file of a network; return its content and SHA-256.
+    """Return content and SHA-256 of a network's file.
 
     Raise `ModelError` if the file is missing, cannot be read, or is unknown.
     """
@@ -302,8 +290,5 @@ def find_network(name: str) -> Path | None:
 
 @lru_cache(maxsize=2)
 def load_embedder(name: str, path: Path) -> Embedder:
-    """Load a network once for all microphones.
-
-    Raise `ModelError` as `Embedder` does.
-    """
+    """Load a network once for all microphones; raise `ModelError` as `Embedder` does."""
     return Embedder(NETWORKS.get(name), path)

@@ -53,13 +53,7 @@ class FrameSpans:
         return self.rows(slice(begin, end))
 
     def begun_in(self, start: int, end: int) -> Self:
-        """Return the spans that begin in a time interval.
-
-        Parameters
-        ----------
-        start, end : int
-            In nanoseconds of UTC: from `start` on, before `end`.
-        """
+        """Return the spans with `start` <= begin < `end`, in nanoseconds of UTC."""
         return self.rows(slice(*np.searchsorted(self.stamps, [start, end])))
 
     def followed_by(self, later: Self) -> Self:
@@ -121,17 +115,7 @@ class Projection:
         return numbers, np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.intp)
 
     def quantise(self, output: NetworkOutput) -> Int8:
-        """Convert the output of a network for a window to logged integers.
-
-        Parameters
-        ----------
-        output : NetworkOutput
-            Non-finite values count as 0.
-
-        Returns
-        -------
-        np.ndarray [shape=(W,)], int8
-        """
+        """Convert network output to logged integers [shape=(W,)]; non-finite values count as 0."""
         embedding, logits = (np.nan_to_num(each, posinf=0.0, neginf=0.0) for each in output)
         numbers, starts = self._grouped
         components = (embedding - self.mean) @ self.components
@@ -141,16 +125,7 @@ class Projection:
         return quantised
 
     def values(self, quantised: Int8) -> Float64:
-        """Convert logged integers to numbers: standard deviations, and logits.
-
-        Parameters
-        ----------
-        quantised : np.ndarray [shape=(n, W)], int8
-
-        Returns
-        -------
-        np.ndarray [shape=(n, W)], float64
-        """
+        """Convert logged integers [shape=(n, W)] to standard deviations, and logits."""
         return quantised.astype(np.float64) * self.steps.astype(np.float64)
 
 
@@ -168,10 +143,7 @@ def write_projection(projection: Projection, path: Path) -> None:
 
 @lru_cache(maxsize=4)
 def read_projection(path: Path) -> Projection:
-    """Read a projection.
-
-    Raise `ModelError` if the file is missing or damaged.
-    """
+    """Read a projection; raise `ModelError` if the file is missing or damaged."""
     data = read_limited(path, "projection of a network", _SIZE_LIMIT, ModelError)
     try:
         arrays, text, damage = read_sealed(path, data, _KEY)

@@ -44,12 +44,9 @@ class NetworkSession(Protocol):
 class TfliteSession:
     """A network from a TFLite file, as `NetworkSession`.
 
-    Its embedding and logits need not be among its outputs.
-
-    The file is not unpacked: an extended list of outputs is appended, because the library that
-    rewrites such files takes 50 MB.
-
-    Raise `ModelError` if LiteRT is not installed, or the file is not such a network.
+    Its embedding and logits need not be among its outputs. The file is not unpacked: an extended
+    list of outputs is appended, because the library that rewrites such files takes 50 MB. Raise
+    `ModelError` if LiteRT is not installed, or the file is not such a network.
     """
 
     def __init__(self, data: bytes, window: int, embedding: int, names: int) -> None:
@@ -72,13 +69,7 @@ class TfliteSession:
         self._embedding, self._logits = places
 
     def __call__(self, window: Float32) -> NetworkOutput:
-        """Compute the output for a window.
-
-        Parameters
-        ----------
-        window : np.ndarray [shape=(window,)], float32
-            Samples, -1 to 1.
-        """
+        """Compute the output for a window of samples [shape=(window,)], -1 to 1."""
         self._interpreter.set_tensor(self._input, window.reshape(self._shape))
         self._interpreter.invoke()
         tensors = (self._interpreter.get_tensor(each) for each in (self._embedding, self._logits))
@@ -87,10 +78,9 @@ class TfliteSession:
 
 @contextmanager
 def _without_notice() -> Iterator[None]:
-    """Suppress the line that LiteRT prints to standard error about its delegate.
+    """Suppress the line that LiteRT prints to standard error about its delegate, without a switch.
 
-    LiteRT has no switch for it. Other output in the meantime, from any thread, appears when the
-    block ends.
+    Other output in the meantime, from any thread, appears when the block ends.
     """
     with _loading, ExitStack() as stack:
         try:
@@ -201,14 +191,9 @@ _LONGEST_LIST = 64  # characters of names in a message
 
 
 class OnnxModel:
-    """A network with one input, the samples of a window.
+    """A network with one input, the samples of a window; `input_name` is empty for the only input.
 
     Raise `ModelError` if onnxruntime is not installed, or the file is not such a network.
-
-    Parameters
-    ----------
-    input_name : str, optional
-        Name of the input; empty for the only input.
     """
 
     def __init__(
@@ -230,11 +215,7 @@ class OnnxModel:
         self.outputs = {each.name: list(each.shape) for each in self._session.get_outputs()}
 
     def run(self, samples: Float32, outputs: Sequence[str], options: Any = None) -> list[Any]:
-        """Compute outputs for a window; onnxruntime raises errors of many kinds.
-
-        Parameters
-        ----------
-        samples : np.ndarray [shape=(window,)], float32
+        """Compute outputs for samples [shape=(window,)]; onnxruntime raises many kinds of errors.
         """
         return self._session.run(
             list(outputs), {self._input: samples.reshape(self._shape)}, options
@@ -297,9 +278,8 @@ class OnnxModel:
 class OnnxSession:
     """A network from an ONNX file whose outputs include embedding and logits, as `Session`.
 
-    Embedding and logits are identified by their widths. Several rows per window are averaged.
-
-    Raise `ModelError` if onnxruntime is not installed, or the file is not such a network.
+    They are identified by their widths. Several rows per window are averaged. Raise `ModelError` if
+    onnxruntime is not installed, or the file is not such a network.
     """
 
     def __init__(self, data: bytes, window: int, embedding: int, names: int) -> None:
@@ -314,13 +294,7 @@ class OnnxSession:
         return found[0]
 
     def __call__(self, window: Float32) -> NetworkOutput:
-        """Compute the output for a window.
-
-        Parameters
-        ----------
-        window : np.ndarray [shape=(window,)], float32
-            Samples, -1 to 1.
-        """
+        """Compute the output for a window of samples [shape=(window,)], -1 to 1."""
         values = self._model.run(window, self._outputs)
         means = (each.reshape(-1, each.shape[-1]).mean(axis=0) for each in values)
         return NetworkOutput(*(each.astype(np.float32) for each in means))

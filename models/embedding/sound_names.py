@@ -48,13 +48,7 @@ def audioset_names() -> tuple[SoundName, ...]:
 
 
 def read_names(path: Path) -> list[SoundName]:
-    """Read a table of names.
-
-    Parameters
-    ----------
-    path : Path
-        CSV, with the fields of `SoundName` as columns; numbers may be missing.
-    """
+    """Read a CSV table with the fields of `SoundName` as columns; numbers may be missing."""
     types = SoundName.__annotations__
     with path.open(newline="", encoding="utf-8") as stream:
         rows = [{key: text for key, text in row.items() if text} for row in csv.DictReader(stream)]

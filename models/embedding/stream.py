@@ -38,13 +38,7 @@ class SteadyNoise:
         self._windows = 0
 
     def learn(self, window: Float32) -> None:
-        """Add a window that contains only the room.
-
-        Parameters
-        ----------
-        window : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            At least two frames.
-        """
+        """Add a window [shape=(n, FRAME_SAMPLES)] of only the room, of at least two frames."""
         frames = np.lib.stride_tricks.sliding_window_view(window.reshape(-1), _FRAME)[::_HOP]
         power = np.square(np.abs(np.fft.rfft(frames * _taper(), axis=1))).mean(axis=0)
         self._windows = min(self._windows + 1, _MOST_WINDOWS)
@@ -53,11 +47,7 @@ class SteadyNoise:
         self._power = self._power + (power - self._power) / self._windows
 
     def reduced(self, window: Float32) -> Float32:
-        """Return a window without the noise; the window itself if the noise is negligible.
-
-        Parameters
-        ----------
-        window : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
+        """Return a window [shape=(n, FRAME_SAMPLES)] without its noise, unless that is negligible.
         """
         if self._power is None:
             return window
@@ -116,15 +106,10 @@ class EmbeddingStream:
         self._stamps = np.empty(0, np.int64)
 
     def push(self, frames: Float32, sound: Bool, first: int, stamps: Int64) -> Embeddings:
-        """Add successive frames.
+        """Add successive frames [shape=(n, FRAME_SAMPLES)].
 
-        Parameters
-        ----------
-        frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-        sound : np.ndarray [shape=(n,)], bool
-            Whether the sound that ends with each frame, at most 0.4 s, is above the room floor.
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds of UTC.
+        `sound` [shape=(n,)]: whether the sound that ends with each frame, at most 0.4 s, is above
+        the room floor. `stamps` [shape=(n,)] are the starts of the frames in nanoseconds of UTC.
         """
         samples = np.clip(np.nan_to_num(frames, posinf=0.0, neginf=0.0), -1.0, 1.0)
         samples = np.concatenate([self._frames, samples])

@@ -49,17 +49,10 @@ _OF_SILENCE = np.array([0.0, 0.17, 3.1, 0.24, 0.2, 1.28, -5.94, 0.26])
 
 
 def band_values(features: Float32) -> Float64:
-    """Compute the values for the inputs `bands` from the features of each frame.
+    """Compute the values of the inputs `bands` [shape=(n, 53)] from features [shape=(n, 21)].
 
-    Parameters
-    ----------
-    features : np.ndarray [shape=(n, 21)], float32
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 53)], float64
-        The features before the cepstra, with energy in dB and the natural logarithm of the flux,
-        then 32 mel bands in dB, then the cepstra.
+    They are the features before the cepstra, with energy in dB and the natural logarithm of the
+    flux, then 32 mel bands in dB, then the cepstra.
     """
     cepstra = features[:, CEPSTRA]
     values = np.empty((len(features), _WIDTH + MEL_BANDS))
@@ -72,17 +65,10 @@ def band_values(features: Float32) -> Float64:
 
 
 def band_powers(features: Float32) -> Float64:
-    """Compute the powers of the mel bands and of the frame.
+    """Compute powers of mel bands and frame [shape=(n, 33)] from features [shape=(n, 21)].
 
-    Parameters
-    ----------
-    features : np.ndarray [shape=(n, 21)], float32
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 33)], float64
-        Powers of the 32 bands that the cepstra represent, without the constant inside their
-        logarithm, then the energy; not below 0.
+    They are the powers of the 32 bands that the cepstra represent, without the constant inside
+    their logarithm, then the energy; not below 0.
     """
     powers = np.empty((len(features), MEL_BANDS + 1))
     level = np.minimum(bands_of(features[:, CEPSTRA]), _MOST_DB)
@@ -92,45 +78,22 @@ def band_powers(features: Float32) -> Float64:
 
 
 def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
-    """Compute the values for the inputs `above_floor` from the features of each frame.
+    """Compute the values of the inputs `above_floor` [shape=(n, 53)], as from `band_values`.
 
-    Raise `TypeError` if there are no floors.
-
-    Parameters
-    ----------
-    features : np.ndarray [shape=(n, 21)], float32
-    floors : np.ndarray [shape=(n, 33)], float64
-        In the order of `band_powers`.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 53)], float64
-        As from `band_values`.
+    `features` has shape (n, 21), `floors` (n, 33), in the order of `band_powers`. Raise `TypeError`
+    if there are no floors.
     """
     return above_floor(features, floors)[0]
 
 
 def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Float64]:
-    """Compute the values above the floor of the room, and the share of energy above the floor.
+    """Compute the values above the floor of the room, and the share of energy above it.
 
-    The floor is subtracted from the powers (Berouti, Schwartz and Makhoul, "Enhancement of speech
-    corrupted by acoustic noise", 1979). The other values allow no subtraction; the smaller the
-    share of energy above the floor, the closer they are moved to the values of silence.
-
-    Raise `TypeError` if there are no floors.
-
-    Parameters
-    ----------
-    features : np.ndarray [shape=(n, 21)], float32
-    floors : np.ndarray [shape=(n, 33)], float64
-        In the order of `band_powers`.
-
-    Returns
-    -------
-    values : np.ndarray [shape=(n, 53)], float64
-        As from `values_above_floor`.
-    share : np.ndarray [shape=(n, 1)], float64
-        From 0 to 1.
+    They are those of `values_above_floor` [shape=(n, 53)], and 0 to 1 [shape=(n, 1)]. The floor is
+    subtracted from the powers (Berouti, Schwartz and Makhoul, "Enhancement of speech corrupted by
+    acoustic noise", 1979). The other values allow no subtraction; the smaller the share of energy
+    above the floor, the closer they are moved to the values of silence. Raise `TypeError` if there
+    are no floors.
     """
     if floors is None:
         raise TypeError("these inputs need the floor of the room")
@@ -148,29 +111,18 @@ def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Flo
 
 
 def bands_of(cepstra: Float32) -> Float64:
-    """Convert mel cepstra to mel bands, which are smooth because higher cepstra are missing.
+    """Convert `mfcc_1` to `mfcc_13` [shape=(n, 13)], in dB, to mel bands [shape=(n, 32)], in dB.
 
-    Parameters
-    ----------
-    cepstra : np.ndarray [shape=(n, 13)], float32
-        In dB, the features `mfcc_1` to `mfcc_13`.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 32)], float64
-        In dB.
+    The bands are smooth because higher cepstra are missing.
     """
     return rowwise_matmul(cepstra.astype(np.float64), dct_weights().T)
 
 
 @cache
 def dct_weights() -> Float64:
-    """Return the weights of an orthonormal DCT-II from mel bands to cepstra.
+    """Return the weights of an orthonormal DCT-II from mel bands to cepstra [shape=(32, 13)].
 
-    Returns
-    -------
-    np.ndarray [shape=(32, 13)], float64
-        One column for each of the first 13 coefficients; the transpose converts cepstra to bands.
+    The transpose converts cepstra to bands.
     """
     band = np.arange(MEL_BANDS)[:, np.newaxis]
     order = np.arange(_WIDTH - _SCALARS)
@@ -226,21 +178,11 @@ class FeatureExtractor:
         self._last_magnitude = None
 
     def __call__(self, frames: Float32) -> Float32:
-        """Compute the features of successive frames.
+        """Compute the features [shape=(n, 21)] of frames [shape=(n, 800)] in full scale, at 16 kHz.
 
         The definitions follow the paper (section 3.2.2) and, where the paper and its library
-        differ, of pyAudioAnalysis; see docs/features.md.
-
-        Parameters
-        ----------
-        frames : np.ndarray [shape=(n, 800)], float32
-            Samples in full scale, -1 to 1, at 16 kHz. Those that are not finite count as 0, those
-            beyond +-1000 are clipped.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, 21)], float32
-            In the order and the units of `FEATURE_NAMES` (see docs/features.md); always finite.
+        differ, of pyAudioAnalysis; see docs/features.md for order and units. Samples that are not
+        finite count as 0, those beyond +-1000 are clipped; features are always finite.
         """
         values = np.empty((len(frames), self.width), np.float32)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
@@ -252,9 +194,9 @@ class FeatureExtractor:
         self._paper_values(frames, out)
 
     def _paper_values(self, frames: Float32, out: Float32) -> Float64:
-        """Compute the 21 values of frames; return the powers of their bins.
+        """Compute the 21 values of frames; return the powers of their bins [shape=(n, 400)].
 
-        Those have shape (n, 400); a full-scale sine has `BINS` squared.
+        A full-scale sine has `BINS` squared.
         """
         samples = self._samples[: len(frames)]
         np.copyto(samples, frames)
@@ -293,20 +235,10 @@ class FeatureExtractor:
 
 
 def zero_crossing_rate(frames: Float32) -> Float64:
-    """Count sign changes per step from sample to sample; a step to or from 0 counts half.
+    """Count sign changes per step from sample to sample [shape=(n,)], 0 to 1.
 
-    The paper (section 3.2.2) divides by the samples of a frame; this divides by the steps, as
-    pyAudioAnalysis does.
-
-    Parameters
-    ----------
-    frames : np.ndarray [shape=(n, 800)], float32
-        Samples; one that is NaN counts as 0.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-        From 0 to 1.
+    A step to or from 0 counts half, and NaN counts as 0. The paper (section 3.2.2) divides by the
+    samples of a frame; this divides by the steps, as pyAudioAnalysis does.
     """
     sign = (frames > 0).view(np.int8) - (frames < 0).view(np.int8)
     steps = sign[:, 1:] - sign[:, :-1]
@@ -314,14 +246,10 @@ def zero_crossing_rate(frames: Float32) -> Float64:
 
 
 def mel_bank() -> Float64:
-    """Return triangular filters of peak 1 on the mel scale, 0 to 8 kHz.
+    """Return triangular filters of peak 1 on the mel scale, 0 to 8 kHz [shape=(400, 32)].
 
-    The scale is from Slaney's Auditory Toolbox.
-
-    Returns
-    -------
-    np.ndarray [shape=(400, 32)], float64
-        Weight of each spectral bin in each band; as `librosa.filters.mel(norm=None)`.
+    The scale is from Slaney's Auditory Toolbox; the weights of spectral bins are those of
+    `librosa.filters.mel(norm=None)`.
     """
     frequency = np.arange(BINS) * (SAMPLE_RATE / FRAME_SAMPLES)
     corners = _mel_corners()
@@ -333,13 +261,7 @@ def mel_bank() -> Float64:
 
 
 def mel_centres() -> Float64:
-    """Return the frequencies at which the filters of `mel_bank` peak.
-
-    Returns
-    -------
-    np.ndarray [shape=(32,)], float64
-        In hertz.
-    """
+    """Return the frequencies at which the filters of `mel_bank` peak, in hertz [shape=(32,)]."""
     return _mel_corners()[1:-1]
 
 
@@ -418,20 +340,11 @@ _NEPER = 10.0 / np.log(10.0)  # dB of a factor e in power
 
 
 def augmented(windows: Float32, rng: "np.random.Generator") -> Float32:
-    """Return each window as another microphone in another room might have captured it.
+    """Return windows [shape=(n, 20, 21)] as another microphone in another room might capture them.
 
     Gain, tilt and bumps of the spectrum, and the noise of a microphone, act on the mel bands that
-    the cepstra represent, so the sound itself is not needed.
-
-    Parameters
-    ----------
-    windows : np.ndarray [shape=(n, 20, 21)], float32
-        Features of the set `auros21`.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 20, 21)], float32
-        Energy and cepstra are changed; the other features hardly depend on a microphone.
+    the cepstra represent, so the sound itself is not needed. Energy and cepstra are changed; the
+    other features hardly depend on a microphone.
     """
     gain, curve = _curves(len(windows), rng)
     cepstra = windows[:, :, CEPSTRA]

@@ -40,7 +40,22 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """The values computed from each frame, and everything that depends on them."""
+    """The values computed from each frame, and everything that depends on them.
+
+    Attributes
+    ----------
+    power : callable
+        Maps features, shape (..., d), to the mean square of the samples, shape (...); full scale
+        is 1.
+    band_powers : callable or None
+        Maps features, shape (n, d), to powers of b bands, shape (n, b), the last of the complete
+        frame; the floor of a room is tracked in these bands. None if the set has no bands.
+    augmented : callable or None
+        Maps windows of features, shape (n, window_frames, d), and a `np.random.Generator` to the
+        features that another microphone in another room would give. None if not supported.
+    digest : str
+        SHA-256 of the file that computes the values, in hexadecimal; empty if code computes them.
+    """
 
     name: str
     version: int
@@ -49,16 +64,10 @@ class FeatureSet:
     window_frames: int
     extractor: Callable[[], Extractor]
     inputs: Mapping[str, Inputs]
-    # maps features, shape (..., d), to the mean square of the samples, shape (...); full scale is 1
     power: Callable[[NDArray[Any]], NDArray[Any]]
-    # maps features, shape (n, d), to powers of b bands, shape (n, b), the last of the complete
-    # frame; the floor of a room is tracked in these bands. None if the set has no bands
     band_powers: Callable[[Float32], Float64] | None = None
     # in quotes: recorder and bridge never load `numpy.random`, which takes 5 MB
-    # maps windows of features, shape (n, window_frames, d), and a `np.random.Generator` to the
-    # features that another microphone in another room would give. None if not supported
     augmented: "Callable[[Float32, np.random.Generator], Float32] | None" = None
-    # SHA-256 of the file that computes the values, in hexadecimal; empty if code computes them
     digest: str = ""
 
     @property

@@ -59,20 +59,10 @@ class FloorTracker:
         self._unsteady = 0  # number of sections since the last steady one
 
     def __call__(self, powers: Float64, first: int) -> Floors:
-        """Add successive frames.
+        """Add powers of frames [shape=(n, b)], the last of the complete frame.
 
-        Parameters
-        ----------
-        powers : np.ndarray [shape=(n, b)], float64
-            Powers of the bands of each frame; the last is of the complete frame.
-        first : int
-            Number of the first frame.
-
-        Returns
-        -------
-        Floors
-            At the last m of these frames: the frames after the first complete block since the start
-            or the last restart.
+        `first` is the number of the first frame. Return the floors at the last m of these frames:
+        the frames after the first complete block since the start or the last restart.
         """
         converged = self._converged_for is not None and self._converged_for >= _SECOND_FRAMES
         if self._converged_for is not None:
@@ -162,36 +152,15 @@ class FloorTracker:
 
 
 def decibels(powers: Float64) -> Float64:
-    """Convert powers to levels.
-
-    Parameters
-    ----------
-    powers : np.ndarray [shape=(..., b)], float64
-
-    Returns
-    -------
-    np.ndarray [shape=(..., b)], float64
-        In dB, not below -70.
-    """
+    """Convert powers [shape=(..., b)] to levels in dB, not below -70."""
     return 10.0 * np.log10(powers + NOMINAL)
 
 
 def is_quiet(powers: Float64, floors: Float64, window_frames: int, gate: float) -> Bool:
-    """Return which windows are not above the floor.
+    """Return for n windows whether no band's mean power is at least `gate`, in dB, above the floor.
 
-    Parameters
-    ----------
-    powers : np.ndarray [shape=(n + window_frames - 1, b)], float64
-        Powers of the bands of successive frames.
-    floors : np.ndarray [shape=(n, b)], float64
-        Floor at the last frame of each window.
-    gate : float
-        In dB.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], bool
-        True if no band's mean power is at least `gate` above the floor.
+    `powers` [shape=(n + window_frames - 1, b)] are those of successive frames, `floors` [shape=(n,
+    b)] are at the last frame of each window.
     """
     total = powers[: len(floors)].copy()
     for place in range(1, window_frames):
@@ -202,19 +171,10 @@ def is_quiet(powers: Float64, floors: Float64, window_frames: int, gate: float) 
 
 
 def low_power(powers: Float64, share: float = 0.2) -> Float64:
-    """Return the floor of a recording that contains only the room.
+    """Return the floor [shape=(b,)] of a recording that contains only the room.
 
-    Parameters
-    ----------
-    powers : np.ndarray [shape=(n, b)], float64
-        Powers of the bands of successive frames; at least one.
-    share : float
-        Share of the blocks that are below the floor.
-
-    Returns
-    -------
-    np.ndarray [shape=(b,)], float64
-        The mean of all frames if there is no complete block.
+    `powers` [shape=(n, b)] are of at least one frame, `share` of the blocks are below the floor.
+    The floor is the mean of all frames if there is no complete block.
     """
     count = len(powers) // BLOCK_FRAMES
     if not count:

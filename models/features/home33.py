@@ -41,20 +41,11 @@ class HomeExtractor(FeatureExtractor):
 
 
 def shape(power: Float64) -> Float64:
-    """Compute the spread of each band's power over its bins.
+    """Compute the spread of each band's power over its bins, in dB [shape=(n, 12)].
 
-    Peakiness is the highest bin over the mean, flatness the geometric mean over the mean. They
-    distinguish voices, music and rings from water, engines and noise.
-
-    Parameters
-    ----------
-    power : np.ndarray [shape=(n, 400)], float64
-        Of the bins of a frame's spectrum; a full-scale sine has 1.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 12)], float64
-        Peakiness of six bands, then their flatness, in dB.
+    It is the peakiness of six bands, then their flatness. Peakiness is the highest bin over the
+    mean, flatness the geometric mean over the mean. They distinguish voices, music and rings from
+    water, engines and noise. `power` [shape=(n, 400)] is that of the bins; a full-scale sine has 1.
     """
     power = power + _FLOOR
     counts = np.diff(_EDGES)
@@ -66,21 +57,11 @@ def shape(power: Float64) -> Float64:
 
 
 def rounded(values: Float32) -> Float32:
-    """Round features to 11 binary digits, as half precision does.
+    """Round finite features [shape=(n, 33)] to 11 binary digits, as half precision does.
 
-    No classifier needs more digits, and noise in the last digits does not compress. Rounded values
+    There are no digits after the 24th binary place, except for energy and flux, which are small. No
+    classifier needs more digits, and noise in the last digits does not compress. Rounded values
     also agree across processors whose exact values differ in the last place.
-
-    Parameters
-    ----------
-    values : np.ndarray [shape=(n, 33)], float32
-        Finite.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 33)], float32
-        As in half precision, no digits after the 24th binary place, except for energy and flux,
-        which are small.
     """
     exponent = np.maximum(np.frexp(values)[1], _LEAST_EXPONENTS)
     return np.ldexp(np.rint(np.ldexp(values, _DIGITS - exponent)), exponent - _DIGITS)
@@ -93,35 +74,16 @@ _OF_SILENCE = np.array([*_PEAKINESS, *_FLATNESS])
 
 
 def band_powers(features: Float32) -> Float64:
-    """Compute the powers of the mel bands and of the frame, as in `auros21`.
-
-    Parameters
-    ----------
-    features : np.ndarray [shape=(n, 33)], float32
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 33)], float64
-    """
+    """Compute powers of mel bands and frame [shape=(n, 33)], as in `auros21`."""
     return auros21.band_powers(features[:, :_WIDTH])
 
 
 def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
-    """Compute the values for the inputs `above_floor` from the features of each frame.
+    """Compute the values of the inputs `above_floor` [shape=(n, 65)].
 
-    Raise `TypeError` if there are no floors.
-
-    Parameters
-    ----------
-    features : np.ndarray [shape=(n, 33)], float32
-    floors : np.ndarray [shape=(n, 33)], float64
-        In the order of `band_powers`.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, 65)], float64
-        The values of `auros21`, then peakiness and flatness, which are closer to their values in
-        silence the smaller the share of energy above the floor.
+    They are the values of `auros21`, then peakiness and flatness, which are closer to their values
+    in silence the smaller the share of energy above the floor. `floors` [shape=(n, 33)] are in the
+    order of `band_powers`. Raise `TypeError` if there are no floors.
     """
     values, share = auros21.above_floor(features[:, :_WIDTH], floors)
     shape = _OF_SILENCE + share * (features[:, _WIDTH:] - _OF_SILENCE)

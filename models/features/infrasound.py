@@ -30,12 +30,8 @@ _MOST_GAIN = 1.1  # upper bound of the power by probes, relative to the polynomi
 class InfrasoundFilter:
     """Removes infrasound below about 20 Hz from one stream of frames, while it stands out.
 
-    The same frames give the same bits in blocks of any size.
-
-    Attributes
-    ----------
-    is_active : bool
-        Whether the last frame was changed.
+    The same frames give the same bits in blocks of any size. `is_active`: the last frame was
+    changed.
     """
 
     def __init__(self) -> None:
@@ -48,18 +44,7 @@ class InfrasoundFilter:
         self._offset, self._wave = _Persistence(), _Persistence()
 
     def __call__(self, frames: Float32) -> Float32:
-        """Filter successive frames.
-
-        Parameters
-        ----------
-        frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            Finite.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            The argument itself if nothing stands out.
-        """
+        """Filter finite frames [shape=(n, FRAME_SAMPLES)]; return them if nothing stands out."""
         if not len(frames):
             return frames
         places = np.flatnonzero(self._may_stand_out(frames))
@@ -168,7 +153,7 @@ def _rough_curves() -> Float32:
 def _probes() -> Float64:
     """Return the map from the coefficients of two frames to their spectrum below 20 Hz.
 
-    The first half of the columns covers everything, the second half excludes the frame means.
+    The second half of the columns excludes the frame means.
     """
     count = 2 * FRAME_SAMPLES
     taper = np.hanning(count + 2)[1:-1]

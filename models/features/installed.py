@@ -18,15 +18,10 @@ FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [
 
 
 def feature_set(name: str = DEFAULT.name) -> FeatureSet:
-    """Return a feature set by name.
+    """Return a feature set: built in, such as "home33", of a distribution, or a network's card.
 
     Raise `ModelError` if there is no such feature set, it cannot be imported, or its card is
     invalid.
-
-    Parameters
-    ----------
-    name : str
-        Such as "home33": built in, from another distribution, or a network with a card.
     """
     if is_network(name):
         return network_features(name)

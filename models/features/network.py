@@ -102,26 +102,15 @@ def has_card(name: str) -> bool:
 
 
 def find_card(name: str) -> Path:
-    """Return the card of a network.
-
-    Returns
-    -------
-    Path
-        The first match in the folders of networks; without a match, the path for a new card.
-    """
+    """Return the first card of a network in the folders of networks, or the path for a new card."""
     places = [folder / (name + _CARD) for folder in network_folders()]
     return next(filter(os.path.lexists, places), places[0])
 
 
 def read_card(path: Path) -> NetworkCard:
-    """Read a card.
+    """Read a card `NAME.toml`; the network `NAME.onnx` next to it is not opened.
 
     Raise `ModelError` if the card cannot be read or is invalid.
-
-    Parameters
-    ----------
-    path : Path
-        A file `NAME.toml`; the network is `NAME.onnx` next to it, and is not opened.
     """
     content = read_toml(path, "card of a network", ModelError)
     network = path.with_suffix(_NETWORK)
@@ -149,10 +138,7 @@ def read_card(path: Path) -> NetworkCard:
 
 
 def read_network(path: Path) -> bytes:
-    """Read the file of a network, at most 512 MB.
-
-    Raise `ModelError` if the file is missing, larger, or cannot be read.
-    """
+    """Read a network, at most 512 MB; raise `ModelError` if it is missing, larger or unreadable."""
     return read_limited(path, "network", _SIZE_LIMIT, ModelError)
 
 
@@ -183,15 +169,10 @@ _SOUND_SEED = 20_261_125
 
 
 class Network:
-    """A network in memory.
+    """A network in memory; `of_silence` [shape=(width,)] is the embedding of digital silence.
 
     Raise `ModelError` if the file is not the network of the card, its input or output contradicts
     the card, or onnxruntime is not installed.
-
-    Attributes
-    ----------
-    of_silence : np.ndarray [shape=(width,)], float32
-        Embedding of digital silence.
     """
 
     def __init__(self, card: NetworkCard) -> None:
@@ -207,18 +188,10 @@ class Network:
             raise ModelError(f"{card.path}: {printable(str(error))[:300]}") from error
 
     def embed(self, window: Float32) -> Float32:
-        """Compute the embedding of a window of sound.
+        """Compute the embedding [shape=(width,)] of samples [shape=(window,)] at 16 kHz, -1 to 1.
 
-        Parameters
-        ----------
-        window : np.ndarray [shape=(window,)], float32
-            Samples at 16 kHz, -1 to 1.
-
-        Returns
-        -------
-        np.ndarray [shape=(width,)], float32
-            In half precision; the mean if the network gives several. Non-finite values are 0. The
-            embedding of silence if the network fails, with a `HearthlogWarning`.
+        It is in half precision; the mean if the network gives several. Non-finite values are 0. If
+        the network fails, it is that of silence, with a `HearthlogWarning`.
         """
         try:
             (values,) = self._model.run(self._resampled(window), [self._output])
@@ -265,10 +238,7 @@ class Network:
 
 @lru_cache(maxsize=4)
 def load_network(card: NetworkCard) -> Network:
-    """Load a network once for all extractors.
-
-    Raise `ModelError` as `Network` does.
-    """
+    """Load a network once for all extractors; raise `ModelError` as `Network` does."""
     return Network(card)
 
 
@@ -309,17 +279,10 @@ class NetworkExtractor:
         self._last = self._of_silence
 
     def __call__(self, frames: Float32) -> Float32:
-        """Compute the features of successive frames.
+        """Compute the features [shape=(n, 1 + width)] of frames [shape=(n, FRAME_SAMPLES)].
 
-        Parameters
-        ----------
-        frames : np.ndarray [shape=(n, FRAME_SAMPLES)], float32
-            Samples, -1 to 1; non-finite samples count as 0, samples out of range are clipped.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, 1 + width)], float32
-            In half precision: the level in dBFS, then the embedding.
+        They are in half precision: the level in dBFS, then the embedding. Samples are -1 to 1;
+        non-finite ones count as 0, those out of range are clipped.
         """
         samples = np.clip(np.nan_to_num(frames, posinf=0.0, neginf=0.0), -1.0, 1.0)
         values = np.empty((len(frames), 1 + self._width), np.float32)
@@ -358,18 +321,7 @@ class LastEmbedding:
         return LastEmbeddingStream(self)
 
     def of_windows(self, windows: Float32, floors: Float64 | None = None) -> Float32:
-        """Compute the inputs of single windows.
-
-        Parameters
-        ----------
-        windows : np.ndarray [shape=(n, window_frames, 1 + width)], float32
-        floors : np.ndarray [shape=(n, b)], float64, optional
-            Unused.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, width)], float32
-        """
+        """Return the last embeddings [shape=(n, width)]; `floors` are unused."""
         del floors
         return np.ascontiguousarray(windows[:, -1, 1:])
 
@@ -386,19 +338,9 @@ class LastEmbeddingStream:
         self._lacking = self._inputs.window_frames - 1  # frames before the first complete window
 
     def __call__(self, features: Float32, floors: Float64 | None = None) -> Float32:
-        """Return the inputs at successive frames.
+        """Return the inputs at the last m frames [shape=(m, width)]; `floors` are unused.
 
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, 1 + width)], float32
-        floors : np.ndarray [shape=(n, b)], float64, optional
-            Unused.
-
-        Returns
-        -------
-        np.ndarray [shape=(m, width)], float32
-            At the last m of these frames: frames with a complete window since the start or the last
-            restart.
+        They are the frames with a complete window since the start or the last restart.
         """
         del floors
         inputs = features[self._lacking :, 1:]
@@ -407,10 +349,7 @@ class LastEmbeddingStream:
 
 
 def network_features(name: str) -> FeatureSet:
-    """Return the feature set of a network.
-
-    Raise `ModelError` if the card cannot be read or is invalid.
-    """
+    """Return a network's feature set; raise `ModelError` if its card is unreadable or invalid."""
     return _features(read_card(find_card(name)))
 
 

@@ -82,19 +82,9 @@ class Inputs(Protocol):
 
 
 def of_segments(inputs: Inputs, segments: Float32, floors: Float64 | None = None) -> Float32:
-    """Compute the inputs of the windows in segments.
+    """Compute the inputs of windows in segments [shape=(n, places, width)], at `window_places`.
 
-    Parameters
-    ----------
-    segments : np.ndarray [shape=(n, f, d)], float32
-        Features of successive frames, at least one window.
-    floors : np.ndarray [shape=(n, b)], float64, optional
-        Floor of the room in each segment.
-
-    Returns
-    -------
-    np.ndarray [shape=(n, places, width)], float32
-        Of the windows at the places of `window_places`.
+    `segments` [shape=(n, f, d)] have at least one window; `floors` has shape (n, b).
     """
     length = inputs.window_frames
     return np.stack(
@@ -133,20 +123,7 @@ class WindowStatistics:
         return StatisticsStream(self)
 
     def of_windows(self, windows: Float32, floors: Float64 | None = None) -> Float32:
-        """Compute the inputs of single windows.
-
-        Parameters
-        ----------
-        windows : np.ndarray [shape=(n, window_frames, d)], float32
-            Features.
-        floors : np.ndarray [shape=(n, b)], float64, optional
-            Floor of the room in each window.
-
-        Returns
-        -------
-        np.ndarray [shape=(n, width)], float32
-            Means, standard deviations and, with `changes`, mean absolute differences.
-        """
+        """Compute means, standard deviations and, with `changes`, mean absolute differences."""
         inputs = np.empty((len(windows), self.width), np.float32)
         for start in range(0, len(windows), _FRAMES_AT_ONCE):
             part = windows[start : start + _FRAMES_AT_ONCE]
@@ -167,17 +144,10 @@ class WindowStatistics:
     def reduce(
         self, frames: Sequence[NDArray[Any]], changes: Sequence[NDArray[Any]], out: Float32
     ) -> None:
-        """Write the statistics of windows into rows.
+        """Write means, deviations and, with `changes`, differences into rows [shape=(n, width)].
 
-        Parameters
-        ----------
-        frames : sequence of np.ndarray [shape=(n, d')]
-            Values of the first frames of all windows, of their second frames and so on, from
-            `successive`.
-        changes : sequence of np.ndarray [shape=(n, d')]
-            Absolute differences from frame to frame, likewise; unused without `changes`.
-        out : np.ndarray [shape=(n, width)], float32
-            Overwritten: means, standard deviations and, with `changes`, mean absolute differences.
+        `frames` and `changes`, the absolute differences from frame to frame, are from `successive`,
+        each of shape (n, d').
         """
         parts = [*mean_and_std(frames)]
         if self.changes:
@@ -214,37 +184,19 @@ class StatisticsStream:
 
 
 def successive(values: NDArray[Any], length: int) -> list[NDArray[Any]]:
-    """View windows of successive rows as one array per place in the window.
+    """View windows of `length` successive rows as one array per place in the window.
 
-    Parameters
-    ----------
-    values : np.ndarray [shape=(n, d)]
-    length : int
-        Rows of a window; at most n.
-
-    Returns
-    -------
-    list of np.ndarray [shape=(n - length + 1, d)]
-        Views: the first rows of all windows, the second rows, and so on.
+    `values` has shape (n, d); each view has shape (n - length + 1, d), `length` is at most n.
     """
     count = len(values) - length + 1
     return [values[place : place + count] for place in range(length)]
 
 
 def mean_and_std(frames: Sequence[NDArray[Any]]) -> tuple[Float64, Float64]:
-    """Compute mean and standard deviation of many windows at once, in float64.
+    """Compute mean and standard deviation [shape=(n, d)] of frames from `successive`, in float64.
 
-    All windows are summed frame by frame, so the sums stay in the cache.
-
-    Parameters
-    ----------
-    frames : sequence of np.ndarray [shape=(n, d)]
-        From `successive`.
-
-    Returns
-    -------
-    mean, std : np.ndarray [shape=(n, d)], float64
-        The standard deviation divides by the number of frames.
+    All windows are summed frame by frame, so the sums stay in the cache. The standard deviation
+    divides by the number of frames.
     """
     mean = _sum(frames) / len(frames)
     square = np.zeros_like(mean)

@@ -51,12 +51,7 @@ def label_columns(
 ) -> dict[str, Column]:
     """Return the fields of one `AudioLabel` per frame.
 
-    Parameters
-    ----------
-    labels : mapping of str to array, or structured array
-        With the fields `frames`, `stamps`, `probabilities` and `novelty` of `FrameLabels`.
-    classes : sequence of str
-        Names of the columns of the probabilities.
+    `labels` has the fields `frames`, `stamps`, `probabilities` and `novelty` of `FrameLabels`.
     """
     probabilities = labels["probabilities"]
     best = probabilities.argmax(axis=1)
@@ -74,17 +69,8 @@ def label_columns(
 class Labeller:
     """Labels one stream of frames and divides the stream into segments.
 
-    Parameters
-    ----------
-    microphone : str
-        Name of the microphone; selects the direction weights of the model.
-    embedding : EmbeddingSource, optional
-        Source of the embeddings; ignored unless network and projection match the model.
-
-    Attributes
-    ----------
-    classes : tuple of str
-        Names of the columns of the probabilities.
+    `microphone` selects the direction weights of the model; `embedding` is ignored unless network
+    and projection match the model.
     """
 
     def __init__(
@@ -139,22 +125,12 @@ class Labeller:
         unlabelled: int,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> None:
-        """Take over from another labeller before a frame, at which segments begin.
+        """Take over from another labeller before frame number `frame`, at which segments begin.
 
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-            Of the last n frames before that frame.
-        floors : np.ndarray [shape=(m, b)], float64, or None
-            Floors at the last m of these frames, m <= n; None if the feature set has no bands.
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of these frames in nanoseconds of UTC.
-        frame : int
-            Number of the frame.
-        unlabelled : int
-            Number of the first frame not labelled by the other labeller.
-        auxiliary : Auxiliary, optional
-            Of at least the last second before the frame.
+        `features` [shape=(n, d)] and `stamps` [shape=(n,)], in nanoseconds of UTC, are of the last
+        n frames before it, `floors` [shape=(m, b)] of the last m <= n; None if the feature set has
+        no bands. `unlabelled` is the number of the first frame not labelled by the other labeller;
+        `auxiliary` covers at least the last second before the frame.
         """
         self._first_label, self._first_segment = unlabelled, frame
         powers, known = self._classifier.feature_set.band_powers, None
@@ -176,27 +152,12 @@ class Labeller:
         stamps: Int64,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> tuple[FrameLabels, list[Segment]]:
-        """Add successive frames.
+        """Add frames; return labels and segments that they complete.
 
-        Parameters
-        ----------
-        features : np.ndarray [shape=(n, d)], float32
-        floors : Floors or None
-            Floors at the last of these frames; frames without a floor are not labelled. None if the
-            feature set has no bands.
-        first : int
-            Number of the first frame.
-        stamps : np.ndarray [shape=(n,)], int64
-            Starts of the frames in nanoseconds of UTC.
-        auxiliary : Auxiliary, optional
-            Directions and embeddings that become available with these frames.
-
-        Returns
-        -------
-        labels : FrameLabels
-            Of the frames whose windows and embeddings are now complete.
-        segments : list of Segment
-            Segments whose end is decided by these frames.
+        `features` has shape (n, d); `stamps` [shape=(n,)] are the starts of the frames in
+        nanoseconds of UTC. Frames without a floor are not labelled; `floors` is None if the feature
+        set has no bands. `auxiliary` has the directions and embeddings that become available with
+        these frames. A frame has a label once its window and embeddings are complete.
         """
         self._converge(floors, first)
         window = self._advance(features, floors if self.timing.needs_floor else None, stamps)
@@ -239,18 +200,7 @@ class Labeller:
         return labels, self.segmenter.push(labelled) if len(labelled.stamps) else []
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments at the end of the sound, and reset.
-
-        Parameters
-        ----------
-        end : int
-            End of the sound in nanoseconds of UTC.
-
-        Returns
-        -------
-        list of Segment
-            In order of time.
-        """
+        """Return the remaining segments at the end, in nanoseconds of UTC, and reset."""
         if self._evidence is not None:
             self._evidence.restart()
         for each in self._window_evidence:

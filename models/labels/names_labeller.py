@@ -127,13 +127,7 @@ class NamesLabeller:
         return labels, self._segments(labelled, end - len(known))
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments at the end of the sound, and reset.
-
-        Parameters
-        ----------
-        end : int
-            End of the sound in nanoseconds of UTC.
-        """
+        """Return the remaining segments at the end, in nanoseconds of UTC, and reset."""
         segments: list[Segment] = []
         count = len(self._stamps)
         if self._end is not None and count:  # only segments: these labels are not returned
@@ -153,11 +147,7 @@ class NamesLabeller:
         return segments
 
     def _add_windows(self, embeddings: Embeddings) -> tuple[int, Bool]:
-        """Add the windows that are now complete.
-
-        Return the names active in each window used by the next labels, and the number of the first
-        of these windows.
-        """
+        """Add windows now complete; return the first one's number and the names active in each."""
         assert self._end is not None
         begin = self._window
         self._window = max((self._end - WINDOW_FRAMES) // HOP_FRAMES + 1, begin)

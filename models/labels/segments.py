@@ -21,12 +21,7 @@ class Borders:
 
     A border of silence moves, within `reach` frames, to the frame that best divides the level into
     two constants, by least squares. Then a state of fewer than `shortest` frames is replaced by the
-    state before it.
-
-    Parameters
-    ----------
-    reach, shortest : int
-        Numbers of frames; 0 and 1 disable the refinement.
+    state before it. 0 and 1 disable this.
     """
 
     def __init__(self, silence: int, reach: int, shortest: int) -> None:
@@ -47,19 +42,10 @@ class Borders:
         self._last: int | None = None  # last state returned
 
     def push(self, states: Indices, powers: Float64) -> Indices:
-        """Add successive states and powers.
+        """Add states [shape=(n,)] and mean squares [shape=(m,)]; return refined states.
 
-        Parameters
-        ----------
-        states : np.ndarray [shape=(n,)], intp
-        powers : np.ndarray [shape=(m,)], float64
-            Mean squares of successive frames; the total number of states never exceeds that of
-            powers.
-
-        Returns
-        -------
-        np.ndarray [shape=(k,)], intp
-            Refined states, up to `delay` frames before the last state.
+        There are never more states than powers in total. Refined states go up to `delay` frames
+        before the last state.
         """
         self._states = np.concatenate([self._states, states])
         self._levels = np.concatenate([self._levels, 10.0 * np.log10(powers + _QUIETEST)])
@@ -142,13 +128,7 @@ class StateRun(NamedTuple):
     confidence: int
 
     def prepend(self, earlier: "StateRun | None") -> "StateRun":
-        """Prepend an earlier run to this run.
-
-        Parameters
-        ----------
-        earlier : Run or None
-            Run of the same label that ends where this run starts; None for none.
-        """
+        """Prepend a run, if any, of the same label that ends where this run starts."""
         if earlier is None:
             return self
         frames, confidence = earlier.frames + self.frames, earlier.confidence + self.confidence
@@ -210,18 +190,9 @@ class SegmenterInput(NamedTuple):
 class Segmenter:
     """Divides one stream of frames into segments, by a model's smoothing.
 
-    Parameters
-    ----------
-    classes : sequence of str
-        Names of the columns of the probabilities.
-    transitions : np.ndarray [shape=(C, C)], float64
-        Transition probabilities of the hidden Markov model; unused if the smoothing merges
-        segments.
-
-    Attributes
-    ----------
-    segments_converged : bool
-        Whether the segments to come are independent of frames before the first frame.
+    `transitions` [shape=(C, C)] are those of the hidden Markov model, unused if the smoothing
+    merges segments. `segments_converged`: the segments to come are independent of frames before the
+    first frame.
     """
 
     def __init__(self, classes: Sequence[str], smoothing: Smoothing, transitions: Float64) -> None:
@@ -272,13 +243,7 @@ class Segmenter:
             self._smoother.forget()
 
     def push(self, frames: SegmenterInput) -> list[Segment]:
-        """Add successive frames and return the segments whose end is now decided.
-
-        Parameters
-        ----------
-        frames : LabelledFrames
-            At least one.
-        """
+        """Add at least one frame; return the segments whose end is now decided."""
         states = frames.probabilities.argmax(axis=1)
         if self._smoother is not None:
             states = self._smoother.push(frames.probabilities)
@@ -297,13 +262,7 @@ class Segmenter:
         return segments
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments at the end of the sound, and reset.
-
-        Parameters
-        ----------
-        end : int
-            End of the sound in nanoseconds of UTC.
-        """
+        """Return the remaining segments at the end, in nanoseconds of UTC, and reset."""
         segments = []
         if self._undecided is not None:
             states = np.empty(0, np.intp) if self._smoother is None else self._smoother.close()
@@ -317,10 +276,7 @@ class Segmenter:
         return segments
 
     def _note_convergence(self, states: Indices, stamps: Int64) -> None:
-        """Record when states converged; `stamps` covers all undecided frames.
-
-        Borders converge after enough equal converged states.
-        """
+        """Record when states converged, and borders, after enough equal converged states."""
         first = self._states
         self._states += len(states)
         after = self._doubtful + 1 if self._smoother is None else self._smoother.converged_after

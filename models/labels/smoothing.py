@@ -31,18 +31,9 @@ class ClassesApart(NamedTuple):
 def log_likelihoods(
     probabilities: Float32, weight: float, apart: ClassesApart | None = None
 ) -> Float64:
-    """Convert classifier probabilities to log-likelihoods of a hidden Markov model.
+    """Convert probabilities [shape=(n, C)] to finite log-likelihoods of a hidden Markov model.
 
     Classes are trained with equal weights, so their prior is uniform.
-
-    Parameters
-    ----------
-    probabilities : np.ndarray [shape=(n, C)], float32
-
-    Returns
-    -------
-    np.ndarray [shape=(n, C)], float64
-        Finite.
     """
     logarithms = np.log(np.maximum(probabilities, _TINY, dtype=np.float64))
     if apart is not None:
@@ -67,19 +58,10 @@ class FixedLagSmoother:
 
     The decided state lies on the likeliest path up to that later frame. It equals the Viterbi state
     over the complete sound unless still later frames change the path. The same frames give the same
-    states in blocks of any size.
-
-    Parameters
-    ----------
-    transitions : np.ndarray [shape=(C, C)], float64
-        Probability of the column's class after a frame of the row's class. The first frame may be
-        of any class.
-
-    Attributes
-    ----------
-    converged_after : int or None
-        Number of frames after which the states, from the last of these frames on, are independent
-        of earlier sound. None if not yet reached.
+    states in blocks of any size. `transitions` [shape=(C, C)] is the probability of the column's
+    class after a frame of the row's class; the first frame may be of any class. The states are
+    independent of earlier sound from the last of `converged_after` frames on; None if not yet
+    reached.
     """
 
     def __init__(
@@ -106,18 +88,9 @@ class FixedLagSmoother:
         self._scores_from = np.where(np.eye(count, dtype=bool), 0.0, -np.inf)
 
     def push(self, probabilities: Float32) -> Indices:
-        """Add successive frames and return the states that are now decided.
+        """Add probabilities [shape=(n, C)], 0 to 1; return the states that are now decided.
 
-        Parameters
-        ----------
-        probabilities : np.ndarray [shape=(n, C)], float32
-            Of the classes, 0 to 1.
-
-        Returns
-        -------
-        np.ndarray [shape=(m,)], intp
-            States of the frames after the already decided frames, up to `lag_frames` before the
-            last.
+        They follow those already decided, up to `lag_frames` before the last frame.
         """
         starts = range(0, len(probabilities), _FRAMES_AT_ONCE)
         blocks = (probabilities[start : start + _FRAMES_AT_ONCE] for start in starts)
@@ -185,12 +158,11 @@ class FixedLagSmoother:
 
 
 def _forward_in_lanes(transitions: Float64, start: Float64, observed: Float64) -> Float64:
-    """Score as `_forward` does, up to a constant per frame.
+    """Score as `_forward` does, up to a constant per frame, in lanes that run in parallel.
 
-    The frames are divided into lanes that are scored in parallel. All lanes but the first start
-    from a guess: an uninformed start some frames earlier. A lane whose guess differs from the end
-    of the lane before it is scored again from there. As the sums are exact, the final result is
-    exact.
+    All lanes but the first start from a guess: an uninformed start some frames earlier. A lane
+    whose guess differs from the end of the lane before it is scored again from there. As the sums
+    are exact, the final result is exact.
     """
     count = -(-len(observed) // _LANE)
     if count < _FEWEST_LANES:
@@ -219,19 +191,10 @@ def _normalized(scores: Float64) -> Float64:
 
 
 def _forward(transitions: Float64, start: Float64, observed: Float64) -> Float64:
-    """Score the likeliest path to each state of each frame.
+    """Score the likeliest path to each state of each frame [shape=(n + 1, C) or (n + 1, C, k)].
 
-    Parameters
-    ----------
-    transitions : np.ndarray [shape=(C, C)], float64
-    start : np.ndarray [shape=(C,) or (C, k)], float64
-        Scores of the previous frame, for k sounds.
-    observed : np.ndarray [shape=(n, C), (n, C, 1) or (n, C, k)], float64
-
-    Returns
-    -------
-    np.ndarray [shape=(n + 1, C) or (n + 1, C, k)], float64
-        The first row is `start`.
+    `observed` has shape (n, C), (n, C, 1) or (n, C, k), `transitions` (C, C). `start` [shape=(C,)
+    or (C, k)], the first row, has the scores of the previous frame, for k sounds.
     """
     scores = np.empty((len(observed) + 1, *start.shape))
     scores[0] = start

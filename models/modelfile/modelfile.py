@@ -102,23 +102,14 @@ def save_model(model: Model, path: Path) -> None:
 
 
 def load_model(path: Path, on_damage: Callable[[str], object] | None = None) -> Model:
-    """Read and validate a model file; nothing in the file is executed.
+    """Read and validate a model file, whose name the model takes; nothing in it is executed.
 
-    Parameters
-    ----------
-    path : Path
-        The file, or a symbolic link to the file, whose name the model takes. Without such a file,
-        the name of a starter model (`hearthlog.models.starter`), or `audioset` for the names of
-        YAMNet.
-    on_damage : callable, optional
-        Receives one line if the checksum does not match; by default a mismatch is an error.
-
-    Raises
-    ------
-    ModelError
-        If the file is missing, larger than 64 MiB, damaged or inconsistent, if its name is not
-        printable, or if the model needs another feature set, or a feature set or kind of classifier
-        that is not installed.
+    `path` may be a symbolic link; without such a file, it is the name of a starter model
+    (`hearthlog.models.starter`), or `audioset` for the names of YAMNet. `on_damage` receives one
+    line if the checksum does not match; by default a mismatch is an error. Raise `ModelError` if
+    the file is missing, larger than 64 MiB, damaged or inconsistent, if its name is not printable,
+    or if the model needs another feature set, or a feature set or kind of classifier that is not
+    installed.
     """
     path, data = _read(path)
     _check_header(path, data)
@@ -143,22 +134,17 @@ def load_model(path: Path, on_damage: Callable[[str], object] | None = None) -> 
 
 
 def starter_for(path: Path, network: str) -> Path:
-    """Return the starter model of a name, given the available embedding network.
+    """Return the variant of a starter model for the available embedding network, empty for none.
 
-    Parameters
-    ----------
-    path : Path
-        Any model. `general` and `bathroom` select their variants with embeddings if those use this
-        network and there is no file of this name.
-    network : str
-        Network of the available embeddings; empty for none.
+    `general` and `bathroom` select their variants with embeddings if those use this network and
+    there is no file of this name; other models stay.
     """
     named = str(path) in BY_FEATURES and not os.path.lexists(path)
     return Path(with_network(str(path))) if named and network == NETWORK else path
 
 
 def name_and_digest(path: Path) -> tuple[str, str]:
-    """Return `Model.name` and `Model.sha256`, which identify a model, without loading the model.
+    """Return `Model.name` and `Model.sha256` without loading the model.
 
     Raise `ModelError` if the file is missing or larger than 64 MiB, or its name is not printable.
     """

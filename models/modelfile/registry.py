@@ -37,8 +37,7 @@ _Text = Annotated[str, StringConstraints(max_length=_LONGEST_REASON, pattern="^[
 class Judgement(BaseModel):
     """The decision whether a model may label a home: one small file per model, next to the models.
 
-    The file name contains the hash of the model, so another model of the same name has no
-    judgement.
+    The file name contains the hash of the model, so another of the same name has no judgement.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -69,13 +68,7 @@ def judgements_of(folder: Path) -> list[Path]:
 
 
 def read_judgement(folder: Path, sha256: str) -> Judgement | None:
-    """Read the judgement of a model.
-
-    Returns
-    -------
-    Judgement or None
-        None if there is no valid judgement of this model.
-    """
+    """Read the valid judgement of a model; None if there is none."""
     path = judgement_path(folder, sha256)
     with suppress(OSError, ValidationError):
         if path.is_file():
@@ -88,10 +81,7 @@ def read_judgement(folder: Path, sha256: str) -> Judgement | None:
 
 
 def write_judgement(folder: Path, judgement: Judgement) -> None:
-    """Write a judgement, replacing an earlier judgement of the same model.
-
-    Raise `ModelError` if the file cannot be written.
-    """
+    """Write a judgement, replacing an earlier one; raise `ModelError` if that fails."""
     path = judgement_path(folder, judgement.model)
     try:
         private_folder(path.parent)
@@ -136,16 +126,10 @@ class ModelEntry:
 
 
 def list_models(folder: Path) -> list[ModelEntry]:
-    """Load every model of a folder and the starter models; list the targets of broken aliases too.
+    """Load all models of a folder and the starter models, by name; also targets of broken aliases.
 
-    Raise `ModelError` if the path is not a folder, or an alias is not a link to a model file in the
-    folder.
-
-    Returns
-    -------
-    list of ModelEntry
-        Sorted by name; an unusable entry has a `problem`. Only the starter models if the folder
-        does not exist.
+    An unusable entry has a `problem`; only starter models if the folder does not exist. Raise
+    `ModelError` if the path is not a folder, or an alias is not a link to a model file in it.
     """
     if os.path.lexists(folder):
         _check_folder(folder)
@@ -160,14 +144,9 @@ def list_models(folder: Path) -> list[ModelEntry]:
 
 
 def target(folder: Path, alias: str) -> str | None:
-    """Return the name of an alias's target.
+    """Return the name of an alias's target, which need not exist; None without the alias.
 
     Raise `ModelError` if the alias exists but is not a link to a model file in the folder.
-
-    Returns
-    -------
-    str or None
-        None if there is no such alias. The target need not exist.
     """
     link = _path(folder, alias)
     if not os.path.lexists(link):
@@ -182,15 +161,10 @@ def target(folder: Path, alias: str) -> str | None:
 
 
 def resolve(folder: Path, name: str) -> str:
-    """Resolve a model name or an alias to the name of a model.
+    """Resolve an alias, or a name of a model or its file, which need not exist, to a model's name.
 
     Raise `ModelError` if the alias does not exist or is not a link to a model file, or the name
     points outside the folder.
-
-    Parameters
-    ----------
-    name : str
-        Name of a model or of its file, or an alias. The model need not exist.
     """
     name = name.removesuffix(SUFFIX)
     if name in ALIASES:
@@ -204,15 +178,9 @@ def resolve(folder: Path, name: str) -> str:
 
 
 def load(folder: Path, name: str) -> Model:
-    """Load a model of a folder, or a starter model.
+    """Load a model of a folder, by `name` as in `resolve`, or a starter model or `audioset`.
 
     Raise `ModelError` if the folder does not exist, or `resolve` or `load_model` refuses the model.
-
-    Parameters
-    ----------
-    name : str
-        Name of a model or of its file, or an alias; without such a file, a starter model or
-        `audioset`.
     """
     stem = name.removesuffix(SUFFIX)
     if stem in {*STARTERS, AUDIOSET} and not os.path.lexists(_path(folder, stem)):
@@ -238,12 +206,9 @@ def is_starter(name: str, sha256: str) -> bool:
 def first_starter(folder: Path) -> str | None:
     """Return the name of the starter model that preceded the champion.
 
-    Returns
-    -------
-    str or None
-        The starter model from which the champion was adapted, traced through models still in the
-        folder; else `general`, the default of a recorder, in the variant with embeddings if the
-        champion uses embeddings. None if the champion is that model, or has another feature set.
+    It is the one from which the champion was adapted, traced through models still in the folder;
+    else `general`, the default of a recorder, in the variant with embeddings if the champion uses
+    embeddings. None if the champion is that model, or has another feature set.
     """
     try:
         champion = model = load(folder, CHAMPION)

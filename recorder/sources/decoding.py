@@ -318,6 +318,7 @@ def _without_holes(rows: Float64) -> Float64:
 
 
 def finite_or_nan(block: Float32) -> Float32:
+    """Replace infinity by NaN."""
     if np.isinf(block).any():
         block = np.where(np.isfinite(block), block, np.float32(np.nan))
     return block
