@@ -20,36 +20,18 @@ Int64 = NDArray[np.int64]
 
 
 def gather(buffer: Bytes, offsets: Int64, size: int) -> NDArray[np.void]:
-    """Copy pieces of `size` bytes at any offsets from a buffer.
+    """Copy pieces of `size` bytes at offsets, 0 to b - `size`, from a buffer [shape=(b,)].
 
-    Parameters
-    ----------
-    buffer : np.ndarray [shape=(b,)], uint8
-        At least `size` bytes.
-    offsets : np.ndarray [shape=(n,)], int64
-        Offsets of the pieces in the buffer, 0 to b - `size`; pieces may overlap.
-    size : int
-        Size of each piece in bytes.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], of dtype V`size`
-        Pieces in the order of `offsets`.
+    The pieces [shape=(n,), dtype V`size`] are in the order of the offsets [shape=(n,)], and may
+    overlap.
     """
     return _pieces(buffer, size)[offsets]
 
 
 def scatter(rows: NDArray[np.void], buffer: Bytes, offsets: Int64) -> None:
-    """Copy rows to offsets of a buffer.
+    """Copy rows [shape=(n,), dtype V`size`] to offsets [shape=(n,)] of a buffer [shape=(b,)].
 
-    Parameters
-    ----------
-    rows : np.ndarray [shape=(n,)], of dtype V`size`
-        Pieces of `size` bytes.
-    buffer : np.ndarray [shape=(b,)], uint8
-        At least `size` bytes, which the rows overwrite.
-    offsets : np.ndarray [shape=(n,)], int64
-        Offsets of the rows in the buffer, 0 to b - `size`; the rows must not overlap.
+    Offsets are 0 to b - `size`; the rows overwrite the buffer, and must not overlap.
     """
     _pieces(buffer, rows.dtype.itemsize)[offsets] = rows
 
@@ -78,21 +60,11 @@ def write_sealed(arrays: Mapping[str, NDArray[Any]], key: str, text: str) -> byt
 
 
 def read_sealed(path: Path, data: bytes, key: str) -> tuple[dict[str, NDArray[Any]], str, str]:
-    """Parse the bytes of an array file; files without digest, from old versions, pass.
+    """Parse the bytes of an array file to arrays, text (may be empty), and damage.
 
-    Returns
-    -------
-    text : str
-        Empty if the file has none.
-    damage : str
-        Error text with advice if the digest differs; otherwise empty.
-
-    Raises
-    ------
-    safetensors.SafetensorError
-        If the data are no safetensors file.
-    KeyError
-        If numpy does not support the type of an array.
+    The damage is an error text with advice if the digest differs; empty otherwise, and for files
+    without digest, from old versions. Raise `safetensors.SafetensorError` if the data are no
+    safetensors file, `KeyError` if numpy does not support the type of an array.
     """
     from safetensors.numpy import load  # noqa: PLC0415  everything imports this module
 

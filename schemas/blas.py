@@ -12,13 +12,9 @@ _READ_BYTES = 1 << 14  # covers the first processor in the file
 def kernel_environment() -> dict[str, str]:
     """Return environment variables that select the fastest OpenBLAS kernel of this processor.
 
-    For processors newer than itself, OpenBLAS selects one without AVX-512, at half the speed.
-
-    Returns
-    -------
-    dict of str to str
-        Empty if OpenBLAS should choose: if the user has set a kernel, or the processor has no
-        AVX-512 or is unknown, as on systems other than Linux.
+    For processors newer than itself, OpenBLAS selects one without AVX-512, at half the speed. They
+    are empty if OpenBLAS should choose: if the user has set a kernel, or the processor has no
+    AVX-512 or is unknown, as on systems other than Linux.
     """
     if _VARIABLE in os.environ or not _flags() >= _AVX512:
         return {}

@@ -11,13 +11,7 @@ def printable(text: object) -> str:
 
 
 def shortened(text: str, length: int) -> str:
-    """Truncate a text to a number of characters, and make it printable.
-
-    Parameters
-    ----------
-    length : int
-        Maximum length, at least 1; the last character is `…` if the text was longer.
-    """
+    """Truncate a text to at least one character, the last being `…`, and make it printable."""
     return printable(text if len(text) <= length else text[: length - 1] + "…")
 
 
@@ -28,13 +22,7 @@ def abridged(names: Sequence[str], most: int = 20) -> str:
 
 
 def listed(names: Sequence[str], last: str = "or") -> str:
-    """List names in a sentence: `a, b or c`.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names in the order of the list; an empty sequence gives an empty text.
-    """
+    """List names in a sentence: `a, b or c`; empty without names."""
     return f" {last} ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
@@ -74,10 +62,4 @@ Progress = Callable[[float], None]  # called with the completed share, from 0 to
 
 
 def ignore_progress(_share: float) -> None:
-    """Ignore a progress report.
-
-    Parameters
-    ----------
-    _share : float
-        Completed share, 0 to 1.
-    """
+    """Ignore a progress report of a share, 0 to 1."""

@@ -46,10 +46,7 @@ def exposed_secret(path: Path) -> str:
 def may_be_regular(path: Path) -> bool:
     """Return whether a path is a regular file, or its kind cannot be determined.
 
-    Returns
-    -------
-    bool
-        Also True for a missing file or an unreadable folder: opening it raises the exact error.
+    Also True for a missing file or an unreadable folder: opening it raises the exact error.
     """
     try:
         return stat.S_ISREG(path.stat().st_mode)
@@ -116,18 +113,9 @@ _DEEPEST = 100  # parts of a dotted key: the parser's time grows with the cube o
 
 
 def read_limited(path: Path, what: str, limit: int, error: type[HearthlogError]) -> bytes:
-    """Read a regular local file, or a file of a store.
+    """Read a regular local file, or a file of a store, of at most `limit` bytes.
 
-    Parameters
-    ----------
-    limit : int
-        Maximum size in bytes.
-
-    Raises
-    ------
-    HearthlogError
-        Of the type `error`, if the file does not exist, is larger than the limit, cannot be read,
-        or is no regular file.
+    Raise `error` if the file does not exist, is larger, cannot be read, or is no regular file.
     """
     try:
         if not path.exists():
@@ -150,11 +138,8 @@ def _opened(path: Path) -> IO[bytes]:
 def read_toml(path: Path, what: str, error: type[HearthlogError]) -> dict[str, Any]:
     """Read a TOML file of at most 1 MB.
 
-    Raises
-    ------
-    HearthlogError
-        Of the type `error`, if the file does not exist, is larger than 1 MB, cannot be read, is
-        nested too deeply, or is not TOML in UTF-8.
+    Raise `error` if the file does not exist, is larger than 1 MB, cannot be read, is nested too
+    deeply, or is not TOML in UTF-8.
     """
     data = read_limited(path, what, _TOML_LIMIT, error)
     content: dict[str, Any] = {}
@@ -200,13 +185,8 @@ def prefetch(
 ) -> Generator[Result, None, None]:
     """Apply a function to items in threads, a few items ahead of the consumer.
 
-    Parameters
-    ----------
-    function : callable
-        Called with one item. Should mostly release the interpreter lock: reading, decompression,
-        numpy.
-    workers : int
-        Number of threads, at least 1; at most `workers + 1` items are in progress or unread.
+    It should mostly release the interpreter lock: reading, decompression, numpy. At most `workers +
+    1` items, `workers` >= 1, are in progress or unread.
     """
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[Future[Result]] = deque()
@@ -237,11 +217,7 @@ def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterab
 
 @contextmanager
 def store_errors(path: object) -> Iterator[None]:
-    """Turn errors of a store into `LogError`.
-
-    Raise `LogError` if the block raises any error except HearthlogError and ImportError, which
-    pass unchanged.
-    """
+    """Turn errors of a store into `LogError`, except HearthlogError and ImportError."""
     try:
         yield
     except (HearthlogError, ImportError):
@@ -259,10 +235,7 @@ def _line(error: Exception) -> str:
 
 
 class LocalFile:
-    """Local file, open for reading.
-
-    Raise `LogError` if the file cannot be opened, or is no regular file.
-    """
+    """Local file, open for reading; raise `LogError` if it cannot be opened, or is not regular."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -288,29 +261,16 @@ class LocalFile:
             return False
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read bytes at an offset.
-
-        Raise `LogError` if the file cannot be read.
-        """
+        """Read bytes at an offset; raise `LogError` if the file cannot be read."""
         try:
             return os.pread(self._descriptor, length, offset)
         except OSError as error:
             raise self._unreadable(error) from error
 
     def read_into(self, out: memoryview, offset: int) -> int:
-        """Read bytes at an offset into a buffer.
+        """Read bytes at an offset into a buffer; return their number, less at the end of the file.
 
         Raise `LogError` if the file cannot be read.
-
-        Parameters
-        ----------
-        out : memoryview
-            Filled from its start; its length is the number of bytes to read.
-
-        Returns
-        -------
-        int
-            Number of bytes read: less than the buffer length at the end of the file.
         """
         try:
             return os.preadv(self._descriptor, [out], offset)
@@ -388,10 +348,7 @@ def _identity(path: Any) -> dict[str, Any]:
 
 
 def open_file(path: Path) -> LocalFile | StoredFile:
-    """Open a file for reading by ranges.
-
-    Raise `LogError` if the file cannot be opened.
-    """
+    """Open a file for reading by ranges; raise `LogError` if that fails."""
     return LocalFile(path) if is_local(path) else StoredFile(path)
 
 
@@ -408,19 +365,9 @@ class Section(io.RawIOBase):
         return True
 
     def readinto(self, out: Any) -> int:
-        """Read the next bytes into a buffer.
+        """Read the next bytes into a buffer; return their number, 0 at the end of the file.
 
         Raise `LogError` if the file cannot be read.
-
-        Parameters
-        ----------
-        out : buffer
-            Filled from its start; its length is the number of bytes to read.
-
-        Returns
-        -------
-        int
-            Number of bytes read; 0 at the end of the file.
         """
         count = self._file.read_into(memoryview(out), self._position)
         self._position += count

@@ -12,20 +12,10 @@ _BEYOND_MICROSECONDS = re.compile(r"(?<=\.\d{6})\d{1,3}(?!\d)")
 
 
 def read_time(text: str) -> int:
-    """Parse a time in ISO 8601.
+    """Parse a time in ISO 8601 to nanoseconds of UTC since 1970.
 
-    Raise `ValueError` if the text is not a time.
-
-    Parameters
-    ----------
-    text : str
-        A date such as `2026-03-01`, or date and time such as `2026-03-01T07:00:00.123456789+01:00`;
-        UTC without an offset, at most nine decimals.
-
-    Returns
-    -------
-    int
-        Nanoseconds of UTC since 1970.
+    A date such as `2026-03-01`, or date and time such as `2026-03-01T07:00:00.123456789+01:00`; UTC
+    without an offset, at most nine decimals. Raise `ValueError` for another text.
     """
     rest = _BEYOND_MICROSECONDS.search(text)  # datetime has no room for these digits
     moment = datetime.fromisoformat(_BEYOND_MICROSECONDS.sub("", text))
@@ -36,17 +26,9 @@ def read_time(text: str) -> int:
 
 
 def millisecond_text(nanoseconds: int) -> str:
-    """Format a time in UTC, to the millisecond.
+    """Format nanoseconds of UTC since 1970 as `2026-03-01T07:00:00.123Z`.
 
-    Parameters
-    ----------
-    nanoseconds : int
-        Nanoseconds of UTC since 1970.
-
-    Returns
-    -------
-    str
-        Such as `2026-03-01T07:00:00.123Z`, or `<nanoseconds> ns` if no calendar has the time.
+    If no calendar has the time, the text is `<nanoseconds> ns`.
     """
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     try:
@@ -57,35 +39,13 @@ def millisecond_text(nanoseconds: int) -> str:
 
 
 def time_text(nanoseconds: int) -> str:
-    """Format a time in UTC, with nine decimals.
-
-    Parameters
-    ----------
-    nanoseconds : int
-        Nanoseconds of UTC since 1970, within the years 1 to 9999.
-
-    Returns
-    -------
-    str
-        Such as `2026-03-01T07:00:00.123456789Z`.
-    """
+    """Format nanoseconds of UTC since 1970 as `2026-03-01T07:00:00.123456789Z`; years 1 to 9999."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09}Z"
 
 
 def seconds_text(nanoseconds: int) -> str:
-    """Format a duration or a time in seconds, with nine decimals.
-
-    Parameters
-    ----------
-    nanoseconds : int
-        May be negative.
-
-    Returns
-    -------
-    str
-        Such as `-1.500000000`.
-    """
+    """Format nanoseconds, possibly negative, in seconds with nine decimals: `-1.500000000`."""
     seconds, rest = divmod(abs(nanoseconds), NANOSECONDS)
     return f"{'-' * (nanoseconds < 0)}{seconds}.{rest:09}"
 

@@ -71,8 +71,7 @@ def make_folders(path: Path, mode: int | None = None) -> None:
 def create_file(path: Path, mode: int = 0o600) -> BinaryIO:
     """Create a local file for writing, without following links.
 
-    Raise `FileExistsError` if the name exists, even as a dangling link.
-    Raise `OSError` if the file cannot be created.
+    Raise `FileExistsError` if the name exists, even as a dangling link, else `OSError`.
     """
     descriptor, folder = _open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     _set_owner(descriptor, folder)
@@ -98,12 +97,7 @@ def open_lock(path: Path) -> int:
 def hand_over(path: Path, mode: int | None = None) -> None:
     """Set the permissions of a new file or folder; root also gives it to the owner of its parent.
 
-    Raise `OSError` if the path does not exist, or is a link.
-
-    Parameters
-    ----------
-    path : Path
-        Local file or folder; a link is not followed.
+    Raise `OSError` if the path, which is local, does not exist, or is a link.
     """
     descriptor, folder = _open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
@@ -143,14 +137,9 @@ def _is_own(made: os.stat_result) -> bool:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Hold a lock on a folder against other processes that lock it.
+    """Hold a lock on a local folder against other processes, after an unlimited wait.
 
     Raise `OSError` if the folder cannot be opened.
-
-    Parameters
-    ----------
-    folder : Path
-        Local folder. The wait for the lock is unlimited.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:

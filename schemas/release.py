@@ -10,11 +10,8 @@ _RELEASE = re.compile(r"(\d{1,4})\.(\d{1,4})\.(\d{1,4})")
 def update_advice(written_by: object) -> str:
     """Return the advice for a file that only a later release reads in full.
 
-    Parameters
-    ----------
-    written_by : object
-        Release that wrote the file, such as `0.4.0`; anything else, as a file may contain, gives
-        the advice without a release.
+    `written_by` is the release that wrote the file, such as `0.4.0`; anything else, as a file may
+    contain, gives the advice without a release.
     """
     release, own = _numbers(written_by), _numbers(__version__)
     if release is None or own is None or release <= own:

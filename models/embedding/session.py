@@ -215,8 +215,7 @@ class OnnxModel:
         self.outputs = {each.name: list(each.shape) for each in self._session.get_outputs()}
 
     def run(self, samples: Float32, outputs: Sequence[str], options: Any = None) -> list[Any]:
-        """Compute outputs for samples [shape=(window,)]; onnxruntime raises many kinds of errors.
-        """
+        """Compute outputs for samples [shape=(window,)]; onnxruntime raises various errors."""
         return self._session.run(
             list(outputs), {self._input: samples.reshape(self._shape)}, options
         )

@@ -47,8 +47,7 @@ class SteadyNoise:
         self._power = self._power + (power - self._power) / self._windows
 
     def reduced(self, window: Float32) -> Float32:
-        """Return a window [shape=(n, FRAME_SAMPLES)] without its noise, unless that is negligible.
-        """
+        """Return a window [shape=(n, FRAME_SAMPLES)] without its noise, unless negligible."""
         if self._power is None:
             return window
         left = 10.0 ** (LEFT_DBFS / 10.0) * np.square(_taper()).sum()

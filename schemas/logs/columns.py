@@ -124,30 +124,16 @@ def read_columns(  # noqa: PLR0913
     *,
     on_damage: OnDamage | None = None,
 ) -> dict[str, Columns]:
-    """Read topics of logs as one series per topic.
+    """Read topics of logs as one series per topic; topics without messages are left out.
+
+    By default, all topics and fields are read; `topics` has names or is a predicate, `fields` has
+    paths. Log times are from `start` on, before `end`, in nanoseconds of UTC. If the files of a
+    topic differ in metadata or fields, only the common entries are kept. Undecodable messages are
+    skipped with a `HearthlogWarning`, as in `decode_readable`. `on_damage` receives a log and the
+    error of a damaged chunk, which is skipped; by default it is raised.
 
     Raise `LogError` if a log cannot be read or is damaged, or two logs have different types on one
     topic.
-
-    Parameters
-    ----------
-    logs : iterable of Path
-    topics : collection of str or callable, optional
-        Names of the topics, or a predicate; all by default.
-    start, end : int, optional
-        Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
-    fields : collection of str, optional
-        Paths of the fields to read; all by default.
-    on_damage : callable, optional
-        Called with a log and the error of a damaged chunk, which is skipped. By default the error
-        is raised.
-
-    Returns
-    -------
-    dict of str to Columns
-        By topic, without topics that have no messages. If the files of a topic differ in metadata
-        or fields, only the common entries are kept. Undecodable messages are skipped with a
-        `HearthlogWarning`, as in `decode_readable`.
     """
     logs = list(logs)
     unlimited = start is None and end is None
@@ -169,21 +155,11 @@ def iterate_columns(  # noqa: PLR0913
     *,
     on_damage: OnDamage | None = None,
 ) -> Iterator[list[Columns]]:
-    """Read topics of logs piece by piece.
+    """Read topics of logs by spans of time, with the arguments of `read_columns`.
 
-    Raise `LogError` if a log cannot be read or is damaged.
-
-    Parameters
-    ----------
-    start, end : int, optional
-        Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
-
-    Yields
-    ------
-    list of Columns
-        The next span of time: one item for each topic with messages in it, or more if its channels
-        differ in type, fields or metadata. No message is older than those yielded before.
-        Undecodable messages are skipped with a `HearthlogWarning`, as in `decode_readable`.
+    A span has one item for each topic with messages in it, or more if its channels differ in type,
+    fields or metadata. No message is older than those yielded before. Raise `LogError` if a log
+    cannot be read or is damaged.
     """
     function = partial(decode_readable, fields=fields)
     pieces = iterate_pieces(logs, topics, start, end, function, on_damage=on_damage)
@@ -193,19 +169,9 @@ def iterate_columns(  # noqa: PLR0913
 def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = None) -> list[Columns]:
     """Decode messages into one `Columns` for each topic, type, set of fields and metadata.
 
-    Raise `LogError` if messages are not of the type of their channel, or not encoded as CDR, or the
+    They are in the order of their first messages; `fields` has paths, by default all. Raise
+    `LogError` if messages are not of the type of their channel, or not encoded as CDR, or the
     definition of the type cannot be parsed.
-
-    Parameters
-    ----------
-    messages : iterable of RawMessages
-    fields : collection of str, optional
-        Paths of the fields to read; all by default.
-
-    Returns
-    -------
-    list of Columns
-        In the order of their first messages in `messages`.
     """
     return _joined([_decode(raw, fields) for raw in messages])
 
@@ -213,26 +179,17 @@ def decode(messages: Iterable[RawMessages], fields: Collection[str] | None = Non
 def decode_readable(
     messages: Iterable[RawMessages], fields: Collection[str] | None = None
 ) -> list[Columns]:
-    """Decode messages as `decode` does, but skip undecodable ones.
+    """Decode messages as `decode` does, but skip undecodable ones, and channels without others.
 
-    A `HearthlogWarning` names each topic that loses messages. In strings that are not UTF-8,
-    U+FFFD replaces invalid bytes.
-
-    Returns
-    -------
-    list of Columns
-        In the order of their first messages in `messages`, without channels that have no decodable
-        message.
+    A `HearthlogWarning` names each topic that loses messages. In strings that are not UTF-8, U+FFFD
+    replaces invalid bytes.
     """
     decoded = (_decode_readable(raw, fields) for raw in messages)
     return _joined([_with_valid_times(columns) for columns in decoded if columns is not None])
 
 
 def unreadable(channel: Channel, schema: Schema | None) -> str:
-    """Return why no message of a channel can be decoded; empty if its definition is valid.
-
-    `schema` is None for a channel without schema.
-    """
+    """Return why no message of a channel can be decoded; empty if its definition is valid."""
     if schema is None or channel.message_encoding != "cdr":
         return f"holds no ROS 2 messages ({channel.message_encoding!r})"
     return definition_fault(schema.name, schema.encoding, schema.data)
@@ -276,13 +233,7 @@ def _decode_readable(raw: RawMessages, fields: Collection[str] | None) -> Column
 
 
 def faults(raw: RawMessages) -> dict[int, LogError]:
-    """Return the error of each message that does not match its type.
-
-    Returns
-    -------
-    dict of int to LogError
-        By index among these messages, ascending.
-    """
+    """Return the error of each message that does not match its type, by ascending index."""
     assert raw.schema is not None
     kind = message_type(raw.schema.name, raw.schema.encoding, raw.schema.data)
     return dict(sorted(unreadable_rows(kind, raw.buffer, raw.offsets, raw.sizes).items()))
@@ -349,12 +300,7 @@ def _with_valid_times(columns: Columns) -> Columns:
 def join(parts: Sequence[Columns]) -> Columns:
     """Concatenate pieces of one topic, with the fields that all pieces have.
 
-    Raise `LogError` if the pieces have different types.
-
-    Parameters
-    ----------
-    parts : sequence of Columns
-        At least one, in order of time.
+    At least one piece, in order of time. Raise `LogError` if the pieces have different types.
     """
     builder = _ColumnBuilder()
     for part in parts:

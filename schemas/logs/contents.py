@@ -33,10 +33,7 @@ class Status(NamedTuple):
 
 
 def statuses_of(columns: Columns) -> Iterator[Status]:
-    """Yield each status of diagnostic messages.
-
-    Raise `LogError` if the field is missing.
-    """
+    """Yield each status of diagnostic messages; raise `LogError` if the field is missing."""
     for time, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
         for status in statuses:
             yield Status(status["name"], time, int(status["level"]), status["message"])
@@ -98,10 +95,7 @@ class LogContents:
     last: dict[str, Status] = field(default_factory=dict, compare=False)
 
     def add(self, batch: Sequence[RawMessages], readable: IsReadable | None = None) -> None:
-        """Add messages to the summary.
-
-        Raise `LogError` if a message does not match the type of its channel.
-        """
+        """Add messages; raise `LogError` if one does not match the type of its channel."""
         for raw in batch:
             self._add_topic(raw)
         for columns in _decoded(batch, readable or is_readable):
@@ -170,13 +164,7 @@ def is_review(microphone: str) -> bool:
 def is_readable(
     channel: Channel, schema: Schema | None, type_: str, paths: Collection[str]
 ) -> bool:
-    """Return whether a channel has messages of a type with the required fields.
-
-    Parameters
-    ----------
-    schema : Schema or None
-        None for a channel without schema.
-    """
+    """Return whether a channel has messages of a type with the required fields."""
     if schema is None or schema.name != type_ or channel.message_encoding != "cdr":
         return False
     return not missing_fields(type_, schema.encoding, schema.data, frozenset(paths))
@@ -185,13 +173,7 @@ def is_readable(
 def has_contents(
     channel: Channel, schema: Schema | None, readable: IsReadable = is_readable
 ) -> bool:
-    """Return whether `LogContents` reads the messages of a channel.
-
-    Parameters
-    ----------
-    schema : Schema or None
-        None for a channel without schema.
-    """
+    """Return whether `LogContents` reads the messages of a channel."""
     return any(readable(channel, schema, *kind) for kind in FIELDS.items())
 
 
@@ -224,12 +206,8 @@ def as_metadata(contents: LogContents) -> dict[str, str] | None:
 def stated_contents(file: LogFile) -> LogContents | None:
     """Read the contents record of a finished log.
 
-    Raise `LogError` if the file cannot be read, or its last metadata record is damaged.
-
-    Returns
-    -------
-    Contents or None
-        None without a record, or if it contradicts the statistics: the messages must be counted.
+    None without a record, or if it contradicts the statistics: the messages must be counted. Raise
+    `LogError` if the file cannot be read, or its last metadata record is damaged.
     """
     places = [place for place in file.record_locations if place.opcode == Opcode.METADATA]
     if file.statistics is None or not places or places[-1].length > _LARGEST + _ROOM:
@@ -242,12 +220,9 @@ def stated_contents(file: LogFile) -> LogContents | None:
 
 
 def from_metadata(record: Mapping[str, str]) -> LogContents | None:
-    """Parse the contents record; None if it is damaged, or of another version.
+    """Parse the contents record of an untrusted file: its form is checked, but not its truth.
 
-    Parameters
-    ----------
-    record : mapping of str to str
-        From an untrusted file: the form is checked, but not the truth.
+    None if it is damaged, or of another version.
     """
     text = record.get("contents", "")
     if record.get("version") != _VERSION or record.get("sha256") != _digest(text):

@@ -62,12 +62,7 @@ CUT = "_cut"  # ends the name, without suffix, of a file cut from a log
 def check_node_name(name: str) -> str:
     """Return the name of a node if it is valid at the start of a file name on all systems.
 
-    Raise `LogError` if the name has another form.
-
-    Parameters
-    ----------
-    name : str
-        At most 64 letters, digits, '-' and '_'; the first is a letter or a digit.
+    Raise `LogError` if it is not at most 64 letters, digits, '-' and '_', a letter or digit first.
     """
     if not is_node_name(name):
         raise LogError(
@@ -175,23 +170,11 @@ def is_log(path: Path) -> bool:
 
 
 def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
-    """List the logs in a folder, or a single log, including active ones.
+    """List the logs and layers in a folder, recursively, or one log, also active ones, by name.
 
-    Raise `LogError` if there is no log, this user may not read it, the path is a pipe, a socket or
-    a device, or the store of the path cannot be used.
-
-    Parameters
-    ----------
-    path : Path
-        Folder, searched recursively, or one log.
-    enrolled : bool
-        Whether to include the training sounds in folders `enrolled`.
-
-    Returns
-    -------
-    list of Path
-        Logs and layers, sorted by name. Unreadable logs in the folder are skipped with a
-        `HearthlogWarning`.
+    Training sounds in folders `enrolled` are only included on request. Unreadable logs in the
+    folder are skipped with a `HearthlogWarning`. Raise `LogError` if there is no log, this user may
+    not read it, the path is a pipe, a socket or a device, or the store of the path cannot be used.
     """
     every = _find_local(path) if is_local(path) else _find_stored(path)
     depth = len(path.parts)
@@ -205,10 +188,7 @@ def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
 
 
 def check_allowed(path: Path) -> None:
-    """Check that this user may read a log, or list a folder; a missing path passes.
-
-    Raise `LogError` otherwise.
-    """
+    """Raise `LogError` if this user may not read a log, or list a folder; a missing path passes."""
     if is_local(path) and is_denied(path):
         raise LogError(f"{path}: {denied_text(path)}")
 
@@ -257,13 +237,7 @@ def _others_in(folder: Path) -> str:
 def walk_logs(
     folder: Path, denied: list[str] | None = None, compressed: list[str] | None = None
 ) -> Iterator["os.DirEntry[str]"]:
-    """List the logs in a local folder, unordered.
-
-    Parameters
-    ----------
-    folder : Path
-        Links to folders are not followed; unreadable folders are skipped.
-    """
+    """List the logs in a local folder, unordered, except in linked and unreadable folders."""
     waiting = [os.fspath(folder)]
     while waiting:
         inside = look_into(path := waiting.pop())
@@ -329,14 +303,9 @@ _SIZE_LIMIT = 1 << 20  # maximum bytes of the records of one kind
 
 
 def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
-    """Return the first and the last log time of a log.
+    """Return a log's first and last log time in nanoseconds of UTC; None without messages.
 
     Raise `LogError` if the log cannot be read, is not an MCAP file, or is damaged.
-
-    Returns
-    -------
-    tuple of int, or None
-        The two log times in nanoseconds of UTC; None if the log has no messages.
     """
     stated = stated_span(path)
     if stated is not None:
@@ -346,15 +315,10 @@ def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
 
 
 def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
-    """Return the first and the last log time of a log from its statistics only.
+    """Return `time_span` in a tuple, from the log's statistics only.
 
-    Raise `LogError` if the log cannot be read.
-
-    Returns
-    -------
-    tuple or None
-        A pair of log times in nanoseconds of UTC, or None without messages, in a tuple. None if
-        the log is unfinished or its index is damaged: only a scan finds its span.
+    None if the log is unfinished or its index is damaged: only a scan finds its span. Raise
+    `LogError` if the log cannot be read.
     """
     try:
         _, opened = open_log(path)
@@ -371,13 +335,10 @@ def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
 
 
 def topic_counts(path: Path) -> Counter[str]:
-    """Return the number of messages of each topic from the statistics of a finished log.
+    """Return the number of messages by topic from the statistics of a finished log.
 
-    Returns
-    -------
-    Counter of str
-        Messages by topic as stated, limited per channel to the size of the log in bytes. Empty if
-        the log has no statistics, they are damaged, or it cannot be read.
+    It is limited per channel to the size of the log in bytes. Empty if the log has no statistics,
+    they are damaged, or it cannot be read.
     """
     topics: Counter[str] = Counter()
     with suppress(LogError, McapError, UnicodeDecodeError, struct.error):

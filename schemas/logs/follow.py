@@ -65,13 +65,7 @@ class FolderChanges:
                     self._inotify.rm_watch(before)  # if it was moved away
 
     def wait(self, seconds: float, stop: Event) -> bool:
-        """Wait for a change or a timeout; return whether there was a change.
-
-        Parameters
-        ----------
-        stop : threading.Event
-            Ends the wait when set, at the latest after `seconds`.
-        """
+        """Wait for a change, some seconds or `stop`; return whether there was a change."""
         if self._inotify is None:
             stop.wait(seconds)
             return False
@@ -105,26 +99,13 @@ def follow(
     fields: Collection[str] | None = None,
     stop: Event | None = None,
 ) -> Iterator[list[Columns]]:
-    """Read the logs of a folder as they are written, across files and recorder restarts.
+    """Read the logs of a folder, recursively, across files and recorder restarts.
 
-    Latency after a recorder's write is a fraction of a second.
-
-    Parameters
-    ----------
-    folder : Path
-        Searched recursively. With `start`, existing files that are not being written are read
-        first.
-    start : int, optional
-        Log time, in nanoseconds of UTC, of the first messages to read; by default only messages
-        written from now on.
-    stop : threading.Event, optional
-        Ends the reading when set; by default it never ends.
-
-    Raises
-    ------
-    LogError
-        If the folder does not exist or disappears, the folder or a log in it cannot be read, a log
-        is damaged, or its messages do not match their stated type.
+    Latency after a recorder's write is a fraction of a second. With `start`, a log time in
+    nanoseconds of UTC, existing files that are not being written are read first; by default only
+    messages written from now on. Reading ends when `stop` is set. Raise `LogError` if the folder
+    does not exist or disappears, the folder or a log in it cannot be read, a log is damaged, or its
+    messages do not match their stated type.
     """
     for _, messages in follow_messages(folder, topics, start, stop):
         if messages:
@@ -150,31 +131,13 @@ def follow_messages(  # noqa: PLR0913
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
     """Read the encoded messages of logs as they are written; as `follow` does.
 
-    Raise `LogError` if the folder does not exist, or any error that `damaged` raises.
-
-    Parameters
-    ----------
-    start : int, optional
-        Log time, in nanoseconds of UTC, of the first messages to read; by default only messages
-        written from now on.
-    stop : threading.Event, optional
-        Ends the reading when set; by default it never ends.
-    damaged : callable
-        Called with the error of a damaged log, which is not read further; and once per incident
-        with that of a log or a folder that is unreadable or missing, which is retried. By default
-        the error is raised.
-    infos : bool
-        Whether to start with the `AudioStreamInfo` messages of active logs, including those
-        written before.
-    ticks : bool
-        Whether to yield the folder with an empty list five times a second while there is no new
-        data, for callers that measure time since the last data.
-
-    Yields
-    ------
-    messages : list of RawMessages
-        Messages written to the log since the last time; possibly empty, as after each log that is
-        not being written, to return control to the caller.
+    A list may be empty, as after each log that is not being written, to return control to the
+    caller. `damaged` receives the error of a damaged log, which is not read further; and once per
+    incident that of a log or a folder that is unreadable or missing, which is retried; by default
+    the error is raised. With `infos`, the `AudioStreamInfo` messages of active logs come first,
+    including those written before. With `ticks`, the folder comes with an empty list five times a
+    second while there is no new data, for callers that measure time since the last data. Raise
+    `LogError` if the folder does not exist, or any error that `damaged` raises.
     """
     stop = stop or Event()
     if not folder.is_dir():

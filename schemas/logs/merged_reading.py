@@ -53,15 +53,10 @@ Piece = TypeVar("Piece", bound=Messages)
 def time_spans(
     logs: Iterable[Path], span_of: Callable[[Path], tuple[int, int] | None] = time_span
 ) -> list[tuple[int, int, Path]]:
-    """Return the first and the last log time of each log with messages.
+    """Return the first and the last log time of each log with messages, in nanoseconds of UTC.
 
-    Raise `LogError` if a log cannot be read, is not an MCAP file, or is damaged.
-
-    Parameters
-    ----------
-    span_of : callable
-        Called with a log; returns its first and last log time in nanoseconds of UTC, or None
-        without messages.
+    `span_of` returns those of a log, or None. Raise `LogError` if a log cannot be read, is not an
+    MCAP file, or is damaged.
     """
     paths = list(logs)
     pairs = zip(map_logs(span_of, paths), paths, strict=True)
@@ -159,22 +154,11 @@ def iterate_messages(  # noqa: PLR0913
     on_damage: OnDamage | None = None,
     once: bool = False,
 ) -> Iterator[list[RawMessages]]:
-    """Read the encoded messages of several logs.
+    """Yield the messages of several logs by spans of time, one or more items for each channel.
 
-    Raise `LogError` if a log cannot be read, is not an MCAP file, or is damaged.
-
-    Parameters
-    ----------
-    start, end : int, optional
-        Log times, in nanoseconds of UTC: from `start` on, before `end`. No limit by default.
-    once : bool
-        Whether to skip chunks that repeat an earlier one of their log byte for byte.
-
-    Yields
-    ------
-    list of RawMessages
-        Messages of the next span of time, one or more items for each channel with messages in it.
-        No message is older than those yielded before.
+    No message is older than those yielded before. Log times are from `start` on, before `end`, in
+    nanoseconds of UTC. With `once`, chunks that repeat an earlier one of their log byte for byte
+    are skipped. Raise `LogError` if a log cannot be read, is not an MCAP file, or is damaged.
     """
     query = _query(topics, start, end)._replace(on_damage=on_damage, once=once)
     return _iterate(logs, query, list)
@@ -190,24 +174,12 @@ def iterate_pieces(  # noqa: PLR0913
     every: int = 1,
     on_damage: OnDamage | None = None,
 ) -> Iterator[list[Piece]]:
-    """Apply a function to the messages of each span of time, in the reader threads.
+    """Yield results of a function of the messages of each span, computed in the reader threads.
 
-    Raise `LogError` if a log cannot be read, is not an MCAP file, or is damaged; also any error of
-    `function`.
-
-    Parameters
-    ----------
-    topics : collection of str, callable or None
-        Names of the topics, or a predicate; None for all.
-    start, end : int or None
-        Log times, in nanoseconds of UTC: from `start` on, before `end`. None for no limit.
-    every : int
-        Read one of this many chunks of a log, as a sample; 1 for all.
-
-    Yields
-    ------
-    list of Piece
-        Results of the next span of time; none is older than those yielded before.
+    No result is older than those yielded before. `topics` has names, or is a predicate; None for
+    all. Log times are from `start` on, before `end`, in nanoseconds of UTC. One of `every` chunks
+    of a log is read, as a sample. Raise `LogError` if a log cannot be read, is not an MCAP file, or
+    is damaged; also any error of `function`.
     """
     query = _query(topics, start, end)._replace(every=every, on_damage=on_damage)
     return _iterate(logs, query, function)

@@ -42,16 +42,9 @@ def provenance(node: str, **more: str) -> dict[str, str]:
 
 
 def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
-    """Read the distinct `hearthlog` records of a file.
+    """Read the distinct `hearthlog` records of a file: one, those of all merged logs, or none.
 
-    A record of a newer version causes a `HearthlogWarning`.
-
-    Raise `LogError` if a record is damaged.
-
-    Returns
-    -------
-    list of mapping of str to str
-        One record, or those of all merged logs; empty if the file is not from hearthlog.
+    A record of a newer version causes a `HearthlogWarning`. Raise `LogError` if one is damaged.
     """
     records = provenance_records(file)
     for record in records:
@@ -60,10 +53,7 @@ def read_provenance(file: LogFile) -> list[Mapping[str, str]]:
 
 
 def provenance_records(file: LogFile) -> list[Mapping[str, str]]:
-    """Read the records of a file as `read_provenance` does, without the version check.
-
-    Raise `LogError` if a record is damaged.
-    """
+    """Read records as `read_provenance`, without version check; raise `LogError` if damaged."""
     different: dict[frozenset[tuple[str, str]], Mapping[str, str]] = {}
     size = 0
     for place in file.record_locations:
@@ -81,13 +71,7 @@ def version_text(record: Mapping[str, str]) -> str:
 
 
 def schema_version(record: Mapping[str, str]) -> int | None:
-    """Return the schema version of a record.
-
-    Returns
-    -------
-    int or None
-        None if this version of hearthlog does not support it.
-    """
+    """Return the schema version of a record; None if this version does not support it."""
     return _KNOWN.get(version_text(record))
 
 
@@ -98,13 +82,7 @@ def describes_model(record: Mapping[str, str]) -> bool:
 
 
 def unknown_version(record: Mapping[str, str]) -> str:
-    """Return the message about an unsupported schema version.
-
-    Returns
-    -------
-    str
-        Rest of a sentence that starts with the file; empty for a supported version.
-    """
+    """Return the rest of a sentence, after the file, about an unsupported schema version, or ""."""
     if schema_version(record) is not None:
         return ""
     return (
@@ -176,22 +154,13 @@ def rosbag2_metadata(
 ) -> dict[str, str]:
     """Return the `rosbag2` metadata record of a file (version 9 of its `metadata.yaml`).
 
-    Parameters
-    ----------
-    span : (int, int)
-        First and last log time, in nanoseconds of UTC.
+    `span` has the first and last log time, in nanoseconds of UTC.
     """
     return {"serialized_metadata": json.dumps(_information([FileCounts(name, topics, span)]))}
 
 
 def rosbag2_counts(record: Mapping[str, str]) -> dict[str, int]:
-    """Read the message count of each topic from the `rosbag2` metadata record of a file.
-
-    Returns
-    -------
-    dict of str to int
-        By topic; empty if the record has no counts, or contradictory ones.
-    """
+    """Read message counts by topic from a `rosbag2` record; empty if absent or contradictory."""
     text = record.get("serialized_metadata", "")
     try:
         total, counts = _from_json(text) if text.lstrip().startswith("{") else _from_yaml(text)
@@ -221,12 +190,9 @@ def _from_yaml(text: str) -> tuple[int, dict[str, int]]:
 
 
 def rosbag2_yaml(files: Sequence[FileCounts]) -> str:
-    """Return the `metadata.yaml` of a bag of several files.
+    """Return the `metadata.yaml` of a bag of at least one file, in order of time.
 
-    Parameters
-    ----------
-    files : sequence of FileCounts
-        At least one, in order of time; type and quality of a topic are equal in all of them.
+    Type and quality of a topic are equal in all of them.
     """
     information = json.dumps(_information(files), ensure_ascii=False)  # JSON is valid YAML
     return f"rosbag2_bagfile_information: {information}\n"
@@ -275,14 +241,9 @@ _DETAILS = (FEATURE_SET_VERSION, FEATURE_SET_DIGEST, FEATURE_SET_DISTRIBUTION)
 
 
 def feature_entries(name: str, version: int, digest: str, distribution: str) -> dict[str, str]:
-    """Return the record entries of a feature set.
+    """Return the record entries of a feature set: network's SHA-256, or empty, and distribution.
 
-    Parameters
-    ----------
-    digest : str
-        SHA-256 of the network of the features; empty for none.
-    distribution : str
-        Distribution of the feature set, with version; empty for hearthlog itself.
+    The distribution has a version; it is empty for hearthlog itself.
     """
     entries = {FEATURE_SET: name, FEATURE_SET_VERSION: str(version)}
     return entries | {
@@ -345,17 +306,11 @@ _TAIL = 1 << 16  # bytes
 
 
 def log_digest(log: Path) -> str:
-    """Return the SHA-256 of the size and the last 64 KiB of a log, as its identity.
+    """Return the SHA-256, 64 hexadecimal digits, of a log's size and last 64 KiB, as its identity.
 
     The end of a log contains its index, or the end of it, and the checksum of the index. It
-    identifies the log without reading all of it.
-
-    Raise `LogError` if the log cannot be read, or is not an MCAP file.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
+    identifies the log without reading all of it. Raise `LogError` if the log cannot be read, or is
+    not an MCAP file.
     """
     with LogFile(log, indexed=False) as file:
         size = file.size
@@ -364,10 +319,7 @@ def log_digest(log: Path) -> str:
 
 
 def earlier_digests(log: Path) -> list[str]:
-    """Return the digests of a log before each thinning.
-
-    Raise `LogError` if the log cannot be read or is damaged.
-    """
+    """Return the digests before each thinning; raise `LogError` if the log is damaged."""
     with LogFile(log) as file:
         records = provenance_records(file)
     return [digest for record in records for digest in record.get(THINNED_OF, "").split()]

@@ -190,24 +190,14 @@ class LogStreamWriter:
         self._writer.add_metadata(name, dict(metadata))
 
     def add_attachment(self, attachment: Attachment, created: int) -> None:
-        """Append a file.
-
-        Parameters
-        ----------
-        created : int
-            Creation time of the file, in nanoseconds of UTC.
-        """
+        """Append a file, created at a time in nanoseconds of UTC."""
         item = attachment
         self._writer.add_attachment(created, created, item.name, item.media_type, item.data)
 
     def write_messages(self, messages: Sequence[tuple[int, str, bytes]]) -> None:
-        """Append encoded messages, in the order of their log times.
+        """Append messages in the order of log times: nanoseconds of UTC, topic, CDR.
 
-        Parameters
-        ----------
-        messages : sequence of (int, str, bytes)
-            Log time in nanoseconds of UTC, also used as publish time; name of a topic of the
-            writer; CDR.
+        A log time is also the publish time; the topic is one of the writer.
         """
         if messages:
             times, topics, payloads = zip(*messages, strict=True)
@@ -217,9 +207,8 @@ class LogStreamWriter:
     def write_columns(self, batch: Sequence[TopicBatch]) -> None:
         """Append messages of several topics, in the order of their log times.
 
-        The result equals that of messages encoded and written one by one.
-
-        Raise `LogError` if a message cannot be encoded; see `encode_groups`.
+        The result equals that of messages encoded and written one by one. Raise `LogError` if a
+        message cannot be encoded; see `encode_groups`.
         """
         blocks: list[Block] = []
         first = 0
@@ -248,24 +237,12 @@ class LogStreamWriter:
 
 
 class LogWriter(LogStreamWriter):
-    """Log that is being written.
+    """Log that is being written to `path`, under its active name; neither may exist.
 
     `flush` hands data to the operating system, and after `sync` they survive a power cut; only
-    `finish` renames the file to its final name, and `complete` leaves that to the caller.
-
-    Parameters
-    ----------
-    path : Path
-        Path of the finished log. Neither it nor its active name may exist.
-    created : int
-        Time of the attachments, in nanoseconds of UTC.
-
-    Raises
-    ------
-    LogError
-        If the log exists, or is being written.
-    OSError
-        If the folder or the file cannot be written.
+    `finish` renames the file to its final name, and `complete` leaves that to the caller. `created`
+    is the time of the attachments, in nanoseconds of UTC. Raise `LogError` if the log exists, or is
+    being written, `OSError` if the folder or the file cannot be written.
     """
 
     def __init__(
@@ -301,10 +278,7 @@ class LogWriter(LogStreamWriter):
         self.write_messages([(log_time, topic, data)])
 
     def flush(self) -> None:
-        """End the chunk and pass it to the operating system.
-
-        Raise `OSError` if the file cannot be written.
-        """
+        """End the chunk and pass it to the operating system; raise `OSError` if that fails."""
         super().flush()
         self._stream.flush()
 
@@ -319,10 +293,7 @@ class LogWriter(LogStreamWriter):
         self._synced = os.fstat(self._stream.fileno()).st_size
 
     def complete(self) -> None:
-        """Finish the log under its active name.
-
-        Raise `OSError` if the file cannot be written.
-        """
+        """Finish the log under its active name; raise `OSError` if it cannot be written."""
         self.end(self.path.name)
         self._stream.flush()
         self.sync()

@@ -72,9 +72,9 @@ class ChunkRow:
         return self.offset, self.length, self.index_length, self.size, self.start, self.end
 
     def continues(self, location: RecordLocation) -> bool:
-        """Return whether a message record continues this run of messages.
+        """Return whether a message record starts at the end of this run, which is not full.
 
-        The record must start at the end of the run, and the run must be below its size limit.
+        The run is full at its size limit.
         """
         is_next = self.offset + self.length == location.offset and not self.late
         is_next &= location.length < _RUN_LIMIT
@@ -93,12 +93,8 @@ class ChunkRow:
 def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
     """Return the row of a chunk, or of a message outside of chunks, from the start of its record.
 
-    Raise `McapError` if the head is too short, or a size is 2**63 or more.
-
-    Returns
-    -------
-    ChunkRow
-        Without channels; `index_length` is 0 for a chunk and -1 for a message.
+    It has no channels; `index_length` is 0 for a chunk and -1 for a message. Raise `McapError` if
+    the head is too short, or a size is 2**63 or more.
     """
     opcode, offset, length = location
     try:
@@ -116,8 +112,8 @@ def read_chunk_row(location: RecordLocation, head: bytes) -> ChunkRow:
 def read_chunk_index(content: bytes) -> ChunkRow:
     """Return the row of a chunk from its chunk index.
 
-    Raise `McapError` if an offset or a size is 2**63 or more. Raise `struct.error` if the
-    content is shorter than stated, or ends within an index offset.
+    Raise `McapError` if an offset or a size is 2**63 or more, `struct.error` if the content is
+    shorter than stated, or ends within an index offset.
     """
     start, end, offset, length, entries = CHUNK_INDEX.unpack_from(content)
     first = CHUNK_INDEX.size
@@ -141,31 +137,12 @@ def _row(sizes: tuple[int, int, int, int], start: int, end: int) -> ChunkRow:
 
 
 def not_empty(chunks: NDArray[np.void]) -> NDArray[np.void]:
-    """Remove empty chunks, which a hostile file may have in great numbers.
-
-    Parameters
-    ----------
-    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], of dtype `CHUNKS`
-    """
+    """Remove empty chunks from `CHUNKS`, which a hostile file may have in great numbers."""
     return chunks[(chunks["size"] > 0) | (chunks["length"] > _EMPTY)]
 
 
 def by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
-    """Sort chunks by the log times of their first messages.
-
-    Parameters
-    ----------
-    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        Sorted copy; chunks with equal times keep their order.
-    """
+    """Sort `CHUNKS` by the log times of their first messages; equal times keep their order."""
     return chunks[np.argsort(chunks["start"], kind="stable")]
 
 
@@ -176,19 +153,11 @@ _WINDOW = 1 << 14  # bytes per read: an hour has half a million records
 def walk_records(
     read: Callable[[int, int], bytes], start: int
 ) -> Iterator[tuple[int, int, int, bytes]]:
-    """Walk from record to record, while there are complete record heads.
+    """Yield opcode, offset and length of records, and a head, while there are complete heads.
 
-    Parameters
-    ----------
-    read : callable
-        Called with offset and length, returns bytes of the file; fewer at its end.
-
-    Yields
-    ------
-    opcode, offset, length : int
-        Location of the record, including opcode and length; it may exceed the file.
-    head : bytes
-        First bytes of the record, opcode and length included, or all of them.
+    Length and head include opcode and length; the record may exceed the file. The head has the
+    first bytes of the record, or all of them. `read` maps offset and length to bytes; fewer at the
+    end of the file.
     """
     window, first = b"", start
     while True:
@@ -207,14 +176,9 @@ def walk_records(
 def read_records(
     file: LocalFile | StoredFile, start: int, end: int
 ) -> Iterator[tuple[RecordLocation, bytes]]:
-    """Read the records of a section one by one.
+    """Read the records of a byte range, the section, one by one.
 
     Raise `McapError` if a record is longer than the section, or than `LIMIT`.
-
-    Parameters
-    ----------
-    start, end : int
-        Byte range of the section.
     """
     with io.BufferedReader(Section(file, start), 1 << 20) as stream:
         while start < end:

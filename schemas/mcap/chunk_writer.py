@@ -47,13 +47,7 @@ class Block(NamedTuple):
     rank: Int64  # [shape=(n,)] order of messages with equal log times
 
     def records(self) -> NDArray[np.void]:
-        """Encode the messages as MCAP records.
-
-        Returns
-        -------
-        np.ndarray [shape=(n,)], of dtype V`size`
-            One record per row, with opcode and length; `size` is the size of a complete record.
-        """
+        """Encode the messages as complete MCAP records [shape=(n,), dtype V`size`]."""
         size = self.payloads.dtype.itemsize
         records = np.empty(len(self.payloads), [("head", MESSAGE_HEAD), ("payload", f"V{size}")])
         head = records["head"]
@@ -95,14 +89,9 @@ class MessageRecords(NamedTuple):
 def join_messages(
     channels: Sequence[int], times: Sequence[int], payloads: Sequence[bytes]
 ) -> MessageRecords:
-    """Encode messages as records, in order.
+    """Encode at least one message as records, in order.
 
-    Parameters
-    ----------
-    channels : sequence of int
-        Channel ID of each message; at least one message.
-    times : sequence of int
-        Log time and publish time of each message, in nanoseconds; ascending.
+    `channels` are IDs; `times`, ascending in nanoseconds, are log time and publish time.
     """
     heads = np.empty(len(payloads), MESSAGE_HEAD)
     heads["opcode"] = Opcode.MESSAGE
@@ -124,13 +113,7 @@ def join_messages(
 
 
 def merge_blocks(blocks: Sequence[Block]) -> MessageRecords:
-    """Encode the messages of several blocks in the order of their log times.
-
-    Parameters
-    ----------
-    blocks : sequence of Block
-        At least one, none empty. Messages of equal log time are sorted by rank.
-    """
+    """Encode the messages of blocks, none empty, by log time; equal ones are sorted by rank."""
     times = np.concatenate([block.log_times for block in blocks])
     order = np.lexsort((np.concatenate([block.rank for block in blocks]), times))
     counts = [len(block.log_times) for block in blocks]
@@ -158,15 +141,9 @@ GATHERED_SPAN = 60 * NANOSECONDS  # ns, time span of separate chunks
 class ChunkWriter:
     """Writer of an MCAP file with indexed chunks in Zstandard compression.
 
-    Methods named as in `mcap.writer.Writer` have the same effect.
-
-    Parameters
-    ----------
-    chunk_size : int
-        Uncompressed bytes of records; the message that exceeds this is the last of its chunk.
-    chunk_span : int, optional
-        Maximum log time span in nanoseconds of a chunk made by `write`, unless the chunk is
-        smaller than 4 KiB; no limit by default.
+    Methods named as in `mcap.writer.Writer` have the same effect. The message that exceeds
+    `chunk_size`, uncompressed bytes of records, is the last of its chunk. A chunk made by `write`
+    spans at most `chunk_span` nanoseconds, by default any, unless it is smaller than 4 KiB.
     """
 
     def __init__(
@@ -187,13 +164,7 @@ class ChunkWriter:
         self._gathered = ChunkBuilder()  # chunk in progress of channels with separate chunks
 
     def start(self, profile: str, library: str) -> None:
-        """Write the magic bytes and the header.
-
-        Parameters
-        ----------
-        profile : str
-            Profile of the header: `ros2`, or empty for none.
-        """
+        """Write magic bytes and header, with the profile `ros2`, or empty for none."""
         self._stream.write(MAGIC)
         self._write(records.Header(profile, library))
 
@@ -215,13 +186,7 @@ class ChunkWriter:
     def copy_attachment(
         self, record: Iterable[bytes | memoryview], index: records.AttachmentIndex
     ) -> None:
-        """Write an attachment of another file.
-
-        Parameters
-        ----------
-        index : mcap.records.AttachmentIndex
-            Index entry of the attachment; its offset and length are replaced.
-        """
+        """Write an attachment of another file; offset and length of its index are replaced."""
         offset = self._stream.tell()
         length = 0
         for piece in record:
@@ -230,22 +195,13 @@ class ChunkWriter:
         self._attachments.append(replace(index, offset=offset, length=length))
 
     def copy_record(self, record: Iterable[bytes]) -> None:
-        """Write a record of another file, of a kind without index, in pieces.
-
-        The chunk in progress is written first.
-        """
+        """Write the chunk in progress, then another file's record without index, in pieces."""
         self.flush()
         for piece in record:
             self._stream.write(piece)
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Add a schema.
-
-        Returns
-        -------
-        int
-            Schema ID, from 1 on.
-        """
+        """Add a schema; return its ID, from 1 on."""
         schema = records.Schema(len(self._schemas) + 1, data, encoding, name)
         self._schemas.append(schema)
         self._chunk.content += encode(schema)
@@ -254,18 +210,7 @@ class ChunkWriter:
     def register_channel(
         self, topic: str, message_encoding: str, schema_id: int, metadata: dict[str, str]
     ) -> int:
-        """Add a channel.
-
-        Parameters
-        ----------
-        schema_id : int
-            Schema ID; 0 for none.
-
-        Returns
-        -------
-        int
-            Channel ID, from 1 on.
-        """
+        """Add a channel with a schema ID, 0 for none; return its ID, from 1 on."""
         channel = records.Channel(
             len(self._channels) + 1, topic, message_encoding, metadata, schema_id
         )
@@ -291,15 +236,7 @@ class ChunkWriter:
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
-        """Append a message.
-
-        Parameters
-        ----------
-        log_time : int
-            Nanoseconds of UTC, 0 to 2**63 - 1.
-        sequence : int
-            0 to 2**32 - 1.
-        """
+        """Append a message; times are nanoseconds, 0 to 2**63 - 1, `sequence` is below 2**32."""
         chunk = self._chunk
         chunk.entries[channel_id] += INDEX_ENTRY.pack(log_time, len(chunk.content))
         chunk.content += MESSAGE.pack(
@@ -318,9 +255,9 @@ class ChunkWriter:
     def add_messages(
         self, channels: Sequence[int], times: Sequence[int], payloads: Sequence[bytes]
     ) -> None:
-        """Append messages from channel IDs, log times and payloads.
+        """Append messages from channel IDs, ascending log times and payloads.
 
-        The publish time of a message is its log time; log times ascend.
+        The publish time of a message is its log time.
         """
         if len(payloads) > _FEW:
             self._append(join_messages(channels, times, payloads))
@@ -329,13 +266,7 @@ class ChunkWriter:
                 self.add_message(*message)
 
     def write(self, blocks: Sequence[Block]) -> None:
-        """Append blocks of messages, merged in the order of their log times.
-
-        Parameters
-        ----------
-        blocks : sequence of Block
-            Empty blocks are skipped.
-        """
+        """Append blocks of messages, merged by log time; empty blocks are skipped."""
         blocks = [block for block in blocks if len(block.log_times)]
         if blocks:
             self._append(merge_blocks(blocks))
@@ -354,21 +285,12 @@ class ChunkWriter:
             self._chunk = ChunkBuilder()
 
     def copy_chunk(self, chunk: StoredChunk) -> None:
-        """Write a chunk of another file unchanged, followed by its message index.
-
-        The chunk in progress is written first.
-        """
+        """Write the chunk in progress, then another file's chunk and message index unchanged."""
         self.flush()
         self._put(chunk)
 
     def copy_large_chunk(self, chunk: StoredChunk, length: int, data: Iterable[bytes]) -> None:
-        """Write a chunk of another file as `copy_chunk` does, with its data in pieces.
-
-        Parameters
-        ----------
-        length : int
-            Size of the data in bytes.
-        """
+        """Write a chunk as `copy_chunk` does, with data of `length` bytes in pieces."""
         self.flush()
         self._put_pieces(chunk, length, data)
 
@@ -381,10 +303,7 @@ class ChunkWriter:
     ) -> None:
         """Append the records of another file's chunk to the chunk in progress.
 
-        Parameters
-        ----------
-        span : int
-            Maximum log time span in nanoseconds of the joined chunk; a longer one is not joined.
+        A joined chunk spans at most `span` nanoseconds of log time; a longer one is not joined.
         """
         own = {number for number in chunk.entries if number in gathered} - set(dropped)
         rest = chunk.entries.keys() - own - set(dropped)

@@ -68,18 +68,11 @@ def read_chunks(
     chunks: NDArray[np.void],
     topics: TopicChoice | None = None,
 ) -> list[RawMessages]:
-    """Read the messages of the selected topics from chunks of a log.
+    """Read the messages of the selected topics from `CHUNKS` of a log.
 
-    Raise `LogError` if the log cannot be read, a chunk is damaged, an index does not match its
-    chunk, or no undamaged chunk defines the channel of a message.
-
-    Parameters
-    ----------
-    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        Rows of `file.chunks`.
-    topics : collection of str or callable, optional
-        Topics to read, or a predicate: None for all; empty for none, which only adds
-        definitions.
+    `topics` has names, or is a predicate: None for all; empty for none, which only adds
+    definitions. Raise `LogError` if the log cannot be read, a chunk is damaged, an index does not
+    match its chunk, or no undamaged chunk defines the channel of a message.
     """
     chunks = in_parts(file, chunks)
     apart = (chunks["part"] >= 0) | (chunks["size"] > LIMIT)
@@ -165,18 +158,10 @@ def read_in_batches(
 def in_parts(
     file: LogFile, chunks: NDArray[np.void], on_damage: OnDamage | None = None
 ) -> NDArray[np.void]:
-    """Split chunks larger than `LIMIT` into parts, and verify the checksums of these chunks.
+    """Split `CHUNKS` larger than `LIMIT` into parts, and verify the checksums of these chunks.
 
-    Raise `LogError` if the log cannot be read, or a large chunk is damaged.
-
-    Parameters
-    ----------
-    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-
-    Returns
-    -------
-    np.ndarray [shape=(m,)], of dtype `CHUNKS`
-        Sorted by start time if any chunk was split; a message larger than `LIMIT` is a part.
+    They are sorted by start time if any was split; a message larger than `LIMIT` is a part. Raise
+    `LogError` if the log cannot be read, or a large chunk is damaged.
     """
     large = (chunks["part"] < 0) & (chunks["index_length"] >= 0)
     large &= (chunks["size"] > LIMIT) | (chunks["length"] > LIMIT)
@@ -282,34 +267,20 @@ def _part_content(file: LogFile, offset: int, first: int, size: int) -> bytes:
 
 
 def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
-    """Verify the checksums of chunks.
+    """Verify the checksums of `CHUNKS`.
 
     Raise `LogError` if the log cannot be read, a chunk is damaged, or a record behind one is no
     message index.
-
-    Parameters
-    ----------
-    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        Rows of `file.chunks`.
     """
     for _ in read_in_batches(file, chunks, topics=()):
         pass
 
 
 def repeated_chunks(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Find the chunks that repeat an earlier chunk of the same file byte for byte.
+    """Return whether each of `CHUNKS` repeats an earlier chunk of the file byte for byte.
 
     Chunks of a single log time are excluded: a writer with one message per chunk writes equal
     chunks for equal messages.
-
-    Parameters
-    ----------
-    chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-        Rows of `file.chunks`.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], bool
     """
     repeated = np.zeros(len(chunks), bool)
     candidates: dict[tuple[int, ...], list[int]] = {}
@@ -508,10 +479,7 @@ class _Batch(NamedTuple):
     def _index_parts(self, starts: Int64, ends: Int64) -> Int64:
         """Walk through the message indexes of all chunks in parallel, one per chunk and step.
 
-        Returns
-        -------
-        np.ndarray [shape=(n, 4)]
-            Chunk number, channel ID, offset and size of the entries.
+        Return chunk number, channel ID, offset and size of the entries [shape=(n, 4)].
         """
         index_head = MESSAGE_INDEX_HEAD
         parts = [np.empty((0, 4), np.int64)]

@@ -52,10 +52,7 @@ class StoredChunk(NamedTuple):
         return np.frombuffer(self.entries[channel], INDEX_ENTRIES)["time"]
 
     def content(self) -> bytes:
-        """Decompress the records.
-
-        Raise `McapError` if the records are damaged.
-        """
+        """Decompress the records; raise `McapError` if they are damaged."""
         head = ChunkHead(0, 0, self.size, 0, self.compression, slice(None))
         return decompress(head, self.data)
 
@@ -74,14 +71,10 @@ _LOCAL = _Local()
 
 
 class ChunkBuilder:
-    """Builder of a chunk.
+    """Builder of a chunk; `entries` has the message index by channel, rows of `INDEX_ENTRIES`.
 
-    Attributes
-    ----------
-    entries : dict of int to bytearray
-        Message index by channel: rows of dtype `INDEX_ENTRIES`.
-    start, end : int
-        First and last log time of its messages, in nanoseconds; `LATEST` and 0 without messages.
+    `start` and `end` are its first and last log time, in nanoseconds; `LATEST` and 0 without
+    messages.
     """
 
     def __init__(self) -> None:
@@ -90,16 +83,10 @@ class ChunkBuilder:
         self.start, self.end = LATEST, 0
 
     def add_messages(self, data: Bytes, channels: Int64, entries: NDArray[np.void]) -> None:
-        """Append message records.
+        """Append concatenated message records [shape=(b,)] of channels [shape=(n,)], n >= 1.
 
-        Parameters
-        ----------
-        data : np.ndarray [shape=(b,)], uint8
-            Concatenated records.
-        channels : np.ndarray [shape=(n,)], int64
-            Channel ID of each record; n is 1 or more.
-        entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
-            Log time of each message, and its offset in the content of the complete chunk.
+        `entries` [shape=(n,), dtype `INDEX_ENTRIES`] have offsets in the content of the complete
+        chunk.
         """
         self.content += data.data
         numbers, firsts = np.unique(channels, return_index=True)
@@ -110,13 +97,7 @@ class ChunkBuilder:
         self.start, self.end = min(self.start, int(times.min())), max(self.end, int(times.max()))
 
     def add_chunk(self, chunk: StoredChunk, dropped: Collection[int] = ()) -> None:
-        """Append the records of a chunk, without the messages of the dropped channels.
-
-        Parameters
-        ----------
-        dropped : collection of int
-            Channel IDs; if they include all channels of the chunk, nothing is appended.
-        """
+        """Append a chunk's records without dropped channels; nothing if these are all of them."""
         kept = {channel: rows for channel, rows in chunk.entries.items() if channel not in dropped}
         if not kept:
             return
@@ -161,12 +142,8 @@ def compress_chunk(
 ) -> StoredChunk:
     """Compress the records of a chunk to its stored form.
 
-    Parameters
-    ----------
-    span : (int, int)
-        First and last log time of the messages, in nanoseconds.
-    entries : mapping of int to bytes-like
-        Message index by channel: rows of dtype `INDEX_ENTRIES`.
+    `span` has the first and last log time in nanoseconds, `entries` the message index by channel:
+    rows of dtype `INDEX_ENTRIES`.
     """
     data, crc = _LOCAL.zstd.compress(content), zlib.crc32(content)
     return StoredChunk(b"zstd", data, len(content), crc, *span, entries, content)
@@ -181,21 +158,9 @@ def decompress_together(
 ) -> tuple[Bytes, Int64] | None:
     """Decompress chunks and verify their checksums, if all are undamaged and use zstd.
 
-    Parameters
-    ----------
-    raw : np.ndarray [shape=(b,)], uint8
-        Buffer with the records of the chunks.
-    starts, lengths : np.ndarray [shape=(n,)], int64
-        Offset of each record, and its size in bytes, both including the record head.
-    limit : int
-        Maximum uncompressed size of all chunks together, in bytes.
-
-    Returns
-    -------
-    buffer : np.ndarray [shape=(c,)], uint8
-        Concatenated uncompressed records of all chunks.
-    sizes : np.ndarray [shape=(n,)], int64
-        Uncompressed bytes of each chunk.
+    `raw` has records with `starts` and `lengths` [shape=(n,)] in bytes, including the record head.
+    All chunks together have at most `limit` bytes uncompressed. Return the concatenated records,
+    and the uncompressed bytes of each chunk [shape=(n,)].
     """
     fixed = ZSTD_CHUNK_HEAD.itemsize
     if not _IS_POSSIBLE or (lengths < fixed).any():
@@ -267,32 +232,15 @@ class TooLargeError(McapError):
 
 
 def most_content(length: Any) -> Any:
-    """Return the maximum content size of a chunk that is opened, in bytes.
-
-    Parameters
-    ----------
-    length : int or np.ndarray
-        Size of the chunk record in bytes.
-    """
+    """Return the maximum content, in bytes, of a chunk record that is opened, by its bytes."""
     return _CLAIMED + _RATIO * length
 
 
 class ContentStream:
-    """Stream of the decompressed records of a chunk.
+    """Stream of the decompressed records of a chunk; `position` counts uncompressed bytes read.
 
-    Raise `McapError` if there is no chunk at the offset, or it is larger than hearthlog reads.
-
-    Parameters
-    ----------
-    read : callable
-        Called with offset and length, returns bytes of the file; fewer at its end.
-    offset : int
-        Offset of the chunk in the file.
-
-    Attributes
-    ----------
-    position : int
-        Number of uncompressed bytes read.
+    `read` maps offset and length to bytes; fewer at the end of the file. Raise `McapError` if there
+    is no chunk at the offset, or it is larger than hearthlog reads.
     """
 
     def __init__(self, read: Read, offset: int) -> None:
@@ -311,10 +259,7 @@ class ContentStream:
         self._stream = _decompressing(self.head.compression, io.BufferedReader(source, _PIECE))
 
     def read(self, length: int) -> bytes:
-        """Read the next bytes; fewer at the end.
-
-        Raise `McapError` if the data cannot be decompressed.
-        """
+        """Read the next bytes, fewer at the end; raise `McapError` if they are damaged."""
         parts = []
         left = min(length, self.head.size - self.position)
         try:
@@ -376,16 +321,9 @@ def _decompressing(compression: bytes, source: io.BufferedReader) -> Any:
 
 
 def stated_size(compression: bytes, data: bytes) -> int | None:
-    """Return the decompressed size stated by compressed data; None if there is none.
+    """Return the decompressed size stated by the first 32 bytes or more of data; None for none.
 
-    Raise `McapError` if no such data begin there.
-
-    Parameters
-    ----------
-    compression : bytes
-        `zstd`, `lz4`, or empty.
-    data : bytes
-        The first 32 bytes of the data, or more.
+    `compression` is `zstd`, `lz4`, or empty. Raise `McapError` if no such data begin there.
     """
     try:
         if compression == b"zstd":
@@ -411,10 +349,7 @@ class Part(NamedTuple):
 
 
 def read_parts(stream: ContentStream) -> Iterator[Part]:
-    """Read all records of a chunk, and verify its checksum at the end.
-
-    Raise `McapError` if the chunk is damaged.
-    """
+    """Read all records of a chunk, and verify its checksum; raise `McapError` if it is damaged."""
     held, first = bytearray(), 0  # offset of `held` in the content
     messages, others = array("q"), list[tuple[int, int]]()
     complete = 0  # bytes of complete records in `held`
@@ -442,10 +377,7 @@ def read_parts(stream: ContentStream) -> Iterator[Part]:
 def _next_records(
     held: bytearray, complete: int, end: int, messages: "array[int]", others: list[tuple[int, int]]
 ) -> tuple[int, int]:
-    """Walk through records; return the end of the last complete record.
-
-    The second number is the size of the next record if that is larger than `LIMIT`.
-    """
+    """Return the end of the last complete record, and the next one's size if over `LIMIT`."""
     while len(held) - complete >= min(MESSAGE.size, end - complete):
         if end - complete < HEAD.size:
             break

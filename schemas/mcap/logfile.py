@@ -172,33 +172,21 @@ class LogFile:
         return self._file.is_at(path)
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read bytes at an offset.
-
-        Raise `LogError` if the file cannot be read.
-        """
+        """Read bytes at an offset; raise `LogError` if the file cannot be read."""
         return self._file.read(offset, length)
 
     def read_into(self, out: memoryview, offset: int) -> None:
-        """Read bytes at an offset into a buffer.
+        """Read bytes at an offset into a buffer, filled partly at the end of the file.
 
         Raise `LogError` if the file cannot be read.
-
-        Parameters
-        ----------
-        out : memoryview
-            Filled from its start; partly at the end of the file.
         """
         self._file.read_into(out, offset)
 
     def record(self, location: RecordLocation) -> McapRecord | None:
         """Read a metadata record, an attachment, or another record without messages.
 
-        Raise `LogError` if the record is larger than `LIMIT`, damaged, or cannot be read.
-
-        Returns
-        -------
-        McapRecord or None
-            None for a chunk, a message, a message index, or a kind that MCAP does not define.
+        None for a chunk, a message, a message index, or a kind that MCAP does not define. Raise
+        `LogError` if the record is larger than `LIMIT`, damaged, or cannot be read.
         """
         if location.length > LIMIT:
             what = "an attachment" if location.opcode == Opcode.ATTACHMENT else "a record"
@@ -224,18 +212,7 @@ class LogFile:
     def with_channels(
         self, chunks: NDArray[np.void], channels: AbstractSet[int]
     ) -> NDArray[np.void]:
-        """Select the chunks that may have messages of the given channels.
-
-        Parameters
-        ----------
-        chunks : np.ndarray [shape=(n,)], of dtype `CHUNKS`
-            Rows of `chunks`.
-
-        Returns
-        -------
-        np.ndarray [shape=(m,)], of dtype `CHUNKS`
-            Includes chunks without a list of channels.
-        """
+        """Select `CHUNKS` with any of some channels, or without a list of channels."""
         may_have = [not ids or not ids.isdisjoint(channels) for ids in self.channel_sets]
         return chunks[np.array(may_have, bool)[chunks["channels"]]]
 
@@ -395,15 +372,10 @@ class LogFile:
         )
 
     def scan_new(self) -> NDArray[np.void]:
-        """Scan the records that were written since the last scan.
+        """Scan new records; return new chunks and runs of messages outside of chunks.
 
-        Raise `LogError` if a record is damaged, or the file cannot be read.
-
-        Returns
-        -------
-        np.ndarray [shape=(n,)], of dtype `CHUNKS`
-            New chunks and runs of messages outside of chunks, by start time. They are also added to
-            `chunks`.
+        They are rows of `CHUNKS` by start time, and also added to `chunks`. Raise `LogError` if a
+        record is damaged, or the file cannot be read.
         """
         rows = array("q")
         if self.partial:

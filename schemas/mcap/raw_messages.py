@@ -49,15 +49,7 @@ class RawMessages:
         return replace(self, offsets=self.offsets[rows], heads=self.heads[rows])
 
     def between(self, start: int | None, end: int | None) -> "RawMessages":
-        """Select the messages with start <= log time < end.
-
-        Parameters
-        ----------
-        start : int or None
-            Nanoseconds of UTC; None for the first message on.
-        end : int or None
-            Nanoseconds of UTC; None for up to the last message.
-        """
+        """Select the messages with start <= log time < end, in nanoseconds of UTC."""
         rows = slice(*bounds(self.log_times, start, end))
         if rows == slice(0, len(self)):
             return self
@@ -75,21 +67,9 @@ def in_order_of_time(parts: Sequence[RawMessages]) -> Iterator[tuple[RawMessages
 
 
 def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
-    """Return the range of times with start <= time < end.
+    """Return the first index, and that behind the last, of ascending times in [start, end).
 
-    Parameters
-    ----------
-    times : np.ndarray [shape=(n,)], int64
-        Ascending, in any unit.
-    start : int or None
-        In the same unit; None for no lower limit.
-    end : int or None
-        In the same unit; None for no upper limit.
-
-    Returns
-    -------
-    first, last : int
-        Index of the first of these times, and behind the last; equal if there are none.
+    They are equal if there are none.
     """
     first = 0 if start is None else int(np.searchsorted(times, start))
     last = len(times) if end is None else int(np.searchsorted(times, end))
@@ -97,18 +77,7 @@ def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
 
 
 def gather_heads(buffer: Bytes | bytes | memoryview, starts: Int64) -> NDArray[np.void]:
-    """Copy the heads of messages out of a buffer.
-
-    Parameters
-    ----------
-    buffer : bytes-like or np.ndarray [shape=(b,)], uint8
-    starts : np.ndarray [shape=(n,)], int64
-        Offsets of the message records in the buffer, at their opcodes.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], of dtype `MESSAGE_HEAD`
-    """
+    """Copy message heads [shape=(n,), dtype `MESSAGE_HEAD`] at opcodes out of a buffer."""
     if not len(starts):
         return np.empty(0, MESSAGE_HEAD)
     array = np.frombuffer(buffer, np.uint8)
@@ -125,21 +94,10 @@ CHUNK_HEAD_LIMIT = 64  # bytes that hold the head of a compressed chunk and the 
 def iterate_records(
     content: bytes | memoryview, start: int = 0, end: int | None = None
 ) -> Iterator[tuple[int, int, int]]:
-    """Iterate over the records in the content of a chunk.
+    """Yield the range, including the opcode, of each record in a chunk's content.
 
+    `start` is the offset of the first record, `end` of the end of the last one; by default all.
     Raise `McapError` if the last record is incomplete, or longer than the content.
-
-    Parameters
-    ----------
-    start : int
-        Offset of the first record in the content.
-    end : int, optional
-        End of the last record; None for the end of the content.
-
-    Yields
-    ------
-    start, end : int
-        Range of the record in the content, including its opcode.
     """
     last = len(content) if end is None else end
     unpack = HEAD.unpack_from
@@ -156,17 +114,9 @@ def iterate_records(
 
 
 def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, bytes]:
-    """Build the message index of a chunk.
+    """Build the message index of a chunk, from ascending offsets of the opcodes of messages.
 
-    Parameters
-    ----------
-    starts : np.ndarray [shape=(n,)], int64
-        Offsets of complete message records in the content, at their opcodes, ascending.
-
-    Returns
-    -------
-    dict of int to bytes
-        By channel, in the order of their first messages: rows of dtype `INDEX_ENTRIES`.
+    It has rows of `INDEX_ENTRIES` by channel, in the order of their first messages.
     """
     if not len(starts):
         return {}
@@ -188,17 +138,10 @@ def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, byte
 
 
 def find_chunk_heads(window: bytes) -> Iterator[int]:
-    """Search for the heads of compressed chunks, damaged or not.
+    """Yield ascending offsets of possible opcodes of compressed chunks, damaged or not.
 
-    Parameters
-    ----------
-    window : bytes
-        Any part of a file. A head is found only with `CHUNK_HEAD_LIMIT` bytes from its start.
-
-    Yields
-    ------
-    int
-        Offsets of possible chunk opcodes in the window, ascending.
+    `window` is any part of a file. A head is found only with `CHUNK_HEAD_LIMIT` bytes from its
+    start.
     """
     for match in _COMPRESSED.finditer(window):
         if match.start() >= _BEFORE_COMPRESSED:

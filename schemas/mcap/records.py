@@ -84,13 +84,7 @@ OTHER_SUFFIXES = (*_COMPRESSED, ".db3", ".bag")
 
 
 def not_mcap(start: bytes) -> str:
-    """Describe a file that does not start as MCAP.
-
-    Parameters
-    ----------
-    start : bytes
-        First 16 bytes of the file, or all of a shorter file.
-    """
+    """Describe a file that does not start as MCAP, from its first 16 bytes or all of them."""
     for magic, what in _OTHERS.items():
         if start.startswith(magic):
             return what
@@ -133,25 +127,10 @@ class _EscapedContent(_Content):
 
 
 def parse(opcode: int, content: bytes, *, escaped: bool = False) -> McapRecord | None:
-    r"""Parse a record without messages.
+    r"""Parse a record; None for a chunk, message, message index, or a kind unknown to MCAP.
 
-    Parameters
-    ----------
-    escaped : bool
-        Replace bytes that are not UTF-8 by `\xNN` instead of raising an error; different names
-        remain different.
-
-    Returns
-    -------
-    McapRecord or None
-        None for a chunk, a message, a message index, and a kind that MCAP does not define.
-
-    Raises
-    ------
-    McapError
-        If the record is shorter than its fields.
-    UnicodeDecodeError
-        If a text in the record is not UTF-8.
+    With `escaped`, bytes that are not UTF-8 become `\xNN`, so different names remain different;
+    else raise `UnicodeDecodeError`. Raise `McapError` if the record is shorter than its fields.
     """
     kind = _CLASSES.get(opcode)
     stream = _EscapedContent if escaped else _Content
@@ -170,17 +149,9 @@ def parse_escaped(opcode: int, content: bytes) -> tuple[McapRecord | None, bool]
 
 
 def read_footer(tail: bytes) -> records.Footer | None:
-    """Read the footer of a finished file.
+    """Read the footer from the last `FOOTER_SIZE` bytes of a file, or all of a shorter one.
 
-    Parameters
-    ----------
-    tail : bytes
-        Last `FOOTER_SIZE` bytes of the file, or all of a shorter file.
-
-    Returns
-    -------
-    mcap.records.Footer or None
-        None if the file does not end with a footer and the magic bytes.
+    None if the file does not end with a footer and the magic bytes.
     """
     if len(tail) < FOOTER_SIZE or tail[0] != Opcode.FOOTER or not tail.endswith(MAGIC):
         return None
@@ -221,14 +192,9 @@ def chunk_head(content: bytes | memoryview) -> ChunkHead:
 
 
 def begun_chunk_head(content: bytes | memoryview) -> ChunkHead:
-    """Read the head of a chunk from the start of its content, without checks.
+    """Read a chunk's head from its content up to the compressed records, without checks.
 
     Raise `McapError` if the content is too short.
-
-    Parameters
-    ----------
-    content : bytes-like
-        Chunk record without opcode and length, at least up to its compressed records.
     """
     try:
         start, end, size, crc, length = CHUNK.unpack_from(content)
@@ -242,14 +208,9 @@ def begun_chunk_head(content: bytes | memoryview) -> ChunkHead:
 
 
 def decompress(head: ChunkHead, content: bytes | memoryview) -> bytes:
-    """Decompress the records of a chunk, and verify their checksum.
+    """Decompress the records of a chunk, of `head.size` bytes, and verify their checksum.
 
     Raise `McapError` if the compression is unknown, or the data are damaged.
-
-    Returns
-    -------
-    bytes
-        Concatenated records: `head.size` bytes.
     """
     out = bytearray(head.size)
     decompress_into(memoryview(out), head, content)
@@ -257,14 +218,9 @@ def decompress(head: ChunkHead, content: bytes | memoryview) -> bytes:
 
 
 def decompress_into(out: memoryview, head: ChunkHead, content: bytes | memoryview) -> None:
-    """Decompress the records of a chunk into a buffer, and verify their checksum.
+    """Decompress records as `decompress` does, into a buffer of exactly `head.size` bytes.
 
     Raise `McapError` if the compression is unknown, or the data are damaged.
-
-    Parameters
-    ----------
-    out : memoryview
-        Exactly `head.size` bytes.
     """
     try:
         size = _DECOMPRESS[head.compression](content[head.data], out)
@@ -319,10 +275,7 @@ Definition = Schema | Channel
 
 
 class Definitions:
-    """Schemas and channels of a file by ID.
-
-    Also records IDs with contradictory definitions.
-    """
+    """Schemas and channels of a file by ID, and IDs with contradictory definitions."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -340,13 +293,7 @@ class Definitions:
         self._doubtful.add((type(record), record.id))
 
     def defines(self, number: int) -> bool:
-        """Return whether the type of a channel's messages is certain.
-
-        Returns
-        -------
-        bool
-            Whether the channel and its schema, if it has one, are defined without contradiction.
-        """
+        """Return whether a channel and its schema, if any, are defined without contradiction."""
         channel = self.channels.get(number)
         if channel is None or (Channel, number) in self._doubtful:
             return False

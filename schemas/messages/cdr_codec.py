@@ -33,25 +33,14 @@ _TRIED = 64  # number of layouts tried before rows are inspected one by one
 def encode_groups(
     typename: str, columns: Mapping[str, Column], count: int
 ) -> Iterator[tuple[Indices, NDArray[np.void]]]:
-    """Encode `count` messages from one column per field.
+    """Encode messages; yield indices [shape=(m,)] and payloads of those with equal string lengths.
 
-    Raise `LogError` if the type is unknown, an array of messages in it is not empty, or a message
-    would be larger than 100 MiB.
-
-    Parameters
-    ----------
-    columns : mapping from field path, such as "header.frame_id", to its values
-        Array of shape (count,) for a number, or a stamp in nanoseconds; of shape (count, k) for
-        an array of numbers, and (count, 0) for an array of messages, which must be empty; for a
-        string, one value for all messages or a sequence of `count`. Fields appended to the type
-        are optional.
-
-    Yields
-    ------
-    rows : np.ndarray [shape=(m,)], intp
-        Indices of messages with equal string lengths.
-    payloads : np.ndarray [shape=(m,)], of a structured dtype
-        Payloads, identical to those of the typestore.
+    `columns` maps field paths, such as "header.frame_id", to arrays of shape (count,) for a number,
+    or a stamp in nanoseconds; (count, k) for an array of numbers, and (count, 0) for an array of
+    messages, which must be empty; for a string, one value for all messages or a sequence of
+    `count`. Fields appended to the type are optional. Payloads have a structured dtype, and are
+    identical to those of the typestore. Raise `LogError` if the type is unknown, an array of
+    messages in it is not empty, or a message would be larger than 100 MiB.
     """
     kind = message_type(typename)
     arrays: dict[str, NDArray[Any]] = {}
@@ -74,10 +63,7 @@ def encode_groups(
 
 
 def encode_rows(typename: str, columns: Mapping[str, Column], count: int) -> list[bytes]:
-    """Encode `count` messages from one column per field into one `bytes` each.
-
-    Raise `LogError` as `encode_groups` does.
-    """
+    """Encode each message to `bytes`; raise `LogError` as `encode_groups` does."""
     payloads: list[bytes] = [b""] * count
     for rows, block in encode_groups(typename, columns, count):
         raw, size = block.tobytes(), block.dtype.itemsize
@@ -172,24 +158,12 @@ def decode_rows(  # noqa: PLR0913
     *,
     undecodable: UndecodableText = "strict",
 ) -> Fields:
-    """Decode messages of one type into one column per field.
+    """Decode messages of one type into one column [shape=(n, ...)] per field, as in `Columns`.
 
-    Raise `LogError` if a payload does not match the type, or a string in it is not UTF-8.
-
-    Parameters
-    ----------
-    buffer : np.ndarray [shape=(b,)], uint8
-        Bytes that contain the payloads.
-    offsets, sizes : np.ndarray [shape=(n,)], int64
-        Offset in the buffer and size in bytes of each payload.
-    undecodable : str
-        Handling of strings that are not UTF-8: "strict" raises an error, "replace" puts U+FFFD in
-        place of invalid bytes.
-
-    Returns
-    -------
-    dict of str to np.ndarray [shape=(n, ...)]
-        By field path, as in `Columns`; arrays of any length have no elements if n is 0.
+    `offsets` and `sizes` [shape=(n,)] are those of the payloads in `buffer`, in bytes. Strings that
+    are not UTF-8 raise an error if `undecodable` is "strict"; "replace" puts U+FFFD in place of
+    invalid bytes. Arrays of any length have no elements if n is 0. Raise `LogError` if a payload
+    does not match the type, or a string in it is not UTF-8.
     """
     parts = [
         (rows, _decode(layout.leaves, block, fields, undecodable))
@@ -218,26 +192,11 @@ def rows_by_layout(
     sizes: Int64,
     errors: dict[int, LogError] | None = None,
 ) -> Iterator[tuple[Layout, Indices, NDArray[np.void]]]:
-    """Group messages of one type by layout.
+    """Group messages by layout; yield it, their indices [shape=(m,)] and copies of the messages.
 
-    Raise `LogError` if a payload does not match the type.
-
-    Parameters
-    ----------
-    buffer : np.ndarray [shape=(b,)], uint8
-        Bytes that contain the payloads.
-    offsets, sizes : np.ndarray [shape=(n,)], int64
-        Offset in the buffer and size in bytes of each payload.
-    errors : dict of int to LogError, optional
-        Receives the error of each message that does not match the type, by row; the message is
-        skipped. Without it, the first error is raised.
-
-    Yields
-    ------
-    rows : np.ndarray [shape=(m,)], intp
-        Indices of the messages with the layout.
-    payloads : np.ndarray [shape=(m,)], of the dtype of the layout
-        Copy of the messages.
+    `offsets` and `sizes` [shape=(n,)] are those of the payloads in `buffer`, in bytes. `errors`
+    receives the error of each message that does not match the type, by row, and the message is
+    skipped; without it, raise the first error, a `LogError`.
     """
     for size, rows in _by_size(sizes):
         payloads = gather(buffer, offsets[rows], size)
@@ -421,14 +380,5 @@ def _scattered(parts: Sequence[tuple[Indices, Fields]], count: int) -> Fields:
 
 
 def ragged(column: NDArray[Any]) -> NDArray[np.object_]:
-    """Convert each row of an array to a separate object.
-
-    Parameters
-    ----------
-    column : np.ndarray [shape=(n, ...)]
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], object
-    """
+    """Convert each row of an array [shape=(n, ...)] to a separate object [shape=(n,)]."""
     return np.fromiter(column, object, len(column))

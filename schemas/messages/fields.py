@@ -69,19 +69,10 @@ def _type(base: str) -> str:
 
 
 def common_fields(definitions: Sequence[Mapping[str, Field]]) -> dict[str, Field]:
-    """Return the union of the fields of several definitions of a type, widened to fit all.
+    """Return the union of the fields of at least one definition, widened to fit all.
 
-    Raise `LogError` if no number type holds all values of a field, or the kinds of a field differ.
-
-    Parameters
-    ----------
-    definitions : sequence of mapping of str to Field
-        At least one, as `fields_of` returns them.
-
-    Returns
-    -------
-    dict of str to Field
-        By path: fields of the first definition in its order, then additional fields of others.
+    Fields of the first definition come in its order, then additional ones of others. Raise
+    `LogError` if no number type holds all values of a field, or the kinds of a field differ.
     """
     common = dict(definitions[0])
     for fields in definitions[1:]:
@@ -121,17 +112,11 @@ def _wide(path: str, one: Field, other: Field) -> Field:
 
 
 def lacking(kind: MessageType, paths: Collection[str]) -> list[str]:
-    """List the paths of fields that a file's definition lacks, or defines differently.
+    """List, sorted, the paths of fields that a file's definition lacks, or defines differently.
 
-    Fields appended to hearthlog types do not count: they have defaults.
-
-    Raise `LogError` if the definition contains itself, refers to an undefined type, or is too
-    large, or ROS 2 and hearthlog have no type of this name.
-
-    Returns
-    -------
-    list of str
-        Sorted.
+    Fields appended to hearthlog types do not count: they have defaults. Raise `LogError` if the
+    definition contains itself, refers to an undefined type, or is too large, or ROS 2 and hearthlog
+    have no type of this name.
     """
     theirs, ours = fields_of(kind), fields_of(message_type(kind.name))
     return sorted(p for p in paths if p not in theirs or not _fits(theirs[p], ours.get(p)))
@@ -164,20 +149,10 @@ def _plain(name: str) -> str:
 
 
 def difference(kind: MessageType, version: int) -> str:
-    """Describe how a file's definition of a type differs from every released definition.
+    """Return an error text if a file's definition differs from every released one; else empty.
 
-    Parameters
-    ----------
-    kind : MessageType
-        Type as defined in the file; ROS 2 or hearthlog must have a type of this name.
-    version : int
-        Schema version of the file's messages. Fields appended up to this version are required;
-        more may follow, as appended by a later version.
-
-    Returns
-    -------
-    str
-        Text for an error message; empty if there is no difference.
+    ROS 2 or hearthlog must have a type of this name. Fields appended up to `version`, the schema
+    version of the file's messages, are required; more may follow, as appended by a later version.
     """
     ours = message_type(kind.name).types
     for name in _built_on(ours, kind.name):

@@ -131,14 +131,7 @@ def store_of(typename: str) -> Typestore:
 
 
 def message(typename: str, **fields: Any) -> Any:
-    """Create a message.
-
-    Parameters
-    ----------
-    **fields : Any
-        Field values by name, as in rosbags. Fields appended to the type are optional, and have
-        defaults.
-    """
+    """Create a message from values by field, as in rosbags; appended fields have defaults."""
     absent = APPENDED.get(typename, {}).keys() - fields.keys()
     if absent:
         descriptions = dict(store_of(typename).fielddefs[typename][1])
@@ -165,13 +158,7 @@ def _default(description: tuple[Nodetype, Any], value: float | str | None = None
 
 
 def number_type(name: str) -> np.dtype[Any]:
-    """Return the dtype of a primitive number type.
-
-    Parameters
-    ----------
-    name : str
-        Name in message definitions, such as "float32" or "byte".
-    """
+    """Return the dtype of a number type in message definitions, such as "float32" or "byte"."""
     return np.dtype("uint8" if name in {"byte", "char"} else name)
 
 
@@ -181,13 +168,7 @@ def header(stamp: int, frame_id: str) -> Any:
 
 
 def time_message(nanoseconds: int) -> Any:
-    """Create a `builtin_interfaces/Time`.
-
-    Parameters
-    ----------
-    nanoseconds : int
-        UTC since 1970.
-    """
+    """Create a `builtin_interfaces/Time` of nanoseconds of UTC since 1970."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
 
@@ -210,13 +191,7 @@ def encode(fields: Any) -> bytes:
 
 
 def decode(data: bytes | memoryview, typename: str) -> Any:
-    """Decode one message from CDR.
-
-    Parameters
-    ----------
-    data : bytes or memoryview
-        Payload, in either byte order.
-    """
+    """Decode one message from CDR, in either byte order."""
     return store_of(typename).deserialize_cdr(data, typename)
 
 

@@ -94,10 +94,7 @@ class EmbeddingSource(NamedTuple):
 
 
 def check_microphone_name(name: str) -> str:
-    """Return the name of a microphone if it is valid in a ROS topic.
-
-    Raise `LogError` otherwise.
-    """
+    """Return a microphone's name; raise `LogError` if it is invalid in a ROS topic."""
     if not re.fullmatch(_MICROPHONE, name):
         raise LogError(
             f"microphone name {name!r} cannot be a topic: use lower-case letters, digits and "
@@ -107,15 +104,7 @@ def check_microphone_name(name: str) -> str:
 
 
 def check_scenario_name(name: str) -> str:
-    """Return the name of a scenario if it is valid in a ROS topic.
-
-    Raise `LogError` if the name has another form.
-
-    Parameters
-    ----------
-    name : str
-        Same form as a microphone name, up to 64 characters.
-    """
+    """Return a scenario's name, as a microphone's, up to 64 characters; else raise `LogError`."""
     if len(name) > _LONGEST_SCENARIO or not re.fullmatch(_MICROPHONE, name):
         raise LogError(
             f"scenario name {name[:80]!r} cannot be part of a topic: use up to "
@@ -142,13 +131,7 @@ def scenario_name(labelling: str) -> str:
 
 
 def review_labelling(scenario: str = "") -> str:
-    """Return the labelling of reviews: `review`, or `review/scenario/<name>` for a scenario.
-
-    Parameters
-    ----------
-    scenario : str
-        Name of the scenario; empty for the sounds of the home.
-    """
+    """Return the labelling of reviews: `review`, or `review/scenario/<name>` for a scenario."""
     return f"{REVIEW}/{scenario_labelling(scenario)}" if scenario else REVIEW
 
 
@@ -181,37 +164,19 @@ def relabelling(model: str) -> str:
 
 
 def parse_topic(name: str) -> TopicName | None:
-    """Split the name of a topic into its parts.
-
-    Returns
-    -------
-    TopicName or None
-        None if the topic does not belong to a microphone.
-    """
+    """Split a microphone's topic into its parts; None for another topic."""
     match = _TOPIC.fullmatch(name)
     return None if match is None else TopicName(match[1], match[2] or LIVE, match[3])
 
 
 def microphone_of(topic: str) -> str:
-    """Return the microphone of a topic; empty if there is none.
-
-    Parameters
-    ----------
-    topic : str
-        Name of the topic, such as "/mic/features".
-    """
+    """Return the microphone of a topic, such as "/mic/features"; empty if there is none."""
     parts = topic.split("/")
     return parts[1] if len(parts) > 2 else ""
 
 
 def label_topics(microphone: str, labelling: str, classes: Sequence[str]) -> tuple[Topic, Topic]:
-    """Return the topics of a labelling.
-
-    Parameters
-    ----------
-    classes : sequence of str
-        Class names in the order of the probabilities.
-    """
+    """Return the topics of a labelling; `classes` are in the order of the probabilities."""
     label, segment = (labelling_topic(microphone, labelling, kind) for kind in ("label", "segment"))
     return (
         Topic(label, message_types.LABEL, array_names={"probabilities": classes}),
@@ -230,15 +195,8 @@ def topics_of(  # noqa: PLR0913
 ) -> list[Topic]:
     """List the topics that a recorder writes for a microphone.
 
-    Parameters
-    ----------
-    classes : sequence of str or None
-        Class names in the order of the probabilities; None for a recorder without a model, which
-        writes no labels and no segments.
-    directions : bool
-        Whether the microphone is an array, with directions.
-    embedding : EmbeddingSource, optional
-        Source of the embeddings; None without a network.
+    `classes` are in the order of the probabilities; None for a recorder without a model, which
+    writes no labels and no segments.
     """
     statistics = {"mean": feature_names, "std": feature_names}
     topics = [

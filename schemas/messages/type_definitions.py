@@ -77,16 +77,7 @@ class Layout(NamedTuple):
     fixed: dict[str, Any]
 
     def fits(self, rows: NDArray[np.void]) -> NDArray[np.bool_]:
-        """Return whether each payload has this layout.
-
-        Parameters
-        ----------
-        rows : np.ndarray [shape=(n,)], of the dtype of the layout
-
-        Returns
-        -------
-        np.ndarray [shape=(n,)], bool
-        """
+        """Return whether each payload [shape=(n,)] has this layout."""
         fitting = np.ones(len(rows), bool)
         for name, value in self.fixed.items():
             fitting &= rows[name] == value
@@ -150,20 +141,9 @@ class TypeDefinition(NamedTuple):
 class LayoutWalk:
     """Walk through the fields of a message that records their layout.
 
-    Parameters
-    ----------
-    order : str
-        Byte order in numpy notation: "<" or ">".
-    length_at : callable
-        Called with the path of a string or sequence and the byte offset of its length word;
-        returns its length: for a string in bytes, with its end; for a wstring in UTF-16 units.
-    size : int
-        Maximum size of the message in bytes.
-
-    Attributes
-    ----------
-    end : int
-        Bytes walked through.
+    `order` is the byte order, "<" or ">"; `size` is the maximum bytes of the message, `end` those
+    walked through. `length_at` maps the path of a string or sequence and the byte offset of its
+    length word to its length: for a string in bytes, with its end; for a wstring in UTF-16 units.
     """
 
     def __init__(
@@ -341,29 +321,16 @@ class MessageType:
         return [*(field for field in self.types[name] if field[0] not in later), *absent]
 
     def layouts(self, size: int) -> list[Layout]:
-        """Return the most recent layouts of payloads of one size.
+        """Return the latest layouts of payloads of a size in bytes, not to be changed.
 
-        Parameters
-        ----------
-        size : int
-            Size of a payload in bytes.
-
-        Returns
-        -------
-        list of Layout
-            Empty before the first call of `layout_of`. The caller must not change it.
+        They are empty before the first call of `layout_of`.
         """
         return self._layouts.get(size, [])
 
     def layout_of(self, payload: memoryview, words: dict[int, bytes] | None = None) -> Layout:
-        """Find the layout of an encoded message.
+        """Find the layout of a message, CDR of either byte order.
 
         Raise `LogError` if the payload is not plain CDR, or not of this type.
-
-        Parameters
-        ----------
-        payload : memoryview
-            CDR of either byte order.
         """
         words = {} if words is None else words
         words[0] = bytes(payload[:2])
@@ -392,13 +359,9 @@ class MessageType:
     def layout_for(self, lengths: Mapping[str, int]) -> Layout:
         """Return the layout of a little-endian message with given string and sequence lengths.
 
-        Raise `LogError` if the type is not defined, contains itself, or has a field of an
+        They are, by field path, bytes of a string, with its end, or number of elements of a
+        sequence. Raise `LogError` if the type is not defined, contains itself, or has a field of an
         unsupported type, or the message would be larger than 100 MiB or have too many fields.
-
-        Parameters
-        ----------
-        lengths : mapping of str to int
-            By field path: bytes of a string, with its end, or number of elements of a sequence.
         """
         key = tuple(lengths.items())
         if key not in self._made:
@@ -414,15 +377,9 @@ class MessageType:
 def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageType:
     """Parse the definition of a message type.
 
-    Raise `LogError` if the encoding is unknown, or the text is larger than 256 KiB or cannot be
-    parsed.
-
-    Parameters
-    ----------
-    encoding : str
-        `ros2msg` or `ros2idl`; empty for the built-in definition of ROS 2 or hearthlog.
-    text : bytes
-        Definition in that encoding, in UTF-8; other bytes are allowed in comments only.
+    `encoding` is `ros2msg` or `ros2idl`; empty for the built-in definition of ROS 2 or hearthlog.
+    `text` is UTF-8; other bytes are allowed in comments only. Raise `LogError` if the encoding is
+    unknown, or the text is larger than 256 KiB or cannot be parsed.
     """
     ours = {key: fields for key, (_, fields) in store_of(name).fielddefs.items()}
     theirs = {key: fields for key, (_, fields) in defined_types(name, encoding, text).items()}
@@ -435,18 +392,10 @@ def message_type(name: str, encoding: str = "", text: bytes = b"") -> MessageTyp
 
 
 def defined_types(name: str, encoding: str, text: bytes) -> dict[str, Any]:
-    """Parse a message type and its nested types from a definition in a file.
+    """Parse a message type and its nested types to constants and fields, as in rosbags.
 
-    Returns
-    -------
-    dict of str to (list, list)
-        Constants and fields by ROS 2 name, as in rosbags; empty for the built-in definition of
-        ROS 2 or hearthlog.
-
-    Raises
-    ------
-    LogError
-        As `message_type`.
+    They are empty for the built-in definition of ROS 2 or hearthlog. Raise `LogError` as
+    `message_type`.
     """
     ours = store_of(name).fielddefs
     if name in ours and (not encoding or text == definition(name).encode()):

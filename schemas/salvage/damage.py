@@ -76,14 +76,9 @@ class DamageList:
         return len(self._damages)
 
     def add(self, damage: Damage, messages: dict[int, int] | None = None) -> None:
-        """Add a damage behind all others in the file.
+        """Add a damage behind all others in the file, with lost messages by channel.
 
         From the thousandth on, damages are merged, with the lost messages of the first of them.
-
-        Parameters
-        ----------
-        messages : dict of int to int, optional
-            Lost messages by channel; None for none.
         """
         if len(self._damages) == _DAMAGES:
             last, lost = self._damages.pop()
@@ -97,12 +92,8 @@ class DamageList:
     ) -> None:
         """Add messages of a channel without a definition so far.
 
-        Parameters
-        ----------
-        times : tuple of int
-            First and last log time in nanoseconds.
-        intact : IntactRecord
-            Record of the messages, behind those added before for the channel.
+        `times` are their first and last log time in nanoseconds, `intact` is their record, behind
+        those added before for the channel.
         """
         count, span, (start, _) = self.unnamed.get(channel, (0, times, (intact.offset, 0)))
         span = min(span[0], times[0]), max(span[1], times[1])
@@ -111,12 +102,8 @@ class DamageList:
     def add_unmet(self, unmet: Iterable[MissingMessages], names: Sequence[str]) -> None:
         """Add records of the index that the file lacks, unless known damages cover them.
 
-        If the index has more detail than a damage, the damage is updated.
-
-        Parameters
-        ----------
-        names : sequence of str
-            All missing metadata records and attachments of the index.
+        If the index has more detail than a damage, the damage is updated. `names` are all missing
+        metadata records and attachments of the index.
         """
         starts = [damage.start for damage, _ in self._damages]
         more: list[tuple[Damage, dict[int, int]]] = []
@@ -199,13 +186,8 @@ def loss_in(
 ) -> Loss:
     """Determine the losses in a byte range without any complete record.
 
-    Parameters
-    ----------
-    ends : collection of int
-        Possible ends of the damaged record.
-    index : Index or None
-        Index of the file. None without a valid index: the bytes of the range and the message
-        indexes behind it are used instead, as for a moved index.
+    `ends` are possible ends of the damaged record. Without a valid index the bytes of the range and
+    the message indexes behind it are used instead, as for a moved index.
     """
     if index is None or index.moved:
         return _loss_by_neighbours(reader, start, end, ends)

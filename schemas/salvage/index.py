@@ -191,16 +191,8 @@ class Index:
 def read_index(reader: RecordVerifier, limit: int) -> Index | None:
     """Read the index of a finished file, even if bytes before it are missing or were added.
 
-    Parameters
-    ----------
-    limit : int
-        Maximum size of the index in bytes.
-
-    Returns
-    -------
-    Index or None
-        None if the file is unfinished, or its index is damaged or larger than the limit. The index
-        of a finished file may be empty.
+    None if the file is unfinished, or its index is damaged or larger than `limit`, in bytes. The
+    index of a finished file may be empty.
     """
     end = reader.end - FOOTER_SIZE
     tail = reader.read(max(end, 0), FOOTER_SIZE)

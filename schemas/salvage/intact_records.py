@@ -58,13 +58,7 @@ LARGEST[[Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX]] = LIMIT
 
 
 def find_record_heads(window: bytes) -> list[int]:
-    """Search for the heads of records, damaged or not.
-
-    Returns
-    -------
-    list of int
-        Offsets in the window with a plausible pair of opcode and length, ascending.
-    """
+    """Return ascending offsets with a plausible opcode and length, of records damaged or not."""
     count = len(window) - HEAD.size + 1
     if count <= 0:
         return []
@@ -129,16 +123,9 @@ Whole = IntactChunk | LargeChunk | IntactAttachment | UnknownRecord
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:
-    """Find the offsets of messages and definitions in a chunk.
+    """Return ascending offsets of the opcodes of messages, and of definitions, in a chunk.
 
     Raise `McapError` if a record is damaged, or not allowed in a chunk.
-
-    Returns
-    -------
-    messages : np.ndarray [shape=(m,)], int64
-        Offsets of messages in the content, at their opcodes, ascending.
-    definitions : np.ndarray [shape=(d,)], int64
-        Offsets of schemas and channels, likewise.
     """
     messages, definitions = array("q"), array("q")
     kind, shortest = int(Opcode.MESSAGE), MESSAGE.size
@@ -157,13 +144,7 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
 
 
 def without_late(chunk: IntactChunk, content: bytes, messages: Int64) -> IntactChunk:
-    """Remove the messages with log times after `LAST_TIME` from a chunk.
-
-    Parameters
-    ----------
-    messages : np.ndarray [shape=(m,)], int64
-        First result of `split_content`.
-    """
+    """Remove `messages`, from `split_content`, with log times after `LAST_TIME` from a chunk."""
     times = gather_heads(content, messages)["log_time"].astype(np.uint64)
     starts = messages[times > LAST_TIME]
     late = index_messages(content, starts)
@@ -175,13 +156,7 @@ def without_late(chunk: IntactChunk, content: bytes, messages: Int64) -> IntactC
 def with_definitions(
     chunk: IntactChunk, content: bytes, starts: Int64
 ) -> tuple[IntactChunk, bytes]:
-    """Rewrite the definitions of a chunk; return the chunk and its content.
-
-    Parameters
-    ----------
-    starts : np.ndarray [shape=(d,)], int64
-        Offsets of the definitions in the content, at their opcodes.
-    """
+    """Rewrite the definitions of a chunk, at offsets of opcodes; return it and its content."""
     stored, content = _with_records(content, starts, map(encode, chunk.definitions))
     return chunk._replace(stored=stored), content
 
@@ -201,14 +176,9 @@ def _with_records(
 
 
 def read_definitions(content: bytes, starts: Int64) -> tuple[list[Definition], list[str]]:
-    """Read the schemas and channels of a chunk.
+    """Read the schemas and channels of a chunk, at offsets of opcodes.
 
     Raise `McapError` if one is damaged, or there are more than 524288.
-
-    Parameters
-    ----------
-    starts : np.ndarray [shape=(d,)], int64
-        Offsets in the content, at their opcodes.
     """
     if len(starts) > _DEFINITIONS_LIMIT:
         raise McapError("a chunk holds more definitions than can be kept")
@@ -234,17 +204,9 @@ def name_of(record: McapRecord | None) -> str:
 
 
 def span_of(entries: Mapping[int, bytes | bytearray]) -> tuple[int, int]:
-    """Return the first and the last log time of a message index.
+    """Return the first and last log time, in nanoseconds, of a message index; 0 and 0 if empty.
 
-    Parameters
-    ----------
-    entries : mapping of int to bytes-like
-        Rows of dtype `INDEX_ENTRIES`, by channel.
-
-    Returns
-    -------
-    first, last : int
-        Log times in nanoseconds; 0 and 0 if the index is empty.
+    It has rows of dtype `INDEX_ENTRIES`, by channel.
     """
     if not entries:
         return 0, 0
@@ -280,10 +242,7 @@ class AttachmentHead(NamedTuple):
 
 
 def attachment_head(raw: bytes | memoryview) -> AttachmentHead:
-    """Read the fields of an attachment before its data.
-
-    Raise `McapError` if the record ends within them.
-    """
+    """Read an attachment's fields before its data; raise `McapError` if it ends within them."""
     record = memoryview(raw)
     try:
         log_time, create_time, length = ATTACHMENT.unpack_from(record, HEAD.size)

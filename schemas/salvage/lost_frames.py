@@ -47,13 +47,9 @@ class FramePosition(NamedTuple):
 def read_marks(
     piece: IntactChunk | Message, definitions: Definitions
 ) -> dict[str, list[FramePosition]]:
-    """Read the gaps of a piece, and its first and last frames.
+    """Read the gaps of a piece, and its first and last frames, by microphone, in order.
 
-    Returns
-    -------
-    dict of str to list of Mark
-        By microphone, in the order of the piece. Messages that do not match the type of their
-        channel are skipped.
+    Messages that do not match the type of their channel are skipped.
     """
     marks: dict[str, list[FramePosition]] = {}
     content = b""
@@ -125,10 +121,7 @@ class LostFrames(NamedTuple):
 class FrameSearch:
     """Search for frames missing between the saved pieces of a log.
 
-    Parameters
-    ----------
-    salvage : Salvage
-        Salvage of the log; `before` must be called with each piece as it is read.
+    `before` must be called with each piece of `salvage` as it is read.
     """
 
     def __init__(self, salvage: Salvage) -> None:
@@ -145,17 +138,9 @@ class FrameSearch:
         return sorted(lost)
 
     def at_end(self, ends: Mapping[int, int]) -> list[LostFrames]:
-        """Return the frames missing behind the last piece.
+        """Return the frames missing behind the last piece; none ends before the last of `ends`.
 
-        Parameters
-        ----------
-        ends : mapping of int to int
-            Last saved log time of each channel, in nanoseconds of UTC.
-
-        Returns
-        -------
-        list of LostFrames
-            None ends before the last of these times.
+        These are the last saved log times by channel, in nanoseconds of UTC.
         """
         recorded_until: dict[str, int] = {}
         for number, end in ends.items():
@@ -272,17 +257,9 @@ _LAST = 0xFFFF  # maximum schema or channel ID
 
 
 def gap_channel(definitions: Definitions, microphone: str) -> int | None:
-    """Return the channel for the gaps of a microphone; define a missing one.
+    """Return the ID of a microphone's channel for gaps; add a missing one to `definitions`.
 
-    Parameters
-    ----------
-    definitions : Definitions
-        Extended if there is no such channel.
-
-    Returns
-    -------
-    int or None
-        Channel ID; None if the topic has a channel of another type.
+    None if the topic has a channel of another type.
     """
     name = topic(microphone, "gap")
     for number, channel in definitions.channels.items():

@@ -64,17 +64,9 @@ _LONGEST_PADDING = 1 << 12  # bytes of fields that a later version of the format
 
 
 class RecordVerifier:
-    """Reader of complete records at any offset of a file.
+    """Reader of complete records at any offset of a file, up to the offset `end`.
 
-    Parameters
-    ----------
-    end : int
-        Offset at which reading ends.
-
-    Attributes
-    ----------
-    work : int
-        Bytes read and decompressed so far.
+    `work` counts the bytes read and decompressed so far.
     """
 
     def __init__(self, file: LocalFile, end: int) -> None:
@@ -84,23 +76,15 @@ class RecordVerifier:
         self._file = file
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read bytes at an offset.
-
-        Raise `LogError` if the file cannot be read.
-        """
+        """Read bytes at an offset; raise `LogError` if the file cannot be read."""
         data = self._file.read(offset, max(min(length, self.end - offset), 0))
         self.work += len(data)
         return data
 
     def head(self, offset: int) -> tuple[int, int]:
-        """Read the opcode and the length of a record, without checks.
+        """Read opcode and stated bytes of a record, without checks.
 
         Raise `McapError` if the file ends within opcode and length.
-
-        Returns
-        -------
-        length : int
-            Stated size of its content, in bytes.
         """
         data = self.read(offset, HEAD.size)
         if len(data) < HEAD.size:
@@ -111,15 +95,8 @@ class RecordVerifier:
     def ends(self, offset: int, kind: int | None = None) -> tuple[int, int]:
         """Find the end of a record by its length, and by its inner lengths.
 
-        Raise `McapError` if the file ends within opcode and length.
-
-        Returns
-        -------
-        outer : int
-            Offset of the end by the length of the record.
-        inner : int
-            Offset of the end by the inner lengths. Equal to `outer` for a message or an invalid
-            record; `UNKNOWN` if the file ends before one of these lengths.
+        Both are equal for a message or an invalid record; the second is `UNKNOWN` if the file ends
+        before an inner length. Raise `McapError` if the file ends within opcode and length.
         """
         opcode, length = self.head(offset)
         outer = offset + HEAD.size + length
@@ -164,15 +141,9 @@ class RecordVerifier:
     def intact(self, offset: int, chained: int = 1) -> IntactRecord:
         """Read a complete record.
 
-        Raise `McapError` if there is no record at the offset, or it is incomplete.
-
-        Parameters
-        ----------
-        offset : int
-            Offset of the record.
-        chained : int
-            Number of plausible records required behind a message outside of chunks, which has no
-            other check. Counting ends at the first record that is no message.
+        A message outside of chunks has no check but `chained` plausible records required behind it,
+        up to the first that is no message. Raise `McapError` if there is no record at the offset,
+        or it is incomplete.
         """
         opcode, length = self.head(offset)
         if opcode == Opcode.CHUNK:
@@ -423,16 +394,10 @@ class RecordVerifier:
         return IntactRecord(offset, end, intact_records.read_message(raw))
 
     def message_index(self, offset: int) -> tuple[int, NDArray[np.void], int]:
-        """Read a message index.
+        """Read a message index: entries up to `LAST_TIME` [shape=(n,)], and the offset of its end.
 
-        Raise `McapError` if there is no message index, or it is damaged.
-
-        Returns
-        -------
-        entries : np.ndarray [shape=(n,)], of dtype `INDEX_ENTRIES`
-            Entries with log times up to `LAST_TIME`.
-        end : int
-            Offset of its end.
+        The entries are of dtype `INDEX_ENTRIES`. Raise `McapError` if there is no message index, or
+        it is damaged.
         """
         if self.head(offset)[0] != Opcode.MESSAGE_INDEX:
             raise McapError("here should be a message index")

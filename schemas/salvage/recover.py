@@ -123,11 +123,8 @@ class Thinning(NamedTuple):
 class SalvagedCopy:
     """Copy of the undamaged pieces of a log in a new log.
 
-    Parameters
-    ----------
-    chunk_span : int
-        Nanoseconds of log time up to which chunks are merged; 0 to copy them unchanged. Merging
-        puts embeddings in separate chunks.
+    Chunks are merged up to `chunk_span` nanoseconds of log time; 0 copies them unchanged. Merging
+    puts embeddings in separate chunks.
     """
 
     def __init__(
@@ -155,13 +152,7 @@ class SalvagedCopy:
         self._span = (1 << 63, 0)
 
     def write(self, name: str, progress: Progress) -> None:
-        """Write all pieces, and finish the file.
-
-        Parameters
-        ----------
-        progress : callable
-            Called after each piece with the processed share of the damaged log, 0 to 1.
-        """
+        """Write all pieces, and finish the file; report the share of the damaged log, 0 to 1."""
         for piece in self._salvage.pieces():
             self._add(piece)
             progress(self._salvage.offset / self._salvage.size)
@@ -396,21 +387,11 @@ def recover_log(
 ) -> Recovery:
     """Copy the undamaged parts of a log to a new log, and check the copy.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the completed share, 0 to 1; restarts at 0 for a second attempt.
-    chunk_span : int
-        Nanoseconds of log time up to which chunks are merged; 0 to copy them unchanged.
-
-    Raises
-    ------
-    NothingIntactError
-        If the source is not an MCAP file, or no part of it is undamaged.
-    LogError
-        If the source cannot be read, or the copy differs from the written messages.
-    OSError
-        If the copy cannot be written.
+    Progress is the completed share, 0 to 1; it restarts at 0 for a second attempt. Chunks are
+    merged up to `chunk_span` nanoseconds of log time; 0 copies them unchanged. Raise
+    `NothingIntactError` if the source is not an MCAP file, or no part of it is undamaged;
+    `LogError` if the source cannot be read, or the copy differs from the written messages;
+    `OSError` if the copy cannot be written.
     """
     definitions: list[Definition] = []
     profile = ""
@@ -442,18 +423,10 @@ def recover_log(
 def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[Path, Recovery]:
     """Replace a damaged log by its recovered copy, and keep the original as `*.damaged`.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the completed share, 0 to 1.
-
-    Raises
-    ------
-    NothingIntactError
-        If the log is not an MCAP file, or no part of it is undamaged.
-    LogError
-        If the log is being written, cannot be read, or a required file name is taken; or if the
-        copy cannot be written, or differs from the written messages.
+    Progress is the completed share, 0 to 1. Raise `NothingIntactError` if the log is not an MCAP
+    file, or no part of it is undamaged; `LogError` if the log is being written, cannot be read, or
+    a required file name is taken, or if the copy cannot be written, or differs from the written
+    messages.
     """
     path = log.with_name(stem(log) + SUFFIX)
     kept = path.with_name(path.name + ".damaged")
@@ -513,10 +486,7 @@ def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:
 
 @contextmanager
 def lock_abandoned(path: Path) -> Iterator[bool]:
-    """Hold the lock of a log, unless its writer holds it.
-
-    Raise `LogError` if the log cannot be read.
-    """
+    """Hold the lock of a log, unless its writer does; raise `LogError` if it cannot be read."""
     try:
         stream = os.fdopen(open_regular(path), "rb")
     except OSError as error:
@@ -549,8 +519,8 @@ def dropped_kinds(text: str | None) -> set[str]:
 def thinned_step(log: Path) -> int:
     """Return the thinning step of a log, an index of `STEPS`.
 
-    Raise `LogError` if the log cannot be read, is damaged, or was thinned in another way by a
-    newer version.
+    Raise `LogError` if the log cannot be read, is damaged, or was thinned in another way by a newer
+    version.
     """
     with LogFile(log) as file:
         texts = {record.get(THINNED, "") for record in provenance_records(file)}
@@ -563,10 +533,9 @@ def thinned_step(log: Path) -> int:
 def thin_log(source: Path, copy: Path, step: int) -> None:
     """Copy a log without the messages that a thinning step drops, and check the copy.
 
-    Other messages keep content and order. Channels stay defined, without messages.
-
-    Raise `LogError` if the log is damaged, or the copy differs from the written messages.
-    Raise `OSError` if the copy cannot be written.
+    Other messages keep content and order. Channels stay defined, without messages. Raise `LogError`
+    if the log is damaged, or the copy differs from the written messages, `OSError` if the copy
+    cannot be written.
     """
     with LogFile(source) as file:
         before = [record.get(THINNED_OF, "") for record in provenance_records(file)]

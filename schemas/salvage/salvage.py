@@ -123,14 +123,10 @@ class Salvage:
         return len(self._damages)
 
     def pieces(self) -> Iterator[Piece]:
-        """Read all undamaged pieces, in file order.
+        """Read all undamaged pieces: `Metadata`, `Message` or a member of `Whole`, in file order.
 
-        Yields
-        ------
-        mcap.records.Metadata, mcap.records.Message, or a member of `Whole`
-            Chunks have verified checksums and a rebuilt message index. They hold no messages of
-            undefined channels: in chunks with such messages, the other messages are yielded one by
-            one.
+        Chunks have verified checksums and a rebuilt message index. They hold no messages of
+        undefined channels: in chunks with such messages, the other messages are yielded one by one.
         """
         yield from self._walk()
         if self._index is not None:
