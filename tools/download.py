@@ -57,20 +57,11 @@ class _StartOverError(Exception):
 def download(
     url: str, path: Path, size: int, sha256: str, progress: Progress = ignore_progress
 ) -> None:
-    """Download a file, and give the file its name after verification.
+    """Download a file of `size` bytes, at most, to a path readable by all, after verification.
 
-    The data of an interrupted download stays next to the path, readable by this account alone, and
-    is resumed.
-
-    Raise `DownloadError` if the file cannot be downloaded, is not the expected file, or cannot be
-    written.
-
-    Parameters
-    ----------
-    path : Path
-        Destination, readable by all; an existing file is replaced.
-    size : int
-        Size of the file in bytes; no more is read.
+    An existing file is replaced. The data of an interrupted download stays next to the path,
+    readable by this account alone, and is resumed. Raise `DownloadError` if the file cannot be
+    downloaded, is not the expected file, or cannot be written.
     """
     _check_address(url)
     with _writing(path), _part(path, sha256) as part:

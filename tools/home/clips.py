@@ -71,17 +71,9 @@ class HomeClip:
 class ClipLibrary:
     """Recordings of a manifest, and synthetic sounds for labels without recordings.
 
-    Parameters
-    ----------
-    manifest : Path or None
-        As in `hearthlog train`, with any labels; None for synthetic sounds alone.
-
-    Raises
-    ------
-    DataError
-        If the manifest cannot be used.
-    SimulationError
-        If a clip is not audio, or is shorter than a frame.
+    The manifest is one for `hearthlog train`, with any labels; None for synthetic sounds alone.
+    Raise `DataError` if it cannot be used, `SimulationError` if a clip is not audio, or is shorter
+    than a frame.
     """
 
     def __init__(self, manifest: Path | None = SHIPPED) -> None:
@@ -98,31 +90,16 @@ class ClipLibrary:
         return self._clips.get(label, [])
 
     def of_groups(self, label: str, count: int, rng: np.random.Generator) -> Sequence[HomeClip]:
-        """Return the clips of some source groups of a label, drawn at random.
-
-        Parameters
-        ----------
-        count : int
-            Maximum number of groups.
-        """
+        """Return the clips of at most `count` source groups of a label, drawn at random."""
         groups = sorted({clip.source_group for clip in self.of(label)})
         chosen = {groups[place] for place in rng.permutation(len(groups))[:count]}
         return [clip for clip in self.of(label) if clip.source_group in chosen]
 
     def sound(self, clip: HomeClip, frames: int) -> Float32:
-        """Return a clip at a common loudness, cut or repeated to a length.
+        """Return a clip, cut or repeated to a length [shape=(frames * FRAME_SAMPLES,)].
 
-        Raise `SimulationError` if the recording is damaged.
-
-        Parameters
-        ----------
-        frames : int
-            At least 1.
-
-        Returns
-        -------
-        np.ndarray [shape=(frames * FRAME_SAMPLES,)], float32
-            Its loud frames have a mean square of 1; the ends are faded.
+        Its loud frames, of at least one, have a mean square of 1; the ends are faded. Raise
+        `SimulationError` if the recording is damaged.
         """
         samples = self._decoded(clip.name, lambda: _decode(clip))
         sound = _extended(samples, frames * FRAME_SAMPLES)
@@ -133,13 +110,7 @@ class ClipLibrary:
 
 
 class ArrayCache:
-    """The most recently used arrays, up to a number of bytes.
-
-    Parameters
-    ----------
-    limit : int
-        In bytes; the most recently used array is kept even if it is larger.
-    """
+    """The most recently used arrays, up to `limit` bytes; the last one even if it is larger."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -229,16 +200,7 @@ def _normalised(sound: Float64) -> Float32:
 
 
 def frame_powers(sound: Float64 | Float32) -> Float64:
-    """Return the mean square of each frame.
-
-    Parameters
-    ----------
-    sound : np.ndarray [shape=(n * FRAME_SAMPLES,)]
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float64
-    """
+    """Return the mean square of each frame [shape=(n,)] of a sound [shape=(n * FRAME_SAMPLES,)]."""
     frames = sound.reshape(-1, FRAME_SAMPLES)
     power: Float64 = np.einsum("ij,ij->i", frames, frames, dtype=np.float64) / FRAME_SAMPLES
     return power

@@ -60,12 +60,8 @@ def attenuation(room: str, microphone: str) -> float:
 class Rooms:
     """The acoustics of a home from the position of a microphone.
 
-    Raise `SimulationError` if there is no such room.
-
-    Attributes
-    ----------
-    floor : np.ndarray [shape=(PERIOD_FRAMES, FRAME_SAMPLES)], float32
-        Periodic noise of the room.
+    `floor` [shape=(PERIOD_FRAMES, FRAME_SAMPLES)] is periodic noise of the room. Raise
+    `SimulationError` if there is no such room.
     """
 
     def __init__(self, microphone: str, seed: int) -> None:
@@ -82,15 +78,9 @@ class Rooms:
         self._responses: dict[str, Float64] = {}
 
     def received(self, sound: Float32, room: str) -> Float32:
-        """Return a sound of a room as received by the microphone.
+        """Return a sound [shape=(n * FRAME_SAMPLES,)] of a room as received by the microphone.
 
-        Parameters
-        ----------
-        sound : np.ndarray [shape=(n * FRAME_SAMPLES,)], float32
-
-        Returns
-        -------
-        np.ndarray [shape=((n + TAIL_FRAMES) * FRAME_SAMPLES,)], float32
+        The result has shape ((n + TAIL_FRAMES) * FRAME_SAMPLES,).
         """
         if room not in self._responses:
             self._responses[room] = self._response(room)
@@ -206,13 +196,7 @@ class Composition:
         }
 
     def samples(self, first: int, count: int) -> Int16:
-        """Compose frames.
-
-        Returns
-        -------
-        np.ndarray [shape=(count, FRAME_SAMPLES)], int16
-            The same samples in blocks of any size.
-        """
+        """Compose frames [shape=(count, FRAME_SAMPLES)], the same in blocks of any size."""
         mix = self._background(first, count)
         for sound in self._sounds(first, first + count):
             begin, end = max(sound.start, first), min(_audible_until(sound), first + count)
@@ -231,24 +215,14 @@ class Composition:
             yield AudibleSound(sound, np.float64(self._gain(sound) ** 2) * self._loudness(sound)[0])
 
     def floor_power(self, first: int, count: int) -> Float64:
-        """Return the mean square of the steady noise.
-
-        Returns
-        -------
-        np.ndarray [shape=(count,)], float64
-        """
+        """Return the mean square of the steady noise [shape=(count,)]."""
         power = np.full(count, self._steady_powers[""])
         for name, gains in self._gains(first, count).items():
             power += self._steady_powers[name] * gains[1:] ** 2
         return power
 
     def busy(self, first: int, count: int) -> Bool:
-        """Return which frames contain more than periodic noise.
-
-        Returns
-        -------
-        np.ndarray [shape=(count,)], bool
-        """
+        """Return which frames contain more than periodic noise."""
         busy = np.zeros(count, bool)
         for sound in self._sounds(first, first + count):
             busy[max(sound.start - first, 0) : max(_audible_until(sound) - first, 0)] = True
@@ -261,12 +235,7 @@ class Composition:
         return tuple(name for name, gains in self._gains(frame, 1).items() if gains[1] > 0.0)
 
     def steady(self, state: tuple[str, ...]) -> Int16:
-        """Compose a period of steady noise alone.
-
-        Returns
-        -------
-        np.ndarray [shape=(PERIOD_FRAMES, FRAME_SAMPLES)], int16
-        """
+        """Compose a period of steady noise alone [shape=(PERIOD_FRAMES, FRAME_SAMPLES)]."""
         mix = self._rooms.floor.copy()
         for name in state:
             mix += self._rooms.steady[name]
@@ -332,12 +301,8 @@ class FeatureStream:
     """The features of a composition, in the order of the frames.
 
     Features are looked up if a frame and its predecessor contain only steady noise, whose features
-    are periodic. Other frames are composed and their features computed.
-
-    Parameters
-    ----------
-    features : FeatureSet
-        Its values of a frame must depend only on the frame and its predecessor.
+    are periodic. Other frames are composed and their features computed. A frame's features must
+    depend only on the frame and its predecessor.
     """
 
     def __init__(self, composition: Composition, features: FeatureSet) -> None:
@@ -347,12 +312,7 @@ class FeatureStream:
         self._tables: dict[tuple[str, ...], Float32] = {}
 
     def __call__(self, first: int, count: int) -> Float32:
-        """Return the features of frames, bit-identical to the features of their samples.
-
-        Returns
-        -------
-        np.ndarray [shape=(count, d)], float32
-        """
+        """Return features [shape=(count, d)], bit-identical to the features of the samples."""
         before = 1 if first else 0
         busy = self._composition.busy(first - before, count + before)
         computed = busy[before:].copy()
@@ -393,12 +353,7 @@ def _quantised(mix: Float32) -> Int16:
 
 
 def full_scale(samples: Int16) -> Float32:
-    """Convert samples to floats as an audio file reader does.
-
-    Parameters
-    ----------
-    samples : np.ndarray, int16
-    """
+    """Convert samples to floats as an audio file reader does."""
     return samples.astype(np.float32) / np.float32(32768.0)
 
 

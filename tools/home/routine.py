@@ -174,14 +174,9 @@ class Habits:
 
 
 def plan_days(days: int, library: ClipLibrary, habits: Habits) -> HomePlan:
-    """Plan days from midnight to midnight.
+    """Plan 1 to 3660 days from midnight to midnight; fewer days give the beginning of more.
 
     Raise `SimulationError` if `days` or the seed is out of range.
-
-    Parameters
-    ----------
-    days : int
-        From 1 to 3660. Fewer days give the beginning of more.
     """
     if not 1 <= days <= MOST_DAYS:
         raise SimulationError(f"a home is simulated for 1 to {MOST_DAYS} days, not {days}")
@@ -453,16 +448,8 @@ def plan_short_day(minutes: float, library: ClipLibrary, seed: int) -> HomePlan:
     """Plan a day of a person living alone, compressed into some minutes.
 
     A shorter day has less silence between the sounds, and then fewer of them (10 minutes hold about
-    three quarters of what 24 do).
-
-    Raise `SimulationError` if `minutes` or `seed` lies beyond its limits.
-
-    Parameters
-    ----------
-    minutes : float
-        At least a frame, at most 1440.
-    seed : int
-        Not negative.
+    three quarters of what 24 do). Raise `SimulationError` if `minutes` is less than a frame or
+    above 1440, or the seed is negative.
     """
     frames = round(minutes * 60.0 / FRAME_SECONDS) if 0 < minutes <= _MAX_MINUTES else 0
     if frames < 1:

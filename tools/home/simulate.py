@@ -42,25 +42,12 @@ def record_composition(
     device: str = "simulated home",
     progress: Progress = ignore_progress,
 ) -> list[Path]:
-    """Write the logs of a simulated home as a recorder would.
+    """Write the logs of a simulated home as a recorder would, from a time in nanoseconds of UTC.
 
     The complete sound is composed only for a model that uses embeddings; for other models most of
-    it is not.
-
-    Parameters
-    ----------
-    settings : Settings
-        Its model labels the sound, with embeddings of its network if it uses any; clips are not
-        kept.
-    start : int
-        Time of the first sample in nanoseconds of UTC.
-
-    Raises
-    ------
-    ModelError
-        If the model cannot be used, or its embedding network is missing.
-    LogError
-        If a log exists, or cannot be written.
+    it is not. The model of the settings labels the sound; clips are not kept. Raise `ModelError` if
+    the model cannot be used, or its embedding network is missing, `LogError` if a log exists, or
+    cannot be written.
     """
     model = None if settings.model is None else load_model(settings.model)
     classifier = None if model is None else Classifier(model)
@@ -189,10 +176,7 @@ def truth_of(composition: Composition) -> Truth:
 
 
 def write_truth(truth: Truth, spans: Path, events: Path) -> None:
-    """Write a label track for Audacity, and a table of the sounds.
-
-    Raise `OSError` if one of the files cannot be written.
-    """
+    """Write a label track for Audacity, and a table of the sounds; raise `OSError` on failure."""
     with spans.open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(f"{start:.6f}\t{end:.6f}\t{label}\n" for start, end, label in truth.spans)
     with events.open("w", encoding="utf-8", newline="") as file:
@@ -257,25 +241,11 @@ _CLIP_SECONDS = (3.0, 5.0)
 
 
 def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
-    """Write clips of 3 to 5 s of every sound, and a manifest of them.
+    """Write clips of 3 to 5 s of every sound, and a manifest of them, `manifest.csv`; return it.
 
-    Raise `SimulationError` if the folder is not empty or cannot be written, or if one of the
-    numbers is too low.
-
-    Parameters
-    ----------
-    folder : Path
-        Must be new or empty.
-    clips_per_class : int
-        From 1.
-    seed : int
-        Not negative. The same arguments give the same bytes.
-
-    Returns
-    -------
-    Path
-        `manifest.csv` in the folder: path (relative to the folder), label, source_group (one per
-        clip), source, licence, seconds.
+    It has path (relative to the folder), label, source_group (one per clip), source, licence,
+    seconds. The same arguments give the same bytes. Raise `SimulationError` if the folder is not
+    empty or cannot be written, there is less than one clip per class, or the seed is negative.
     """
     if clips_per_class < 1:
         raise SimulationError(f"a training set has at least 1 clip a class, not {clips_per_class}")
@@ -303,29 +273,15 @@ def write_training_set(folder: Path, clips_per_class: int, seed: int) -> Path:
 
 
 def write_day(path: Path, minutes: float, seed: int, manifest: Path | None = SHIPPED) -> Truth:
-    """Write a day of a person living alone, compressed into some minutes.
+    """Write a day of a person living alone, compressed into some minutes, as FLAC, 16 kHz mono.
 
     The true labels are written next to the audio, as a label track for Audacity (`.txt`), and the
-    sounds one by one as a table (`.csv`).
+    sounds one by one as a table (`.csv`). The same arguments give the same bytes. Without manifest,
+    all sounds are synthetic.
 
-    Parameters
-    ----------
-    path : Path
-        A new FLAC file, 16 kHz mono; written block by block.
-    minutes : float
-        At least a frame, at most 1440.
-    seed : int
-        Not negative. The same arguments give the same bytes.
-    manifest : Path or None
-        Manifest of the clips; None for synthetic sounds alone.
-
-    Raises
-    ------
-    SimulationError
-        If one of the files exists or cannot be written, if the name does not end in `.flac`, or if
-        `minutes` or `seed` lies beyond its limits.
-    DataError
-        If the manifest cannot be used.
+    Raise `SimulationError` if one of the files exists or cannot be written, if the name does not
+    end in `.flac`, if `minutes` is less than a frame or above 1440, or the seed is negative;
+    `DataError` if the manifest cannot be used.
     """
     spans, events = path.with_suffix(".txt"), path.with_suffix(".csv")
     if path.suffix != ".flac":

@@ -29,21 +29,9 @@ Range = tuple[float, float]
 class Train:
     """Successive syllables, coughs or knocks: runs of them, and pauses between the runs.
 
-    Parameters
-    ----------
-    samples : int
-        Samples of the sound, at 16 kHz.
-    length, gap : (float, float)
-        Shortest and longest element, and gap between two elements of a run, in seconds.
-    pause : (float, float)
-        Shortest and longest pause between two runs, in seconds.
-
-    Attributes
-    ----------
-    starts : np.ndarray [shape=(count,)], intp
-        First samples of the elements.
-    lengths : np.ndarray [shape=(count,)], float64
-        Lengths of the elements in samples.
+    `length`, `gap` (between two elements of a run) and `pause` (between two runs) are shortest and
+    longest values, in seconds. `starts` [shape=(count,)] and `lengths` [shape=(count,), float64] of
+    the elements are in samples, at 16 kHz.
     """
 
     def __init__(  # noqa: PLR0913 - five ranges describe a rhythm
@@ -70,28 +58,14 @@ class Train:
         self.count = len(self.starts)
 
     def ends(self) -> Indices:
-        """Return the samples at which elements end, within the sound.
-
-        Returns
-        -------
-        np.ndarray [shape=(m,)], intp
-        """
+        """Return the samples at which elements end, within the sound."""
         ends = (self.starts + self.lengths).astype(np.intp)
         return ends[ends < self._samples]
 
     def envelope(self, gains: Float64, attack: float, release: float) -> Float64:
-        """Return an envelope that rises and falls with each element.
+        """Return an envelope [shape=(samples,)] that rises and falls with each element.
 
-        Parameters
-        ----------
-        gains : np.ndarray [shape=(count,)], float64
-            Height of each element.
-        attack, release : float
-            Shares of an element for the rise and the fall, 0 to 1.
-
-        Returns
-        -------
-        np.ndarray [shape=(samples,)], float64
+        `gains` [shape=(count,)] are heights, `attack` and `release` shares of an element, 0 to 1.
         """
         corners = np.array([0.0, attack, 1.0 - release, 1.0])
         at = self.starts[:, np.newaxis] + self.lengths[:, np.newaxis] * corners
@@ -99,12 +73,7 @@ class Train:
         return np.interp(np.arange(self._samples), at.ravel(), height.ravel())
 
     def position(self) -> Float64:
-        """Return the position in each element, from 0 at its start to 1 at its end.
-
-        Returns
-        -------
-        np.ndarray [shape=(samples,)], float64
-        """
+        """Return the position in each element [shape=(samples,)], from 0 to 1."""
         at = self.starts[:, np.newaxis] + self.lengths[:, np.newaxis] * np.array([0.0, 1.0])
         return np.interp(np.arange(self._samples), at.ravel(), np.tile([0.0, 1.0], self.count))
 
@@ -118,22 +87,11 @@ def voiced(  # noqa: PLR0913 - a voice is these
     tract: float,
     breath: float = 0.05,
 ) -> Float64:
-    """Pass a glottal source through formants that glide from vowel to vowel.
+    """Pass a glottal source through formants that glide from vowel to vowel [shape=(samples,)].
 
-    The formants are those of Peterson & Barney (1952).
-
-    Parameters
-    ----------
-    pitch : np.ndarray [shape=(samples,)], float64
-        In hertz.
-    tract : float
-        Factor of the formants; 1 for a man.
-    breath : float
-        Standard deviation of the noise in the source, whose sawtooth reaches from -1 to 1.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
+    The formants are those of Peterson & Barney (1952), times `tract`, 1 for a man. `pitch` is in
+    hertz. `breath` is the standard deviation of the noise in the source, whose sawtooth reaches
+    from -1 to 1.
     """
     samples = len(pitch)
     source = sawtooth(pitch) + breath * rng.standard_normal(samples)
@@ -152,17 +110,9 @@ def voiced(  # noqa: PLR0913 - a voice is these
 
 
 def sawtooth(pitch: Float64) -> Float64:
-    """Return a sawtooth of a varying pitch, its edges rounded (polyBLEP) against aliases.
+    """Return a sawtooth, -1 to 1, of a varying pitch in hertz, below 8000 [shape=(samples,)].
 
-    Parameters
-    ----------
-    pitch : np.ndarray [shape=(samples,)], float64
-        In hertz, below 8000.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
-        From -1 to 1.
+    Its edges are rounded (polyBLEP) against aliases.
     """
     step = pitch / SAMPLE_RATE
     phase = np.cumsum(step) % 1.0
@@ -178,20 +128,10 @@ def _resonance(frequency: float, bandwidth: float) -> tuple[float, float]:
 
 
 def ring(hits: Float64, frequency: float, seconds: float) -> Float64:
-    """Return decaying sines, as from struck objects.
+    """Return decaying sines [shape=(samples,)], as from struck objects.
 
-    Parameters
-    ----------
-    hits : np.ndarray [shape=(samples,)], float64
-        Amplitude of the sine that begins at each sample, mostly 0.
-    frequency : float
-        In hertz; silence from 8000 on.
-    seconds : float
-        Time in which a sine decays to 1/e.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
+    `hits` has the amplitude of the sine that begins at each sample, mostly 0; `frequency` is in
+    hertz, silence from 8000 on; a sine decays to 1/e in `seconds`.
     """
     if frequency >= SAMPLE_RATE / 2:
         return np.zeros(len(hits))
@@ -201,98 +141,38 @@ def ring(hits: Float64, frequency: float, seconds: float) -> Float64:
 
 
 def impulses(samples: int, at: Indices, gains: Float64) -> Float64:
-    """Return impulses at some samples, and 0 elsewhere.
-
-    Parameters
-    ----------
-    at : np.ndarray [shape=(n,)], intp
-        Samples of the impulses, below `samples`.
-    gains : np.ndarray [shape=(n,)], float64
-        Their heights.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
-    """
+    """Return impulses of some heights at samples below `samples`, and 0 elsewhere."""
     hits = np.zeros(samples)
     hits[at] = gains
     return hits
 
 
 def decays(samples: int, at: Indices, seconds: float, gains: Float64 | None = None) -> Float64:
-    """Return an envelope that jumps at some samples and decays after each of them.
+    """Return an envelope that jumps at some samples and decays to 1/e in `seconds`, at 16 kHz.
 
-    Parameters
-    ----------
-    samples : int
-        Samples of the sound, at 16 kHz.
-    at : np.ndarray [shape=(n,)], intp
-        Samples at which it jumps, below `samples`.
-    seconds : float
-        Time in which it decays to 1/e.
-    gains : np.ndarray [shape=(n,)], float64, optional
-        Heights of the jumps; 1 by default.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
+    `gains` are the heights of the jumps; 1 by default.
     """
     hits = impulses(samples, at, np.ones(len(at)) if gains is None else gains)
     return lfilter([1.0], [1.0, -np.exp(-1.0 / (seconds * SAMPLE_RATE))], hits)
 
 
 def band_noise(rng: np.random.Generator, samples: int, low: float, high: float) -> Float64:
-    """Return noise between two frequencies, of about power 1.
-
-    Parameters
-    ----------
-    samples : int
-        Samples of the sound, at 16 kHz.
-    low, high : float
-        Edges of the band in hertz, above 0 and below 8000.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
-    """
+    """Return noise, of about power 1, between two frequencies in hertz, above 0 and below 8000."""
     sos = butter(2, (low, high), "bandpass", fs=SAMPLE_RATE, output="sos")
     return sosfilt(sos, rng.standard_normal(samples)) * np.sqrt(SAMPLE_RATE / 2 / (high - low))
 
 
 def wander(rng: np.random.Generator, samples: int, rate: float, depth: float) -> Float64:
-    """Return a random factor about 1 that changes slowly.
-
-    Parameters
-    ----------
-    samples : int
-        Samples of the sound, at 16 kHz.
-    rate : float
-        New values a second, between which the factor glides.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
-    """
+    """Return a random factor about 1 that glides to `rate` new values a second, at 16 kHz."""
     points = int(samples / SAMPLE_RATE * rate) + 2
     values = np.exp(depth * rng.standard_normal(points))
     return np.interp(np.arange(samples) * (rate / SAMPLE_RATE), np.arange(points), values)
 
 
 def vibrato(samples: int, rate: float, depth: float) -> Float64:
-    """Return a factor about 1 that swings as a sine.
+    """Return a factor about 1 that swings as a sine, `rate` times a second, at 16 kHz.
 
-    Parameters
-    ----------
-    samples : int
-        Samples of the sound, at 16 kHz.
-    rate : float
-        Swings a second.
-    depth : float
-        Largest distance from 1.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
+    `depth` is the largest distance from 1.
     """
     return 1.0 + depth * np.sin(np.arange(samples) * (2.0 * np.pi * rate / SAMPLE_RATE))
 
@@ -321,35 +201,17 @@ class RoomTone:
         self._state = np.zeros(1)
 
     def __call__(self, samples: int) -> Float64:
-        """Return the next samples.
-
-        Returns
-        -------
-        np.ndarray [shape=(samples,)], float64
-            Full scale is -1 to 1, at 16 kHz.
-        """
+        """Return the next samples in full scale, -1 to 1, at 16 kHz."""
         noise = self._rng.standard_normal(samples)
         coloured, self._state = lfilter([self._gain], [1.0, -self._pole], noise, zi=self._state)
         return self._level * coloured
 
 
 def synthesize(label: str, seconds: float, seed: int) -> Float32:
-    """Synthesise one sound, with the room's background noise.
+    """Synthesise a sound in the room's noise, -1 to 1 at 16 kHz, of up to 300 seconds.
 
-    Raise `SimulationError` if there is no such sound, its duration is out of range, or the seed is
-    negative.
-
-    Parameters
-    ----------
-    seconds : float
-        More than 0, at most 300.
-    seed : int
-        Not negative. The same arguments give the same samples.
-
-    Returns
-    -------
-    np.ndarray [shape=(n,)], float32
-        Full scale is -1 to 1, at 16 kHz.
+    The same arguments give the same samples. Raise `SimulationError` if there is no such sound, its
+    duration is out of range, or the seed is negative.
     """
     samples = round(seconds * SAMPLE_RATE) if 0 < seconds <= _MAX_SECONDS else 0
     if samples < 1:
@@ -359,14 +221,9 @@ def synthesize(label: str, seconds: float, seed: int) -> Float32:
 
 
 def generator(*seed: int) -> np.random.Generator:
-    """Return the random generator of a seed.
+    """Return the random generator of a seed, and of integers that distinguish its uses.
 
     Raise `SimulationError` if one of them is negative.
-
-    Parameters
-    ----------
-    *seed : int
-        A seed, and further integers that distinguish its uses. None is negative.
     """
     if min(seed) < 0:
         raise SimulationError(f"a seed is a whole number from 0, not {min(seed)}")
@@ -374,19 +231,9 @@ def generator(*seed: int) -> np.random.Generator:
 
 
 def dry_sound(label: str, samples: int, rng: np.random.Generator) -> Float64:
-    """Synthesise one sound without the room; its ends are faded.
+    """Synthesise at least one sample without the room, -1 to 1, at 16 kHz; the ends are faded.
 
     Raise `SimulationError` if there is no such sound.
-
-    Parameters
-    ----------
-    samples : int
-        At least 1, at 16 kHz.
-
-    Returns
-    -------
-    np.ndarray [shape=(samples,)], float64
-        Full scale is -1 to 1, at 16 kHz.
     """
     if label not in _SOUNDS:
         raise SimulationError(f"no sound is called {label!r}; there are {', '.join(LABELS)}")

@@ -42,10 +42,7 @@ _GAPS = 3  # status of a recorder that ended well, with gaps in its log
 class Service:
     """A process that is started again when it ends, or when it has stopped reporting.
 
-    Parameters
-    ----------
-    account : str or None
-        Account that runs it; None for this one.
+    Without `account`, this account runs it.
     """
 
     def __init__(

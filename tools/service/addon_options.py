@@ -125,10 +125,7 @@ class BrokerError(HearthlogError):
 
 
 def read_options(file: Path) -> AddonOptions:
-    """Read the options that the Supervisor has written.
-
-    Raise `ConfigurationError` with a line for each wrong option.
-    """
+    """Read the Supervisor's options; raise `ConfigurationError` with a line for each wrong one."""
     data = read_limited(file, "file of options", _MOST_BYTES, ConfigurationError)
     try:
         content = json.loads(data)
@@ -147,12 +144,7 @@ def read_options(file: Path) -> AddonOptions:
 def find_broker(options: AddonOptions, supervisor: str, token: str) -> AddonBroker:
     """Return the broker of the options, or else the one that the Supervisor knows.
 
-    Raise `BrokerError` if there is none, with the reason.
-
-    Parameters
-    ----------
-    supervisor : str
-        Address of the Supervisor's API.
+    `supervisor` is the address of its API. Raise `BrokerError` if there is none, with the reason.
     """
     if options.mqtt_host:
         port = options.mqtt_port or 1883
@@ -188,12 +180,8 @@ def write_configuration(
 ) -> None:
     """Write the configuration, the broker's password, and the definitions of the inputs.
 
-    Raise `ConfigurationError` if the user's file or a value is wrong; the files are then as before.
-
-    Parameters
-    ----------
-    account : str or None
-        Account that runs the services; None for this one.
+    `account` runs the services; None for this one. Raise `ConfigurationError` if the user's file or
+    a value is wrong; the files are then as before.
     """
     own = folders.own_keys
     text = ""

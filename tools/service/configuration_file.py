@@ -68,14 +68,9 @@ class Answers:
 
 
 def configuration_text(text: str | None, answers: Answers) -> str:
-    """Return the text of a configuration with the answers.
+    """Return a configuration, valid TOML or None, with the answers; everything else is kept.
 
     Raise `ConfigurationError` if the text has a form that cannot be changed.
-
-    Parameters
-    ----------
-    text : str or None
-        The present text, valid TOML, of which everything else is kept.
     """
     try:
         content = tomlkit.parse(_NEW if text is None else text)
@@ -180,12 +175,8 @@ def written_files(
 ) -> Iterator[None]:
     """Write a configuration and its secret files; restore what was there if the block raises.
 
-    Raise `LogError` if a file cannot be written.
-
-    Parameters
-    ----------
-    account : str or None
-        Account that may read the secrets, and alone may; None for this one.
+    Only `account` may read the secrets; None for this one. Raise `LogError` if a file cannot be
+    written.
     """
     person = None if account is None else pwd.getpwnam(account)
     before: dict[Path, Path | None] = {}

@@ -53,10 +53,7 @@ _SOUND_GROUP = "audio"  # group that may open sound cards
 
 
 def system_unit(command: Sequence[str], account: str, needs: Needs) -> str:
-    """Return the unit of a system service.
-
-    Raise `ServiceError` if a unit cannot contain one of the names.
-    """
+    """Return the unit of a system service; raise `ServiceError` if it cannot contain a name."""
     has_state = Path(needs.output).is_relative_to(STATE)
     isolated = f"PrivateNetwork=yes\n{_NO_NETWORK}\nIPAddressDeny=any"
     return _filled(
@@ -72,10 +69,7 @@ def system_unit(command: Sequence[str], account: str, needs: Needs) -> str:
 
 
 def user_unit(command: Sequence[str], folder: Path, needs: Needs) -> str:
-    """Return the unit of a user service.
-
-    Raise `ServiceError` if a unit cannot contain one of the names.
-    """
+    """Return the unit of a user service; raise `ServiceError` if it cannot contain a name."""
     return _filled(
         "user.service",
         command=_command(command),
@@ -87,14 +81,9 @@ def user_unit(command: Sequence[str], folder: Path, needs: Needs) -> str:
 def bridge_unit(
     command: Sequence[str], account: str | None, recorder: str, logs: Path, written: Sequence[Path]
 ) -> str:
-    """Return the unit of the bridge as a system service.
+    """Return the unit of the bridge as a system service; by default systemd creates its user.
 
     Raise `ServiceError` if a unit cannot contain one of the names.
-
-    Parameters
-    ----------
-    account : str or None
-        User that runs the service; None for a user created by systemd.
     """
     own = f"DynamicUser=yes\nSupplementaryGroups={recorder}"
     # The bridge waits for a folder that does not exist yet.
@@ -209,13 +198,8 @@ def is_packaged(name: str) -> bool:
 def check_unit(unit: Path, verb: str, config: Path, folder: Path | None) -> None:
     """Check that an existing unit starts this installation, for a configuration and a folder.
 
-    Raise `ServiceError` if it starts another installation, or a user's service records in another
-    folder.
-
-    Parameters
-    ----------
-    folder : Path or None
-        Of a user's service.
+    `folder` is of a user's service. Raise `ServiceError` if it starts another installation, or a
+    user's service records in another folder.
     """
     if not unit.exists():
         return
@@ -254,10 +238,7 @@ def make_account(account: str) -> bool:
 
 
 def remove_account(account: str) -> None:
-    """Remove an account that was just made.
-
-    Raise `ServiceError` if it cannot be removed.
-    """
+    """Remove an account that was just made; raise `ServiceError` if it cannot be removed."""
     _account_command("userdel", account)
 
 
@@ -274,10 +255,7 @@ def _account_command(*command: str) -> None:
 
 
 def check_seen(what: str, path: Path | None) -> None:
-    """Check that a file is visible to a system service.
-
-    Raise `ServiceError` if the file is in a place hidden from services.
-    """
+    """Raise `ServiceError` if a file is in a place hidden from system services."""
     if path is not None and any(path.is_relative_to(folder) for folder in _UNSEEN):
         raise ServiceError(
             f"{path}: {what} is in a folder that the service does not see, as no home and no /tmp; "
@@ -314,10 +292,7 @@ def start_unit(name: str, *options: str, is_running: bool) -> bool:
 
 
 def stop_unit(name: str) -> None:
-    """Stop a service of the machine for good.
-
-    Raise `ServiceError` if it cannot be stopped.
-    """
+    """Stop a service of the machine for good; raise `ServiceError` if it cannot be stopped."""
     _systemctl("disable", "--now", name)
 
 
@@ -335,10 +310,7 @@ def _systemctl(*arguments: str, env: dict[str, str] | None = None) -> None:
 
 
 def check_root() -> None:
-    """Check the permission to install a system service.
-
-    Raise `ServiceError` if the user is not root.
-    """
+    """Raise `ServiceError` if the user is not root, and may not install a system service."""
     if os.geteuid():
         raise ServiceError(
             "a service of the machine is installed by root: use sudo, or --user for one of your own"
@@ -346,10 +318,7 @@ def check_root() -> None:
 
 
 def check_program_seen() -> None:
-    """Check that hearthlog and its Python are visible to a system service.
-
-    Raise `ServiceError` if one of them is in a place hidden from services.
-    """
+    """Raise `ServiceError` if hearthlog or its Python are in a place hidden from services."""
     check_seen("hearthlog", Path(hearthlog.recorder.__file__).resolve())
     check_seen("its Python", Path(sys.executable).absolute())
     check_seen("the Python of its environment", Path(sys.executable).resolve())
@@ -388,7 +357,7 @@ def install_for_system(account: str, config: Path | None) -> Installed:
 def install_for_user(config: Path | None) -> Installed:
     """Install the recorder as a user service in the current folder, and start or restart it.
 
-    Raise `ConfigurationError, ServiceError` as `install_for_system`.
+    Raise `ConfigurationError` and `ServiceError` as `install_for_system`.
     """
     unit = place_of(user_units(), NAME)
     config = None if config is None else config.absolute()
@@ -452,18 +421,9 @@ RECORDER = "hearthlog"  # user of the recorder
 def install_bridge(config: Path, account: str | None) -> Installed:
     """Install the bridge as a system service, and start or restart it.
 
-    Parameters
-    ----------
-    account : str or None
-        User that runs the bridge; by default a user of its own, which may read logs readable by the
-        recorder's group, and write none.
-
-    Raises
-    ------
-    ConfigurationError
-        If the configuration is invalid.
-    ServiceError
-        For other failures. Nothing is written on failure, unless only the start failed.
+    By default it has a user of its own, which may read logs readable by the recorder's group, and
+    write none. Raise `ConfigurationError` if the configuration is invalid, `ServiceError` for other
+    failures. Nothing is written on failure, unless only the start failed.
     """
     check_root()
     unit = place_of(SYSTEM_UNITS, BRIDGE_NAME)
