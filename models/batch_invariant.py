@@ -12,11 +12,11 @@ _LINE = 64  # bytes of a cache line
 
 
 def rowwise_matmul(rows: Float64, weights: Float64) -> Float64:
-    """Multiply `rows @ weights` so that a row's result does not depend on the other rows.
+    """Multiply rows [shape=(n, k)] and weights [shape=(k, m)] so that rows are independent.
 
-    The shapes are (n, k), (k, m) and (n, m). A BLAS chooses kernel and threads by the size of the
-    product, and each choice sums in another order. Stacks of one small, fixed shape prevent that,
-    if `weights` has at most a few thousand values.
+    A BLAS chooses kernel and threads by the size of the product, and each choice sums in another
+    order. Stacks of one small, fixed shape prevent that, if `weights` has at most a few thousand
+    values.
     """
     count, width = rows.shape
     columns = weights.shape[1]

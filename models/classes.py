@@ -112,9 +112,10 @@ def ordered(labels: Iterable[str]) -> list[str]:
 
 
 def meant_by(label: str, names: Collection[str]) -> list[str]:
-    """Return the `names` that match a label: the label itself in any spelling, or all of its class.
+    """Return the `names`, in their order, that match a label in any spelling, or by its class.
 
-    Two names of one class in a dataset are distinct there, so a third name matches both.
+    They are the label itself, or all of its class. Two names of one class in a dataset are distinct
+    there, so a third name matches both.
     """
     if label in names:
         return [label]

@@ -359,7 +359,7 @@ def _without_scenarios(content: dict[str, Any]) -> dict[str, Any]:
 def load_with_origins(
     file: Path | None, command_line: dict[str, Any], microphone: dict[str, Any]
 ) -> tuple[Settings, Origins]:
-    """Load settings and their origins; raise as `load_settings` does."""
+    """Load settings and their origins; raise `ConfigurationError` as `load_settings` does."""
     content = {} if file is None else read_toml(file, "configuration", ConfigurationError)
     content.pop(BRIDGE, None)
     lines = {} if file is None else key_lines(file.read_text("utf-8-sig"))

@@ -186,7 +186,8 @@ def record(
 ) -> RecordingSummary:
     """Record a source, as the first microphone, until it ends or `stop` is set.
 
-    Raise `SourceError` if the source does, and the other errors of `record_files`.
+    Raise `SourceError` if the source does; `ModelError`, `ConfigurationError` and `LogError` as
+    `record_files`.
     """
     return _record(settings, {settings.microphone[0].name: source}, stop, reload_requests)
 

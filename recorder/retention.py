@@ -54,7 +54,7 @@ class RecordedDays:
         self._days = sorted({start // _DAY for start in starts if start >= _NO_EARLIER})
 
     def since(self, start: int) -> int:
-        """Count the recorded days after the day of a time; 0 for times of an unset clock."""
+        """Count the recorded days after a time; 0 for the last day, and times of an unset clock."""
         if start < _NO_EARLIER:
             return 0
         return len(self._days) - bisect_right(self._days, start // _DAY)
@@ -130,7 +130,10 @@ class ThinningDays(NamedTuple):
     rest: int = 0
 
     def step(self, age: int) -> int:
-        """Return the thinning step, an index of `STEPS` in `recover`, after `age` recorded days."""
+        """Return the thinning step after `age` recorded days.
+
+        It is an index of `hearthlog.schemas.salvage.recover.STEPS`.
+        """
         due = [step for step, days in enumerate(self, 1) if days and age >= days]
         return max(due, default=0)
 

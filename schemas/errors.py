@@ -11,7 +11,10 @@ def printable(text: object) -> str:
 
 
 def shortened(text: str, length: int) -> str:
-    """Truncate a text to at least one character, the last being `…`, and make it printable."""
+    """Truncate a text to at most `length` characters, at least 1, and make it printable.
+
+    The last character is `…` if the text was longer.
+    """
     return printable(text if len(text) <= length else text[: length - 1] + "…")
 
 
@@ -22,7 +25,7 @@ def abridged(names: Sequence[str], most: int = 20) -> str:
 
 
 def listed(names: Sequence[str], last: str = "or") -> str:
-    """List names in a sentence: `a, b or c`; empty without names."""
+    """List names, in their order, in a sentence: `a, b or c`; empty without names."""
     return f" {last} ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 

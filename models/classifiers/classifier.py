@@ -125,7 +125,7 @@ class Classifier:
         self.names: NamesParameters | None = names_parameters(model) if by_names else None
 
     def direction_weights(self, microphone: str) -> Float64 | None:
-        """Return the direction weights [shape=(C, S)] of a microphone array, or None."""
+        """Return an array's weights [shape=(C, S)] for `DirectionEvidence`, or None."""
         return self._direction_weights.get(microphone)
 
     def takes_embeddings(self, source: EmbeddingSource | None) -> bool:
@@ -159,9 +159,11 @@ class Classifier:
     ) -> tuple[Float32, Float32]:
         """Mix features and embeddings: features decide on silence, both on the class of a sound.
 
-        All have shape (n, C), and rows without embedding (NaN in `by_heads`) and evidence keep
-        their probabilities, those from `classify` without evidence. `by_heads` is from
-        `EmbeddingHeads.log_probabilities`. The result is that of `classify`.
+        `probabilities` [shape=(n, C)] are from `classify` without evidence, `by_heads` [shape=(n,
+        C)] from `EmbeddingHeads.log_probabilities`, NaN where there is no embedding; `evidence`
+        [shape=(n, C)] is as in `classify`. Rows without embedding and evidence keep their
+        probabilities. The result is that of `classify`: probabilities [shape=(n, C)] and novelty
+        [shape=(n,)].
         """
         embedded = np.isfinite(by_heads.sum(axis=1))
         changed = embedded if evidence is None else embedded | evidence.any(axis=1)
@@ -176,7 +178,7 @@ class Classifier:
         return self._in_steps(probabilities)
 
     def probabilities(self, inputs: Float32) -> Float32:
-        """Compute the class probabilities [shape=(n, C)] of finite inputs [shape=(n, width)]."""
+        """Compute probabilities [shape=(n, C)] as `classify` does, of inputs [shape=(n, width)]."""
         return self.classify(inputs)[0]
 
     def classify(
@@ -188,10 +190,11 @@ class Classifier:
         """Compute class probabilities [shape=(n, C)] and the novelty of each window [shape=(n,)].
 
         `inputs` [shape=(n, width)] are finite. `evidence` [shape=(n, C)] is added to the logarithms
-        of the probabilities; `by_heads` is as in `mix`. Probabilities are in steps of 2**-16, and
-        every row sums to 1 within half a step per class; older models' are not rounded. Novelty is
-        the probability, 0 to 1, that the sound is not of the likeliest class other than `unknown`;
-        for older models the value of the kind of classifier, or NaN.
+        of the probabilities; `by_heads` is as in `mix`. Probabilities are in the order of the
+        model's classes, in steps of 2**-16, and every row sums to 1 within half a step per class;
+        older models' are not rounded. Novelty is the probability, 0 to 1, that the sound is not of
+        the likeliest class other than `unknown`; for older models the value of the kind of
+        classifier, or NaN.
         """
         if by_heads is not None:
             return self.mix(self.classify(inputs)[0], by_heads, evidence)

@@ -299,10 +299,11 @@ def floored(decisions: Float64) -> Float64:
 def mixed(
     decisions: Float64, by_heads: Float64, mix: EmbeddingMix, classes: Sequence[str]
 ) -> Float64:
-    """Mix classifier and heads, from `log_probabilities`, to log-probabilities [shape=(n, C)].
+    """Mix the outputs of classifier and heads to log-probabilities [shape=(n, C)].
 
     Silence keeps the classifier's probability; the other classes share the rest. `decisions` are
-    logarithms of the classifier's probabilities, plus any constant per row.
+    logarithms of the classifier's probabilities, plus any constant per row; `by_heads` is from
+    `EmbeddingHeads.log_probabilities`.
     """
     sounds = sounds_of(classes)
     of_sounds = decisions[:, sounds]

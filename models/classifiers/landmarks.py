@@ -129,7 +129,10 @@ class LandmarksMachine:
             self._blocks.append((block, aligned(weights[rows])))
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Return logarithms of probabilities up to a constant and a temperature; NaN as novelty."""
+        """Return decisions [shape=(n, C)] of finite inputs [shape=(n, width)], and novelty, NaN.
+
+        The decisions are logarithms of probabilities up to a constant and a temperature.
+        """
         rows = self._distances.rows(self._scaled(inputs))
         decisions = np.tile(self._bias, (len(inputs), 1))
         for landmarks, weights in self._blocks:

@@ -33,7 +33,7 @@ def scaler_shapes(width: int) -> dict[str, tuple[int, ...]]:
 
 
 def scaler_problem(arrays: Mapping[str, Array]) -> str | None:
-    """Return an error in the scaler arrays, finite and of valid types and shapes; else None."""
+    """Return an error in the arrays of `Scaler`, which are finite and of valid shapes; or None."""
     if (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
         return None
     return "scaler_scale has values that are not positive"

@@ -157,10 +157,10 @@ class SvmMachine:
         self._first, self._second = np.triu_indices(self._count, 1)
 
     def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
-        """Compute decisions [shape=(n, C)] and novelty [shape=(n,)] of finite inputs.
+        """Compute decisions [shape=(n, C)] and novelty [shape=(n,)] of inputs [shape=(n, width)].
 
-        Novelty is one minus the kernel of the nearest support vector, 0 to 1; NaN for a model whose
-        novelty is derived from its probabilities.
+        Inputs are finite. Novelty is one minus the kernel of the nearest support vector, 0 to 1;
+        NaN for a model whose novelty is derived from its probabilities.
         """
         rows = self._distances.rows(self._scaled(inputs))
         pairs, others, nearest = self._pairs(rows)

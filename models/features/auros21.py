@@ -80,8 +80,8 @@ def band_powers(features: Float32) -> Float64:
 def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
     """Compute the values of the inputs `above_floor` [shape=(n, 53)], as from `band_values`.
 
-    `features` has shape (n, 21), `floors` (n, 33), in the order of `band_powers`. Raise `TypeError`
-    if there are no floors.
+    `features` has shape (n, 21); `floors` [shape=(n, 33)] are in the order of `band_powers`. Raise
+    `TypeError` if there are no floors.
     """
     return above_floor(features, floors)[0]
 
@@ -89,7 +89,8 @@ def values_above_floor(features: Float32, floors: Float64 | None) -> Float64:
 def above_floor(features: Float32, floors: Float64 | None) -> tuple[Float64, Float64]:
     """Compute the values above the floor of the room, and the share of energy above it.
 
-    They are those of `values_above_floor` [shape=(n, 53)], and 0 to 1 [shape=(n, 1)]. The floor is
+    They are those of `values_above_floor` [shape=(n, 53)], and 0 to 1 [shape=(n, 1)], of features
+    [shape=(n, 21)] and floors [shape=(n, 33)] in the order of `band_powers`. The floor is
     subtracted from the powers (Berouti, Schwartz and Makhoul, "Enhancement of speech corrupted by
     acoustic noise", 1979). The other values allow no subtraction; the smaller the share of energy
     above the floor, the closer they are moved to the values of silence. Raise `TypeError` if there
@@ -178,11 +179,11 @@ class FeatureExtractor:
         self._last_magnitude = None
 
     def __call__(self, frames: Float32) -> Float32:
-        """Compute the features [shape=(n, 21)] of frames [shape=(n, 800)] in full scale, at 16 kHz.
+        """Compute `FEATURE_NAMES` [shape=(n, 21)] of frames [shape=(n, 800)], at 16 kHz, -1 to 1.
 
         The definitions follow the paper (section 3.2.2) and, where the paper and its library
-        differ, of pyAudioAnalysis; see docs/features.md for order and units. Samples that are not
-        finite count as 0, those beyond +-1000 are clipped; features are always finite.
+        differ, of pyAudioAnalysis; see docs/features.md for the units. Samples that are not finite
+        count as 0, those beyond +-1000 are clipped; features are always finite.
         """
         values = np.empty((len(frames), self.width), np.float32)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):
@@ -235,7 +236,7 @@ class FeatureExtractor:
 
 
 def zero_crossing_rate(frames: Float32) -> Float64:
-    """Count sign changes per step from sample to sample [shape=(n,)], 0 to 1.
+    """Count sign changes per step from sample to sample [shape=(n, 800)]: 0 to 1 [shape=(n,)].
 
     A step to or from 0 counts half, and NaN counts as 0. The paper (section 3.2.2) divides by the
     samples of a frame; this divides by the steps, as pyAudioAnalysis does.

@@ -157,10 +157,10 @@ def decibels(powers: Float64) -> Float64:
 
 
 def is_quiet(powers: Float64, floors: Float64, window_frames: int, gate: float) -> Bool:
-    """Return for n windows whether no band's mean power is at least `gate`, in dB, above the floor.
+    """Return whether no band's mean power in a window is at least `gate`, in dB, above the floor.
 
     `powers` [shape=(n + window_frames - 1, b)] are those of successive frames, `floors` [shape=(n,
-    b)] are at the last frame of each window.
+    b)] are at the last frame of each window; the result has shape (n,).
     """
     total = powers[: len(floors)].copy()
     for place in range(1, window_frames):

@@ -321,7 +321,10 @@ class LastEmbedding:
         return LastEmbeddingStream(self)
 
     def of_windows(self, windows: Float32, floors: Float64 | None = None) -> Float32:
-        """Return the last embeddings [shape=(n, width)]; `floors` are unused."""
+        """Return the inputs [shape=(n, width)] of windows [shape=(n, window_frames, 1 + width)].
+
+        `floors` are unused.
+        """
         del floors
         return np.ascontiguousarray(windows[:, -1, 1:])
 
@@ -338,9 +341,10 @@ class LastEmbeddingStream:
         self._lacking = self._inputs.window_frames - 1  # frames before the first complete window
 
     def __call__(self, features: Float32, floors: Float64 | None = None) -> Float32:
-        """Return the inputs at the last m frames [shape=(m, width)]; `floors` are unused.
+        """Return the inputs [shape=(m, width)] at the last m of n frames [shape=(n, 1 + width)].
 
-        They are the frames with a complete window since the start or the last restart.
+        They are the frames with a complete window since the start or the last restart; `floors` are
+        unused.
         """
         del floors
         inputs = features[self._lacking :, 1:]

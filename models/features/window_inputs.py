@@ -84,7 +84,8 @@ class Inputs(Protocol):
 def of_segments(inputs: Inputs, segments: Float32, floors: Float64 | None = None) -> Float32:
     """Compute the inputs of windows in segments [shape=(n, places, width)], at `window_places`.
 
-    `segments` [shape=(n, f, d)] have at least one window; `floors` has shape (n, b).
+    `segments` [shape=(n, f, d)] have features of at least one window; `floors` [shape=(n, b)] are
+    those of the room in each segment.
     """
     length = inputs.window_frames
     return np.stack(
@@ -123,7 +124,11 @@ class WindowStatistics:
         return StatisticsStream(self)
 
     def of_windows(self, windows: Float32, floors: Float64 | None = None) -> Float32:
-        """Compute means, standard deviations and, with `changes`, mean absolute differences."""
+        """Compute the inputs [shape=(n, width)] of windows [shape=(n, window_frames, d)].
+
+        They are means, standard deviations and, with `changes`, mean absolute differences. `floors`
+        [shape=(n, b)] are those of the room in each window.
+        """
         inputs = np.empty((len(windows), self.width), np.float32)
         for start in range(0, len(windows), _FRAMES_AT_ONCE):
             part = windows[start : start + _FRAMES_AT_ONCE]
@@ -147,7 +152,7 @@ class WindowStatistics:
         """Write means, deviations and, with `changes`, differences into rows [shape=(n, width)].
 
         `frames` and `changes`, the absolute differences from frame to frame, are from `successive`,
-        each of shape (n, d').
+        each [shape=(n, d')].
         """
         parts = [*mean_and_std(frames)]
         if self.changes:
@@ -184,9 +189,10 @@ class StatisticsStream:
 
 
 def successive(values: NDArray[Any], length: int) -> list[NDArray[Any]]:
-    """View windows of `length` successive rows as one array per place in the window.
+    """View windows of `length` successive rows, at most n, as one array per place in the window.
 
-    `values` has shape (n, d); each view has shape (n - length + 1, d), `length` is at most n.
+    `values` has [shape=(n, d)]; a view, of the first rows of all windows, the second rows, and so
+    on, has [shape=(n - length + 1, d)].
     """
     count = len(values) - length + 1
     return [values[place : place + count] for place in range(length)]

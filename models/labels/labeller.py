@@ -152,12 +152,13 @@ class Labeller:
         stamps: Int64,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> tuple[FrameLabels, list[Segment]]:
-        """Add frames; return labels and segments that they complete.
+        """Add frames; return labels and segments, whose end is decided, that they complete.
 
-        `features` has shape (n, d); `stamps` [shape=(n,)] are the starts of the frames in
-        nanoseconds of UTC. Frames without a floor are not labelled; `floors` is None if the feature
-        set has no bands. `auxiliary` has the directions and embeddings that become available with
-        these frames. A frame has a label once its window and embeddings are complete.
+        `features` [shape=(n, d)] and `floors` are those of the frames; `stamps` [shape=(n,)] are
+        their starts in nanoseconds of UTC. Frames without a floor are not labelled; `floors` is
+        None if the feature set has no bands. `auxiliary` has the directions and embeddings that
+        become available with these frames. A frame has a label once its window and embeddings are
+        complete.
         """
         self._converge(floors, first)
         window = self._advance(features, floors if self.timing.needs_floor else None, stamps)
@@ -200,7 +201,7 @@ class Labeller:
         return labels, self.segmenter.push(labelled) if len(labelled.stamps) else []
 
     def close(self, end: int) -> list[Segment]:
-        """Return the remaining segments at the end, in nanoseconds of UTC, and reset."""
+        """Return the remaining segments at the end, in nanoseconds of UTC, in order, and reset."""
         if self._evidence is not None:
             self._evidence.restart()
         for each in self._window_evidence:

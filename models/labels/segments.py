@@ -42,7 +42,7 @@ class Borders:
         self._last: int | None = None  # last state returned
 
     def push(self, states: Indices, powers: Float64) -> Indices:
-        """Add states [shape=(n,)] and mean squares [shape=(m,)]; return refined states.
+        """Add states [shape=(n,)] and mean squares [shape=(m,)]; return refined ones [shape=(k,)].
 
         There are never more states than powers in total. Refined states go up to `delay` frames
         before the last state.
@@ -276,7 +276,10 @@ class Segmenter:
         return segments
 
     def _note_convergence(self, states: Indices, stamps: Int64) -> None:
-        """Record when states converged, and borders, after enough equal converged states."""
+        """Record when states converged; `stamps` covers all undecided frames.
+
+        Borders converge after enough equal converged states.
+        """
         first = self._states
         self._states += len(states)
         after = self._doubtful + 1 if self._smoother is None else self._smoother.converged_after

@@ -88,7 +88,7 @@ class FixedLagSmoother:
         self._scores_from = np.where(np.eye(count, dtype=bool), 0.0, -np.inf)
 
     def push(self, probabilities: Float32) -> Indices:
-        """Add probabilities [shape=(n, C)], 0 to 1; return the states that are now decided.
+        """Add probabilities [shape=(n, C)], 0 to 1; return the states now decided [shape=(m,)].
 
         They follow those already decided, up to `lag_frames` before the last frame.
         """
@@ -193,8 +193,8 @@ def _normalized(scores: Float64) -> Float64:
 def _forward(transitions: Float64, start: Float64, observed: Float64) -> Float64:
     """Score the likeliest path to each state of each frame [shape=(n + 1, C) or (n + 1, C, k)].
 
-    `observed` has shape (n, C), (n, C, 1) or (n, C, k), `transitions` (C, C). `start` [shape=(C,)
-    or (C, k)], the first row, has the scores of the previous frame, for k sounds.
+    `observed` has [shape=(n, C), (n, C, 1) or (n, C, k)], `transitions` [shape=(C, C)]. `start`
+    [shape=(C,) or (C, k)], the first row, has the scores of the previous frame, for k sounds.
     """
     scores = np.empty((len(observed) + 1, *start.shape))
     scores[0] = start

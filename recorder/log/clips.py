@@ -213,8 +213,8 @@ _ALL_KEPT = "minutes of this day are kept already"
 class ClipWriter:
     """Writes clips to layers, within the daily minutes and the free space of the disk.
 
-    Errors become notices and are never raised, so that the logs continue. `file_at` is
-    `RollingLog.file_at`.
+    Errors become notices and are never raised, so that the logs continue. `file_at` maps a time in
+    nanoseconds of UTC to its log and that log's end, as `RollingLog.file_at`.
     """
 
     def __init__(
@@ -377,7 +377,7 @@ def _frames_in(layer: Path, start: int, end: int) -> int:
 class ClipRecorder:
     """Writes the clips of a recording, if configured, and always deletes old clips.
 
-    `file_at` is `RollingLog.file_at`. Raise `ConfigurationError` if sound is to be kept and a model
+    `file_at` is as in `ClipWriter`. Raise `ConfigurationError` if sound is to be kept and a model
     lacks a class that must not be kept.
     """
 

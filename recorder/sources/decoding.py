@@ -59,7 +59,7 @@ class ChannelMixer:
         self._chosen = chosen
 
     def __call__(self, block: Float32) -> Float32:
-        """Mix a block [shape=(n, c)] to one channel; NaN where samples are not finite."""
+        """Mix a block [shape=(n, c)] to one channel [shape=(n,)]; NaN where it is not finite."""
         block = finite_or_nan(block)
         count = block.shape[1]
         if count == 1 or self._fixed is not None:
@@ -334,13 +334,13 @@ def read_audio(  # noqa: PLR0913
     incomplete: Callable[[str], object] = str,
     chosen: Callable[[str], object] = str,
 ) -> Iterator[Float32]:
-    """Yield blocks of an audio file of any rate, at 16 kHz [shape=(n,) or (n, channels)], -1 to 1.
+    """Yield blocks of an audio file of any rate, at 16 kHz [shape=(n,) or (n, channels)].
 
-    Channels are averaged, unless they cancel or hide each other; then the best channel is used.
-    With `channels`, the number in an array, they stay separate; `channel`, from 1, selects one.
-    Samples that are not finite are NaN. `start` and `end` are in seconds, limited to the length of
-    the file. `chosen` receives which channels are selected and why on a change, and an empty text
-    on return to the default.
+    Samples are in full scale, -1 to 1; those that are not finite are NaN. Channels are averaged,
+    unless they cancel or hide each other; then the best channel is used. With `channels`, the
+    number in an array, as in `check_channels`, they stay separate; `channel`, from 1, selects one.
+    `start` and `end` are in seconds, limited to the length of the file. `chosen` receives which
+    channels are selected and why on a change, and an empty text on return to the default.
 
     Raise `SourceError` if the file is missing, is not audio, is empty, or has a sample rate below 1
     kHz or above 768 kHz.

@@ -30,7 +30,10 @@ class FrameCutter:
             self._resampler = soxr.ResampleStream(rate, SAMPLE_RATE, channels or 1, dtype="float32")
 
     def push(self, samples: Float32, *, last: bool = False) -> Float32:
-        """Add samples [shape=(m,) or (m, c)]; return frames [shape=(n, 800) or (n, 800, c)]."""
+        """Add samples [shape=(m,) or (m, c)]; return frames [shape=(n, 800) or (n, 800, c)].
+
+        The samples are at the rate of the sound, the frames at 16 kHz.
+        """
         if self._resampler is not None:
             samples = self._resampler.resample_chunk(samples, last=last)
         self._held = np.concatenate([self._held, samples])
@@ -103,7 +106,7 @@ class SampleClock:
     def time(self, index: Float64 | float) -> Float64:
         """Compute capture times, in seconds of CLOCK_MONOTONIC, of indices [shape=() or (n,)].
 
-        Indices may be fractional. At least one observation is required.
+        Sample indices may be fractional. At least one observation is required.
         """
         assert self._origin is not None
         nominal = np.asarray(index) / self._rate

@@ -97,9 +97,10 @@ class Capture:
             raise
 
     def blocks(self, timeout: float) -> list[SampleBlock] | None:
-        """Return the blocks that arrive, waiting some seconds for the first; None at the end.
+        """Return the blocks that have arrived, in order; None if the process has ended.
 
-        Raise `DeviceError` if the process has ended with a reason.
+        It waits `timeout` seconds for the first block; there may be none. Raise `DeviceError` if
+        the process has ended with a reason.
         """
         if not self._wait(timeout):
             return []

@@ -40,7 +40,7 @@ class PrivateFrames:
         self._unnamed = NAMED_FRAMES + 1  # frames since the last names of a private class
 
     def push(self, count: int, labels: FrameLabels | None) -> Bool:
-        """Add at least one next frame; return whether the next decided frames are private."""
+        """Add at least one next frame; return which frames decided now are private [shape=(m,)]."""
         self._likely = np.append(self._likely, self._unlabelled(count))
         if labels is not None and len(labels.novelty):
             end = len(self._likely) - min(labels.ahead, self._ahead)
@@ -48,7 +48,7 @@ class PrivateFrames:
         return self._decide()
 
     def close(self) -> Bool:
-        """Return whether each undecided frame is private, and reset."""
+        """Return whether each undecided frame is private [shape=(m,)], and reset."""
         self._likely = np.append(self._likely, self._unlabelled(self.delay))
         private = self._decide()
         self._begin()

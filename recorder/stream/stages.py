@@ -43,8 +43,9 @@ class RollingStatistics:
     def __call__(self, features: Float32, places: Indices | None = None) -> tuple[Float32, Float32]:
         """Compute mean and standard deviation [shape=(m, d)] at some frames, by default all.
 
-        `features` has shape (n, d), `places` (m,), ascending indices from 0. The window is shorter
-        after the start or the last restart; the deviation divides by the number of frames.
+        `features` have [shape=(n, d)], `places` [shape=(m,)] are ascending indices from 0.
+        Statistics are over the last window, or all frames since the start or the last restart if
+        these are fewer; the deviation divides by the number of frames.
         """
         frames = np.concatenate([self._recent, features])
         places = np.arange(len(features)) if places is None else places

@@ -158,8 +158,9 @@ def iterate_columns(  # noqa: PLR0913
     """Read topics of logs by spans of time, with the arguments of `read_columns`.
 
     A span has one item for each topic with messages in it, or more if its channels differ in type,
-    fields or metadata. No message is older than those yielded before. Raise `LogError` if a log
-    cannot be read or is damaged.
+    fields or metadata. No message is older than those yielded before. Undecodable messages are
+    skipped with a `HearthlogWarning`, as in `decode_readable`. Raise `LogError` if a log cannot be
+    read or is damaged.
     """
     function = partial(decode_readable, fields=fields)
     pieces = iterate_pieces(logs, topics, start, end, function, on_damage=on_damage)

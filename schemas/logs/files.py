@@ -170,7 +170,7 @@ def is_log(path: Path) -> bool:
 
 
 def find_logs(path: Path, *, enrolled: bool = False) -> list[Path]:
-    """List the logs and layers in a folder, recursively, or one log, also active ones, by name.
+    """List logs and layers, also active ones, in a folder, recursively, or one log; sorted by name.
 
     Training sounds in folders `enrolled` are only included on request. Unreadable logs in the
     folder are skipped with a `HearthlogWarning`. Raise `LogError` if there is no log, this user may
@@ -315,7 +315,7 @@ def time_span(path: Path, *, partial: bool = False) -> tuple[int, int] | None:
 
 
 def stated_span(path: Path) -> tuple[tuple[int, int] | None] | None:
-    """Return `time_span` in a tuple, from the log's statistics only.
+    """Return the result of `time_span` in a tuple, from the log's statistics only.
 
     None if the log is unfinished or its index is damaged: only a scan finds its span. Raise
     `LogError` if the log cannot be read.

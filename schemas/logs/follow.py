@@ -129,7 +129,7 @@ def follow_messages(  # noqa: PLR0913
     infos: bool = False,
     ticks: bool = False,
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
-    """Read the encoded messages of logs as they are written; as `follow` does.
+    """Read the encoded messages of logs as they are written, from `start` on, as `follow` does.
 
     A list may be empty, as after each log that is not being written, to return control to the
     caller. `damaged` receives the error of a damaged log, which is not read further; and once per

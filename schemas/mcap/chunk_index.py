@@ -137,12 +137,15 @@ def _row(sizes: tuple[int, int, int, int], start: int, end: int) -> ChunkRow:
 
 
 def not_empty(chunks: NDArray[np.void]) -> NDArray[np.void]:
-    """Remove empty chunks from `CHUNKS`, which a hostile file may have in great numbers."""
+    """Remove empty chunks, which a hostile file may have in great numbers.
+
+    Rows [shape=(n,)] and result [shape=(m,)] are of dtype `CHUNKS`.
+    """
     return chunks[(chunks["size"] > 0) | (chunks["length"] > _EMPTY)]
 
 
 def by_start(chunks: NDArray[np.void]) -> NDArray[np.void]:
-    """Sort `CHUNKS` by the log times of their first messages; equal times keep their order."""
+    """Sort chunks [shape=(n,), dtype `CHUNKS`] by first log time; equal times keep their order."""
     return chunks[np.argsort(chunks["start"], kind="stable")]
 
 

@@ -236,7 +236,10 @@ class ChunkWriter:
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
     ) -> None:
-        """Append a message; times are nanoseconds, 0 to 2**63 - 1, `sequence` is below 2**32."""
+        """Append a message, with times in nanoseconds of UTC, 0 to 2**63 - 1.
+
+        `sequence` is 0 to 2**32 - 1.
+        """
         chunk = self._chunk
         chunk.entries[channel_id] += INDEX_ENTRY.pack(log_time, len(chunk.content))
         chunk.content += MESSAGE.pack(

@@ -68,7 +68,7 @@ def read_chunks(
     chunks: NDArray[np.void],
     topics: TopicChoice | None = None,
 ) -> list[RawMessages]:
-    """Read the messages of the selected topics from `CHUNKS` of a log.
+    """Read the messages of the selected topics from chunks of a log, rows of `file.chunks`.
 
     `topics` has names, or is a predicate: None for all; empty for none, which only adds
     definitions. Raise `LogError` if the log cannot be read, a chunk is damaged, an index does not
@@ -158,7 +158,7 @@ def read_in_batches(
 def in_parts(
     file: LogFile, chunks: NDArray[np.void], on_damage: OnDamage | None = None
 ) -> NDArray[np.void]:
-    """Split `CHUNKS` larger than `LIMIT` into parts, and verify the checksums of these chunks.
+    """Split `CHUNKS` [shape=(n,)] larger than `LIMIT` into parts, and verify their checksums.
 
     They are sorted by start time if any was split; a message larger than `LIMIT` is a part. Raise
     `LogError` if the log cannot be read, or a large chunk is damaged.
@@ -267,7 +267,7 @@ def _part_content(file: LogFile, offset: int, first: int, size: int) -> bytes:
 
 
 def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
-    """Verify the checksums of `CHUNKS`.
+    """Verify the checksums of chunks, rows of `file.chunks`.
 
     Raise `LogError` if the log cannot be read, a chunk is damaged, or a record behind one is no
     message index.
@@ -277,10 +277,10 @@ def verify_chunks(file: LogFile, chunks: NDArray[np.void]) -> None:
 
 
 def repeated_chunks(file: LogFile, chunks: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Return whether each of `CHUNKS` repeats an earlier chunk of the file byte for byte.
+    """Return whether chunks repeat an earlier one of the file byte for byte [shape=(n,)].
 
-    Chunks of a single log time are excluded: a writer with one message per chunk writes equal
-    chunks for equal messages.
+    They are rows of `file.chunks`. Chunks of a single log time are excluded: a writer with one
+    message per chunk writes equal chunks for equal messages.
     """
     repeated = np.zeros(len(chunks), bool)
     candidates: dict[tuple[int, ...], list[int]] = {}

@@ -158,9 +158,9 @@ def decompress_together(
 ) -> tuple[Bytes, Int64] | None:
     """Decompress chunks and verify their checksums, if all are undamaged and use zstd.
 
-    `raw` has records with `starts` and `lengths` [shape=(n,)] in bytes, including the record head.
-    All chunks together have at most `limit` bytes uncompressed. Return the concatenated records,
-    and the uncompressed bytes of each chunk [shape=(n,)].
+    `raw` [shape=(b,)] has records with `starts` and `lengths` [shape=(n,)] in bytes, including the
+    record head. All chunks together have at most `limit` bytes uncompressed. Return the
+    concatenated records [shape=(c,)], and the uncompressed bytes of each chunk [shape=(n,)].
     """
     fixed = ZSTD_CHUNK_HEAD.itemsize
     if not _IS_POSSIBLE or (lengths < fixed).any():

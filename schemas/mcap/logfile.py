@@ -212,7 +212,7 @@ class LogFile:
     def with_channels(
         self, chunks: NDArray[np.void], channels: AbstractSet[int]
     ) -> NDArray[np.void]:
-        """Select `CHUNKS` with any of some channels, or without a list of channels."""
+        """Select rows of `chunks` with any of some channels, or without a list of channels."""
         may_have = [not ids or not ids.isdisjoint(channels) for ids in self.channel_sets]
         return chunks[np.array(may_have, bool)[chunks["channels"]]]
 
@@ -372,10 +372,10 @@ class LogFile:
         )
 
     def scan_new(self) -> NDArray[np.void]:
-        """Scan new records; return new chunks and runs of messages outside of chunks.
+        """Scan the records written since the last scan; return new chunks [shape=(n,)].
 
-        They are rows of `CHUNKS` by start time, and also added to `chunks`. Raise `LogError` if a
-        record is damaged, or the file cannot be read.
+        They are rows of `CHUNKS` by start time, also for runs of messages outside of chunks, and
+        are added to `chunks`. Raise `LogError` if a record is damaged, or the file cannot be read.
         """
         rows = array("q")
         if self.partial:

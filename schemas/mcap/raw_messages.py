@@ -67,9 +67,9 @@ def in_order_of_time(parts: Sequence[RawMessages]) -> Iterator[tuple[RawMessages
 
 
 def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
-    """Return the first index, and that behind the last, of ascending times in [start, end).
+    """Return the range of ascending times [shape=(n,)], in any unit, with start <= time < end.
 
-    They are equal if there are none.
+    It is the first index, and the one behind the last; equal if there are none.
     """
     first = 0 if start is None else int(np.searchsorted(times, start))
     last = len(times) if end is None else int(np.searchsorted(times, end))
@@ -77,7 +77,10 @@ def bounds(times: Int64, start: int | None, end: int | None) -> tuple[int, int]:
 
 
 def gather_heads(buffer: Bytes | bytes | memoryview, starts: Int64) -> NDArray[np.void]:
-    """Copy message heads [shape=(n,), dtype `MESSAGE_HEAD`] at opcodes out of a buffer."""
+    """Copy the heads [shape=(n,), dtype `MESSAGE_HEAD`] of messages out of a buffer [shape=(b,)].
+
+    `starts` [shape=(n,)] are the offsets of their opcodes.
+    """
     if not len(starts):
         return np.empty(0, MESSAGE_HEAD)
     array = np.frombuffer(buffer, np.uint8)
@@ -114,9 +117,10 @@ def iterate_records(
 
 
 def index_messages(content: bytes | memoryview, starts: Int64) -> dict[int, bytes]:
-    """Build the message index of a chunk, from ascending offsets of the opcodes of messages.
+    """Build the message index of a chunk: rows of `INDEX_ENTRIES` by channel.
 
-    It has rows of `INDEX_ENTRIES` by channel, in the order of their first messages.
+    `starts` [shape=(n,)] are ascending offsets of complete message records, at their opcodes.
+    Channels are in the order of their first messages.
     """
     if not len(starts):
         return {}

@@ -160,10 +160,10 @@ def decode_rows(  # noqa: PLR0913
 ) -> Fields:
     """Decode messages of one type into one column [shape=(n, ...)] per field, as in `Columns`.
 
-    `offsets` and `sizes` [shape=(n,)] are those of the payloads in `buffer`, in bytes. Strings that
-    are not UTF-8 raise an error if `undecodable` is "strict"; "replace" puts U+FFFD in place of
-    invalid bytes. Arrays of any length have no elements if n is 0. Raise `LogError` if a payload
-    does not match the type, or a string in it is not UTF-8.
+    `offsets` and `sizes` [shape=(n,)] are those of the payloads in `buffer` [shape=(b,)], in bytes.
+    Strings that are not UTF-8 raise an error if `undecodable` is "strict"; "replace" puts U+FFFD in
+    place of invalid bytes. Arrays of any length have no elements if n is 0. Raise `LogError` if a
+    payload does not match the type, or a string in it is not UTF-8.
     """
     parts = [
         (rows, _decode(layout.leaves, block, fields, undecodable))
@@ -194,9 +194,9 @@ def rows_by_layout(
 ) -> Iterator[tuple[Layout, Indices, NDArray[np.void]]]:
     """Group messages by layout; yield it, their indices [shape=(m,)] and copies of the messages.
 
-    `offsets` and `sizes` [shape=(n,)] are those of the payloads in `buffer`, in bytes. `errors`
-    receives the error of each message that does not match the type, by row, and the message is
-    skipped; without it, raise the first error, a `LogError`.
+    `offsets` and `sizes` [shape=(n,)] are those of the payloads in `buffer` [shape=(b,)], in bytes.
+    `errors` receives the error of each message that does not match the type, by row, and the
+    message is skipped; without it, raise the first error, a `LogError`.
     """
     for size, rows in _by_size(sizes):
         payloads = gather(buffer, offsets[rows], size)

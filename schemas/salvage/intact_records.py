@@ -123,9 +123,10 @@ Whole = IntactChunk | LargeChunk | IntactAttachment | UnknownRecord
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:
-    """Return ascending offsets of the opcodes of messages, and of definitions, in a chunk.
+    """Return the offsets of messages [shape=(m,)] and definitions [shape=(d,)] in a chunk.
 
-    Raise `McapError` if a record is damaged, or not allowed in a chunk.
+    They are those of opcodes, ascending. Raise `McapError` if a record is damaged, or not allowed
+    in a chunk.
     """
     messages, definitions = array("q"), array("q")
     kind, shortest = int(Opcode.MESSAGE), MESSAGE.size
@@ -144,7 +145,10 @@ def split_content(content: bytes) -> tuple[Int64, Int64]:
 
 
 def without_late(chunk: IntactChunk, content: bytes, messages: Int64) -> IntactChunk:
-    """Remove `messages`, from `split_content`, with log times after `LAST_TIME` from a chunk."""
+    """Remove the messages with log times after `LAST_TIME` from a chunk.
+
+    `messages` [shape=(m,)] are the offsets from `split_content`.
+    """
     times = gather_heads(content, messages)["log_time"].astype(np.uint64)
     starts = messages[times > LAST_TIME]
     late = index_messages(content, starts)
@@ -156,7 +160,7 @@ def without_late(chunk: IntactChunk, content: bytes, messages: Int64) -> IntactC
 def with_definitions(
     chunk: IntactChunk, content: bytes, starts: Int64
 ) -> tuple[IntactChunk, bytes]:
-    """Rewrite the definitions of a chunk, at offsets of opcodes; return it and its content."""
+    """Rewrite the definitions of a chunk, at their opcodes [shape=(d,)]; return both."""
     stored, content = _with_records(content, starts, map(encode, chunk.definitions))
     return chunk._replace(stored=stored), content
 
@@ -176,7 +180,7 @@ def _with_records(
 
 
 def read_definitions(content: bytes, starts: Int64) -> tuple[list[Definition], list[str]]:
-    """Read the schemas and channels of a chunk, at offsets of opcodes.
+    """Read the schemas and channels of a chunk, at offsets of opcodes [shape=(d,)].
 
     Raise `McapError` if one is damaged, or there are more than 524288.
     """

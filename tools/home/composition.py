@@ -78,9 +78,9 @@ class Rooms:
         self._responses: dict[str, Float64] = {}
 
     def received(self, sound: Float32, room: str) -> Float32:
-        """Return a sound [shape=(n * FRAME_SAMPLES,)] of a room as received by the microphone.
+        """Return a sound of a room as received by the microphone, with a tail.
 
-        The result has shape ((n + TAIL_FRAMES) * FRAME_SAMPLES,).
+        Sound [shape=(n * FRAME_SAMPLES,)], result [shape=((n + TAIL_FRAMES) * FRAME_SAMPLES,)].
         """
         if room not in self._responses:
             self._responses[room] = self._response(room)
@@ -222,7 +222,7 @@ class Composition:
         return power
 
     def busy(self, first: int, count: int) -> Bool:
-        """Return which frames contain more than periodic noise."""
+        """Return which frames contain more than periodic noise [shape=(count,)]."""
         busy = np.zeros(count, bool)
         for sound in self._sounds(first, first + count):
             busy[max(sound.start - first, 0) : max(_audible_until(sound) - first, 0)] = True

@@ -58,7 +58,7 @@ class Train:
         self.count = len(self.starts)
 
     def ends(self) -> Indices:
-        """Return the samples at which elements end, within the sound."""
+        """Return the samples at which elements end, within the sound [shape=(m,)]."""
         ends = (self.starts + self.lengths).astype(np.intp)
         return ends[ends < self._samples]
 
@@ -141,38 +141,45 @@ def ring(hits: Float64, frequency: float, seconds: float) -> Float64:
 
 
 def impulses(samples: int, at: Indices, gains: Float64) -> Float64:
-    """Return impulses of some heights at samples below `samples`, and 0 elsewhere."""
+    """Return impulses [shape=(samples,)] of some heights [shape=(n,)] at some samples; else 0."""
     hits = np.zeros(samples)
     hits[at] = gains
     return hits
 
 
 def decays(samples: int, at: Indices, seconds: float, gains: Float64 | None = None) -> Float64:
-    """Return an envelope that jumps at some samples and decays to 1/e in `seconds`, at 16 kHz.
+    """Return an envelope [shape=(samples,)] that jumps at some samples and decays after each.
 
-    `gains` are the heights of the jumps; 1 by default.
+    It jumps `at` samples [shape=(n,)] below `samples`, by `gains` [shape=(n,)], 1 by default, and
+    decays to 1/e in `seconds`, at 16 kHz.
     """
     hits = impulses(samples, at, np.ones(len(at)) if gains is None else gains)
     return lfilter([1.0], [1.0, -np.exp(-1.0 / (seconds * SAMPLE_RATE))], hits)
 
 
 def band_noise(rng: np.random.Generator, samples: int, low: float, high: float) -> Float64:
-    """Return noise, of about power 1, between two frequencies in hertz, above 0 and below 8000."""
+    """Return noise of about power 1 between two frequencies [shape=(samples,)], at 16 kHz.
+
+    They are in hertz, above 0 and below 8000.
+    """
     sos = butter(2, (low, high), "bandpass", fs=SAMPLE_RATE, output="sos")
     return sosfilt(sos, rng.standard_normal(samples)) * np.sqrt(SAMPLE_RATE / 2 / (high - low))
 
 
 def wander(rng: np.random.Generator, samples: int, rate: float, depth: float) -> Float64:
-    """Return a random factor about 1 that glides to `rate` new values a second, at 16 kHz."""
+    """Return a random factor about 1 that changes slowly [shape=(samples,)], at 16 kHz.
+
+    It glides between `rate` new values a second.
+    """
     points = int(samples / SAMPLE_RATE * rate) + 2
     values = np.exp(depth * rng.standard_normal(points))
     return np.interp(np.arange(samples) * (rate / SAMPLE_RATE), np.arange(points), values)
 
 
 def vibrato(samples: int, rate: float, depth: float) -> Float64:
-    """Return a factor about 1 that swings as a sine, `rate` times a second, at 16 kHz.
+    """Return a factor about 1 that swings as a sine [shape=(samples,)], at 16 kHz.
 
-    `depth` is the largest distance from 1.
+    `rate` is in swings a second, `depth` is the largest distance from 1.
     """
     return 1.0 + depth * np.sin(np.arange(samples) * (2.0 * np.pi * rate / SAMPLE_RATE))
 
@@ -201,14 +208,14 @@ class RoomTone:
         self._state = np.zeros(1)
 
     def __call__(self, samples: int) -> Float64:
-        """Return the next samples in full scale, -1 to 1, at 16 kHz."""
+        """Return the next samples [shape=(samples,)] in full scale, -1 to 1, at 16 kHz."""
         noise = self._rng.standard_normal(samples)
         coloured, self._state = lfilter([self._gain], [1.0, -self._pole], noise, zi=self._state)
         return self._level * coloured
 
 
 def synthesize(label: str, seconds: float, seed: int) -> Float32:
-    """Synthesise a sound in the room's noise, -1 to 1 at 16 kHz, of up to 300 seconds.
+    """Synthesise a sound [shape=(n,)] in the room's noise, -1 to 1 at 16 kHz, of up to 300 seconds.
 
     The same arguments give the same samples. Raise `SimulationError` if there is no such sound, its
     duration is out of range, or the seed is negative.
@@ -231,9 +238,9 @@ def generator(*seed: int) -> np.random.Generator:
 
 
 def dry_sound(label: str, samples: int, rng: np.random.Generator) -> Float64:
-    """Synthesise at least one sample without the room, -1 to 1, at 16 kHz; the ends are faded.
+    """Synthesise a sound [shape=(samples,)] without the room, -1 to 1 at 16 kHz, with faded ends.
 
-    Raise `SimulationError` if there is no such sound.
+    There is at least one sample. Raise `SimulationError` if there is no such sound.
     """
     if label not in _SOUNDS:
         raise SimulationError(f"no sound is called {label!r}; there are {', '.join(LABELS)}")
