@@ -67,8 +67,8 @@ class NamedSound(NamedTuple):
     """A sound named by the network."""
 
     name: SoundName
-    first: int  # number of its first frame, and of the frame after its last
-    end: int
+    first: int  # number of its first frame
+    end: int  # number of the frame after its last
     logit: float
 
 

@@ -57,11 +57,11 @@ class NetworkCard:
     path: Path
     sha256: str
     sample_rate: int
-    window: int  # samples at 16 kHz of one input, and between successive inputs
-    hop: int
+    window: int  # samples at 16 kHz of one input
+    hop: int  # samples at 16 kHz between successive inputs
     names: tuple[str, ...]
-    input: str  # names in the network; empty for its only input or output
-    output: str
+    input: str  # name in the network; empty for its only input
+    output: str  # name in the network; empty for its only output
 
     @property
     def name(self) -> str:

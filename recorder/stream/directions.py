@@ -34,8 +34,8 @@ class DirectionGrid(NamedTuple):
     """Grid of candidate directions."""
 
     azimuths: Float64  # [shape=(a,)] in radians, counter-clockwise from x, in equal steps
-    before: Indices  # [shape=(a,)] indices of the neighbours of each direction
-    after: Indices
+    before: Indices  # [shape=(a,)] index of each direction's neighbour
+    after: Indices  # [shape=(a,)] index of the other neighbour
     step: float  # in radians
 
 
@@ -43,8 +43,7 @@ class DirectionGrid(NamedTuple):
 class ArrayGeometry:
     """Microphone positions of an array."""
 
-    # [shape=(c, 3)] position of each channel's microphone, in metres: x forward, y to the left, z
-    # up
+    # [shape=(c, 3)] each channel's microphone, in metres: x forward, y to the left, z up
     positions: Float64
 
     @property

@@ -111,8 +111,8 @@ class LogName(NamedTuple):
 
     log: str  # name of the log without suffix; for a layer, the name of its log
     layer: str  # `audio`, `review` or `relabel-<model>`; empty for a log
-    node: str  # `20260301T120000Z` with an optional ending; empty if the name is not a recorder's
-    time: str
+    node: str  # empty if the name is not a recorder's
+    time: str  # `20260301T120000Z` with an optional ending; empty like `node`
 
 
 def log_name(path: Path) -> LogName:

@@ -41,9 +41,9 @@ class Block(NamedTuple):
 
     channel: int
     log_times: Int64  # [shape=(n,)] nanoseconds of UTC
-    publish_times: Int64
+    publish_times: Int64  # [shape=(n,)] nanoseconds of UTC
     sequences: NDArray[np.uint32]  # [shape=(n,)]
-    payloads: NDArray[np.void]
+    payloads: NDArray[np.void]  # [shape=(n,), dtype V`size`]
     rank: Int64  # [shape=(n,)] order of messages with equal log times
 
     def records(self) -> NDArray[np.void]:

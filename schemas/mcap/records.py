@@ -170,8 +170,8 @@ def encode(record: McapRecord) -> bytes:
 class ChunkHead(NamedTuple):
     """The head of a chunk."""
 
-    start: int  # log times of the first and the last message, in nanoseconds
-    end: int
+    start: int  # log time of the first message, in nanoseconds
+    end: int  # log time of the last message, in nanoseconds
     size: int  # uncompressed bytes of the records
     crc: int  # CRC-32 of the uncompressed records; 0 for none
     compression: bytes  # `zstd`, `lz4`, or empty for uncompressed records

@@ -58,8 +58,8 @@ class PlannedNoise:
     """A steady noise during some time."""
 
     name: str
-    start: int  # first frame, and the frame after the last frame; including fades of a second each
-    end: int
+    start: int  # first frame, including a fade of a second
+    end: int  # frame after the last frame, including a fade of a second
 
 
 @dataclass(frozen=True)
