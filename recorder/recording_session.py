@@ -269,7 +269,6 @@ class RecordingSession:
             self._update(self._state, microphone, event)
 
     def _update(self, state: RecorderState, microphone: str, event: Event) -> None:
-        """Update the state of the recorder after an event."""
         if isinstance(event, Frames):
             pipeline = self._streams[microphone].pipeline
             state.sound[microphone] = pipeline.last_frames or event

@@ -1,8 +1,7 @@
 """Creation of files that are complete or absent, locally and in a store.
 
-Files are private to the account regardless of its umask, as data of a home are private. Files
-of a log are readable by the readers of the log. Files created by root are handed to the owner of
-the folder, and links that this account may have placed there are not followed.
+Files are private to the account regardless of its umask; those of a log are readable by its
+readers. Files of root are handed to the owner of the folder. Links placed there are not followed.
 """
 
 import errno

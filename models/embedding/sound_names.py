@@ -94,7 +94,6 @@ def named_sounds(
 
 
 def _named(name: SoundName, logits: Float64, frames: Int64, above_low: float) -> list[NamedSound]:
-    """Return the sounds of one name."""
     above = logits >= name.threshold
     rows = np.flatnonzero(above | (logits >= max(name.threshold - RELEASE, above_low)))
     if not len(rows):

@@ -1,10 +1,8 @@
 """The floor of a room: the background power in each band.
 
-The floor falls with the tenth percentile of the last minute, as in minimum statistics (Martin,
-"Noise power spectral density estimation based on optimal smoothing and minimum statistics", 2001),
-and rises only while the sound is as steady as noise. So a fan becomes part of the room, and ten
-minutes of a shower or of music do not. Steady sound no louder than a fridge belongs to the room at
-once; the floor, which is subtracted from sound, follows steady sound after a minute.
+It falls with the tenth percentile of the last minute, as in minimum statistics (Martin, "Noise
+power spectral density estimation based on optimal smoothing and minimum statistics", 2001), and
+rises only while the sound is as steady as noise.
 """
 
 from typing import NamedTuple
@@ -41,8 +39,10 @@ class Floors(NamedTuple):
 class FloorTracker:
     """Tracks the floor of one stream of frames.
 
-    Frames are averaged in blocks whose positions depend only on the frame numbers, so the same
-    frames give the same bits in blocks of any size.
+    A fan becomes part of the room, and ten minutes of a shower or of music do not. Steady sound no
+    louder than a fridge belongs to the room at once; the floor, which is subtracted from sound,
+    follows steady sound after a minute. Frames are averaged in blocks whose positions depend only
+    on the frame numbers, so the same frames give the same bits in blocks of any size.
     """
 
     def __init__(self) -> None:

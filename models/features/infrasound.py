@@ -1,8 +1,7 @@
-"""A filter of offsets, drifts and rumbles below hearing, for frames in which they stand out.
+"""A filter of offsets, drifts and rumbles below hearing, which raise the floor of the room.
 
-Infrasound raises the floor of the room and hides the sound above it. Polynomials are fitted to each
-frame separately, so a step leaves no trace in later frames. Frames in which infrasound does not
-stand out stay unchanged to the last bit, as feature sets and models expect.
+Polynomials are fitted to each frame separately, so a step leaves no trace in later frames. Frames
+in which infrasound does not stand out stay unchanged to the last bit, as models expect.
 """
 
 from functools import cache
@@ -30,8 +29,8 @@ _MOST_GAIN = 1.1  # upper bound of the power by probes, relative to the polynomi
 class InfrasoundFilter:
     """Removes infrasound below about 20 Hz from one stream of frames, while it stands out.
 
-    The same frames give the same bits in blocks of any size. `is_active`: the last frame was
-    changed.
+    Infrasound raises the floor of the room and hides the sound above it. The same frames give the
+    same bits in blocks of any size. `is_active`: the last frame was changed.
     """
 
     def __init__(self) -> None:

@@ -1,9 +1,7 @@
 """Labels and segments from the embeddings of one stream, by the names of a network alone.
 
-A sound begins with a window whose logged value is above the threshold of a name. The sound
-continues while windows at most a second apart are above the threshold or slightly below, and is
-labelled once enough windows were above. `hearthlog.models.embedding.sound_names` uses the same
-rule; here the delay is bounded and each frame has one name.
+The rule is that of `hearthlog.models.embedding.sound_names`; here the delay is bounded and each
+frame has one name.
 """
 
 import numpy as np
@@ -27,7 +25,10 @@ _STEPS = 1 << 16  # steps of a probability, as in the classifiers
 class NamesLabeller:
     """Labels one stream of frames by names; the counterpart of `Labeller`.
 
-    All frames are silence if network or projection of the embeddings differ from the model's.
+    A sound begins with a window whose logged value is above the threshold of a name. It continues
+    while windows at most a second apart are above the threshold or slightly below, and is labelled
+    once enough windows were above. All frames are silence if network or projection of the
+    embeddings differ from the model's.
     """
 
     def __init__(self, classifier: Classifier, embedding: EmbeddingSource | None = None) -> None:

@@ -325,7 +325,6 @@ def _problem_of_heads(description: Description) -> str | None:
 
 
 def _problem_of(description: Description, arrays: Mapping[str, Array]) -> str | None:
-    """Check the arrays of a model."""
     kind, classes = classifier_kind(description.kind), len(description.classes)
     dtypes = {**kind.arrays, **kind.optional, **_COMMON}
     if not kind.arrays.keys() <= arrays.keys() <= dtypes.keys():
@@ -388,7 +387,6 @@ def _problem_of_array(
 
 
 def _shapes(description: Description, arrays: Mapping[str, Array]) -> dict[str, tuple[int, ...]]:
-    """Return the required shape of each array."""
     features, classes = feature_set(description.feature_set), len(description.classes)
     width = features.inputs[description.inputs].width
     shapes = classifier_kind(description.kind).shapes(classes, width, arrays)
@@ -520,7 +518,6 @@ def model_card(model: Model) -> str:
 
 
 def _elsewhere(description: Description) -> list[str]:
-    """Describe the scores on datasets outside the training data."""
     elsewhere = description.elsewhere
     if elsewhere is None:
         return []

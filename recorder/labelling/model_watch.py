@@ -219,7 +219,7 @@ def _warn_if_simulated(model: Model) -> None:
 
 
 def _warn_if_changed(path: Path, champion: Model) -> None:
-    """Print a warning if a champion's file is not the promoted one, hence without a judgement."""
+    """Warn if a champion has no promotion check: its file was replaced or damaged."""
     is_kept = path.is_symlink() and judgements_of(path.parent)
     is_known = is_starter(champion.name, champion.sha256)
     if is_kept and not is_known and read_judgement(path.parent, champion.sha256) is None:

@@ -271,7 +271,6 @@ class RollingLog:
             )
 
     def _drop_synced(self) -> None:
-        """Drop the held messages that are on the disk."""
         while self._held:
             begins_log = self._held.begins_log
             if self._dropped == self._safe and (self._failing or not begins_log):

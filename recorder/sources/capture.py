@@ -2,9 +2,6 @@
 
 PortAudio hangs inside the process when a device vanishes, so this process can be killed at any
 moment. It imports only what PortAudio needs and computes nothing.
-
-It writes one line of JSON, a `CaptureFormat` or an error, and then blocks: a `BLOCK` header and its
-samples (int16, interleaved if there are several channels).
 """
 
 import json
@@ -235,9 +232,10 @@ class CaptureFormat:
 def main() -> None:
     """Capture from the device named by the first argument, until killed or without a parent.
 
-    Without arguments, list the devices. Further arguments: the number of channels of an array, or
-    0; the selected channel, or 0; the latency in seconds; a fifth argument of any value requires an
-    exact name.
+    Write one line of JSON, a `CaptureFormat` or an error, and then blocks: a `BLOCK` header and its
+    samples (int16, interleaved if there are several channels). Without arguments, list the devices.
+    Further arguments: the number of channels of an array, or 0; the selected channel, or 0; the
+    latency in seconds; a fifth argument of any value requires an exact name.
     """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends

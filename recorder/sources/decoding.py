@@ -1,11 +1,7 @@
 """Audio files as one stream of samples at 16 kHz: mono, or the channels of an array.
 
 Several channels become one: their mean, or the first channel, or other channels where the mean or
-first channel would hide sound. The choice is made at two time scales. Every ten seconds all
-channels are compared, long enough to tell steady noise from sound. Every 0.4 s the mixer switches
-if another channel holds sound and the selected channels do not, so a dead channel, or a talker near
-another microphone, costs less than a second of live sound. A channel that sounds again within a
-minute is mixed with the selected ones, so alternating talkers do not cause a switch every time.
+first channel would hide sound.
 """
 
 import math
@@ -129,7 +125,14 @@ class StreamMixer:
 
 
 class _Choice:
-    """Selection of channels."""
+    """Selection of channels, at two time scales.
+
+    Every ten seconds all channels are compared, long enough to tell steady noise from sound. Every
+    0.4 s the mixer switches if another channel holds sound and the selected channels do not, so a
+    dead channel, or a talker near another microphone, costs less than a second of live sound. A
+    channel that sounds again within a minute is mixed with the selected ones, so alternating
+    talkers do not cause a switch every time.
+    """
 
     def __init__(
         self, count: int, chosen: Callable[[str], object], *, takes_first: bool = False
@@ -168,7 +171,7 @@ class _Choice:
         return float(self._mixed(rows, channels, axis=0).var(axis=-1).mean())
 
     def look_at_piece(self, piece: Float32) -> None:
-        """Switch if the selected channels hold no sound in a piece [shape=(n, c)], but another."""
+        """Switch if, in a piece [shape=(n, c)], only channels that are not selected hold sound."""
         finite = _rows_of(piece, max(len(piece) // _SAMPLES, 1))
         is_lost = np.zeros(self._count, bool)
         if np.isnan(piece.sum()):  # much faster than a look at each sample

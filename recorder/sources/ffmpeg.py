@@ -1,8 +1,7 @@
 """Sound by ffmpeg: from network addresses, and from files that libsndfile cannot read.
 
-The module is also the capture process of a network microphone. It writes the blocks of
-`recorder.sources.capture`, with arrival times only; the last line of standard error is the reason
-for its end. The address comes on standard input, as all users of the machine can read arguments.
+As the capture process of an address, it writes the blocks of `recorder.sources.capture`, with
+arrival times only. The address comes on standard input, as all users can read arguments.
 """
 
 import ctypes
@@ -279,7 +278,10 @@ _SAID_BYTES = 4000
 
 
 def main() -> None:
-    """Capture from the address on standard input, until killed or without a parent."""
+    """Capture from the address on standard input, until killed or without a parent.
+
+    The last line of standard error is the reason for the end.
+    """
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a logout is no reason to end
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the recorder decides when this ends
     address = sys.stdin.read()

@@ -81,8 +81,6 @@ class FileTime(NamedTuple):
 
 
 class _Moment(NamedTuple):
-    """A parsed time."""
-
     time: datetime  # naive if the text has no zone
     step: int  # ns
 

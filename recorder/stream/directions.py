@@ -2,8 +2,7 @@
 
 The phases of the cross-spectra of all microphone pairs are steered to each direction and summed
 (DiBiase, "A high-accuracy, low-latency technique for talker localization in reverberant
-environments using microphone arrays", 2000). Each band and time step is weighted by its share that
-is neither noise floor nor echo: an echo is weaker than the sound a moment before.
+environments using microphone arrays", 2000).
 """
 
 from collections.abc import Sequence
@@ -171,7 +170,9 @@ _NOWHERE = Located(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, n
 class DirectionFinder:
     """Finds the direction of each block of one stream of frames.
 
-    Blocks are aligned to the frame numbers, so results are bit-equal for pieces of any size.
+    Each band and time step is weighted by its share that is neither noise floor nor echo: an echo
+    is weaker than the sound a moment before. Blocks are aligned to the frame numbers, so results
+    are bit-equal for pieces of any size.
     """
 
     def __init__(self, geometry: ArrayGeometry) -> None:

@@ -128,7 +128,7 @@ def opening_messages(info: Any, lines: Sequence[str] = ()) -> list[EncodedMessag
 
 
 def diagnostics(subject: str, health: SourceHealth, microphone: str = "") -> EncodedMessage:
-    """Encode the health of a subject: a microphone or recorder, or a space and a part of it."""
+    """Encode the health of a microphone or recorder, or of its part, which follows a space."""
     status = message(
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=health.level,

@@ -191,7 +191,6 @@ class Pipeline:
         return directions, messages
 
     def _add_floor(self, powers: Float64) -> None:
-        """Add the noise floor of successive frames to the sound watch."""
         self._watch.add_floor(powers)
         if len(powers):
             self._last_floor = powers[-1:]

@@ -82,7 +82,7 @@ def describes_model(record: Mapping[str, str]) -> bool:
 
 
 def unknown_version(record: Mapping[str, str]) -> str:
-    """Return the rest of a sentence, after the file, about an unsupported schema version, or ""."""
+    """Return why a schema version is not supported, to follow the file's name; else empty."""
     if schema_version(record) is not None:
         return ""
     return (

@@ -72,10 +72,7 @@ class ChunkRow:
         return self.offset, self.length, self.index_length, self.size, self.start, self.end
 
     def continues(self, location: RecordLocation) -> bool:
-        """Return whether a message record starts at the end of this run, which is not full.
-
-        The run is full at its size limit.
-        """
+        """Return whether a message starts at the end of this run, which is below its size limit."""
         is_next = self.offset + self.length == location.offset and not self.late
         is_next &= location.length < _RUN_LIMIT
         return self.index_length < 0 and is_next and self.length < _RUN_LIMIT

@@ -1,11 +1,7 @@
 """MCAP records (https://mcap.dev/spec): binary layouts, parsing and decompression with limits.
 
-Files are untrusted: every stated length is checked, and no record may be larger than `LIMIT`.
-A larger chunk is read in parts.
-
-All numbers are little-endian; times are nanoseconds. A record is its opcode, the length of its
-content, and its content. A `Struct` is the fixed start of a content, without opcode and length
-unless its comment includes them; the rows of a dtype are complete records or entries.
+Files are untrusted: every stated length is checked, and no record may be larger than `LIMIT`. A
+larger chunk is read in parts.
 """
 
 import struct
@@ -22,6 +18,9 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Schema
 
+# All numbers are little-endian; times are nanoseconds. A record is its opcode, the length of its
+# content, and its content. A `Struct` is the fixed start of a content, without opcode and length
+# unless its comment includes them; the rows of a dtype are complete records or entries.
 MAGIC = b"\x89MCAP0\r\n"
 UINT16, UINT32, UINT64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 HEAD = struct.Struct("<BQ")  # opcode, length of the content

@@ -104,7 +104,10 @@ def check_microphone_name(name: str) -> str:
 
 
 def check_scenario_name(name: str) -> str:
-    """Return a scenario's name, as a microphone's, up to 64 characters; else raise `LogError`."""
+    """Return the name of a scenario if it has the form of a microphone name.
+
+    Raise `LogError` otherwise, or if it is longer than 64 characters.
+    """
     if len(name) > _LONGEST_SCENARIO or not re.fullmatch(_MICROPHONE, name):
         raise LogError(
             f"scenario name {name[:80]!r} cannot be part of a topic: use up to "

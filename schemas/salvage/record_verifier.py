@@ -322,7 +322,6 @@ class RecordVerifier:
         return IntactAttachment(head.index_record, (offset, end), inner, head.escaped)
 
     def _crc(self, start: int, end: int) -> int:
-        """Return the checksum of a byte range of the file."""
         crc = 0
         for place in range(start, end, _PIECE):
             crc = zlib.crc32(self.read(place, min(_PIECE, end - place)), crc)

@@ -264,7 +264,6 @@ class SalvagedCopy:
         yield from stored(start + HEAD.size, end)
 
     def _add_large(self, piece: LargeChunk) -> None:
-        """Copy an unopened chunk."""
         chunk, (start, end) = piece.stored, piece.data
         dropped = [self._drops(number) for number in chunk.entries]
         if dropped and all(dropped):

@@ -1,11 +1,7 @@
 """Undamaged pieces of a truncated or damaged MCAP file, and its damages.
 
-The file is scanned record by record. Behind damaged data, the next complete record is searched
-for, so a wrong length hides nothing behind it.
-
-The time grows with the actual size of the file, not with stated sizes: undamaged data are read
-once, and futile reads of false records are limited to `_VAIN` times the bytes passed so far plus
-`4 * LIMIT`. Beyond the limit, data are skipped and reported.
+The file is scanned record by record. Behind damaged data, the next complete record is searched for,
+so a wrong length hides nothing behind it.
 """
 
 from bisect import bisect_left
@@ -61,19 +57,12 @@ class _Places(NamedTuple):
 class Salvage:
     """Reader of the undamaged pieces of a truncated or damaged MCAP file.
 
-    Raise `LogError` if the file cannot be read.
-
-    Attributes
-    ----------
-    unnamed : dict of int to tuple
-        By channel without a definition before its messages: number of messages, first and last log
-        time, and their byte range in the file.
-    size : int
-        Size of the file in bytes.
-    offset : int
-        Number of bytes passed by `pieces` so far.
-    escaped : dict of str
-        Names found so far that are not UTF-8, or of records with other texts that are not.
+    The time grows with the actual `size` of the file, in bytes, not with stated sizes: undamaged
+    data are read once, and futile reads of false records are limited to `_VAIN` times the bytes
+    passed so far (`offset`) plus `4 * LIMIT`. Beyond the limit, data are skipped and reported.
+    `unnamed` has, by channel without a definition before its messages, their number, first and last
+    log time, and byte range in the file. `escaped` has the names found so far that are not UTF-8,
+    or of records with other texts that are not. Raise `LogError` if the file cannot be read.
     """
 
     def __init__(self, path: Path, definitions: Iterable[Definition] = ()) -> None:
@@ -296,7 +285,6 @@ class Salvage:
         return end
 
     def _find_places(self, window: int) -> "_Places":
-        """Search a window for possible record heads."""
         start = window * _WINDOW
         size = min(_WINDOW + CHUNK_HEAD_LIMIT, self._reader.end - start)
         data = self._file.read(start, size)
