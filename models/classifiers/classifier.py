@@ -178,7 +178,8 @@ class Classifier:
         return self._in_steps(probabilities)
 
     def probabilities(self, inputs: Float32) -> Float32:
-        """Compute probabilities [shape=(n, C)] as `classify` does, of inputs [shape=(n, width)]."""
+        """Compute probabilities [shape=(n, C)] as `classify`, of finite inputs [shape=(n, width)].
+        """
         return self.classify(inputs)[0]
 
     def classify(

@@ -179,11 +179,12 @@ class FeatureExtractor:
         self._last_magnitude = None
 
     def __call__(self, frames: Float32) -> Float32:
-        """Compute `FEATURE_NAMES` [shape=(n, 21)] of frames [shape=(n, 800)], at 16 kHz, -1 to 1.
+        """Compute `FEATURE_NAMES` [shape=(n, 21)], in this order, of frames [shape=(n, 800)].
 
-        The definitions follow the paper (section 3.2.2) and, where the paper and its library
-        differ, of pyAudioAnalysis; see docs/features.md for the units. Samples that are not finite
-        count as 0, those beyond +-1000 are clipped; features are always finite.
+        Frames are in full scale, -1 to 1, at 16 kHz. The definitions follow the paper (section
+        3.2.2) and, where the paper and its library differ, pyAudioAnalysis; see docs/features.md
+        for the units. Samples that are not finite count as 0, those beyond +-1000 are clipped;
+        features are always finite.
         """
         values = np.empty((len(frames), self.width), np.float32)
         for start in range(0, len(frames), _FRAMES_AT_ONCE):

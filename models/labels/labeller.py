@@ -154,11 +154,11 @@ class Labeller:
     ) -> tuple[FrameLabels, list[Segment]]:
         """Add frames; return labels and segments, whose end is decided, that they complete.
 
-        `features` [shape=(n, d)] and `floors` are those of the frames; `stamps` [shape=(n,)] are
-        their starts in nanoseconds of UTC. Frames without a floor are not labelled; `floors` is
-        None if the feature set has no bands. `auxiliary` has the directions and embeddings that
-        become available with these frames. A frame has a label once its window and embeddings are
-        complete.
+        `features` [shape=(n, d)] are those of the frames, `floors` of the last of them; `stamps`
+        [shape=(n,)] are their starts in nanoseconds of UTC. Frames without a floor are not
+        labelled; `floors` is None if the feature set has no bands. `auxiliary` has the directions
+        and embeddings that become available with these frames. A frame has a label once its window
+        and embeddings are complete.
         """
         self._converge(floors, first)
         window = self._advance(features, floors if self.timing.needs_floor else None, stamps)
