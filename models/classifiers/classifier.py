@@ -178,8 +178,7 @@ class Classifier:
         return self._in_steps(probabilities)
 
     def probabilities(self, inputs: Float32) -> Float32:
-        """Compute probabilities [shape=(n, C)] as `classify`, of finite inputs [shape=(n, width)].
-        """
+        """Compute `classify`'s probabilities [shape=(n, C)] of finite inputs [shape=(n, width)]."""
         return self.classify(inputs)[0]
 
     def classify(
