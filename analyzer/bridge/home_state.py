@@ -81,11 +81,23 @@ NO_CORRECTIONS = EventCorrections(Path(), "")
 class LiveMicrophone:
     """Current labels and recent events of one microphone, by one of its models.
 
-    `unnamed` classes have no events; except for silence they are left out of `classes`. `names` are
-    all of the model, empty while unknown. `label` and `confidence` are of the newest label; empty
-    before the first. `level_dbfs` is the mean of ten seconds; NaN if unknown. `gaps` in the audio
-    are in log order; `since` is the start of the first label or segment, 0 before there is any;
-    both in nanoseconds of UTC.
+    Parameters
+    ----------
+    unnamed : collection of str, optional
+        Classes without events; except for silence they are left out of `classes`.
+
+    Attributes
+    ----------
+    names : list of str
+        Classes of the model, empty while unknown.
+    label, confidence : str, float
+        The newest label; empty before the first.
+    level_dbfs : float
+        Mean level of ten seconds; NaN if unknown.
+    gaps : list of (int, int)
+        Gaps in the audio, in nanoseconds of UTC, in log order.
+    since : int
+        Start of the first label or segment, in nanoseconds of UTC; 0 before there is any.
     """
 
     def __init__(self, name: str, unnamed: Collection[str] = (SILENCE,)) -> None:
@@ -342,11 +354,18 @@ class LiveMicrophone:
 class HomeState:
     """State of one recorder's microphones.
 
-    `scenarios` has states by scenario models: the key `<microphone>-<scenario>` is no valid
-    microphone name. `caught_up` if all earlier messages have been read, so that further ones are
-    live. `common_names` are shown for classes that a model takes for one another; `sources` are the
-    labelling sources of the newest log, None while unknown; `corrections` are what people said of
-    recent events.
+    Attributes
+    ----------
+    scenarios : dict of str to LiveMicrophone
+        States by scenario models; the key `<microphone>-<scenario>` is no valid microphone name.
+    caught_up : bool
+        Whether all earlier messages have been read, so that further ones are live.
+    common_names : mapping of str to str
+        Names that people are shown for classes that a model takes for one another.
+    sources : collection of str or None
+        Labelling sources of the newest log; None while unknown.
+    corrections : EventCorrections
+        What people said of recent events.
     """
 
     def __init__(self) -> None:

@@ -138,11 +138,17 @@ def merge_logs(
     Channels of equal topic, definition and metadata become one. Metadata records and attachments
     are copied, equal ones once; the `rosbag2` record is rebuilt.
 
-    With `latched` begin with the messages that a late subscriber would still receive: for each
-    transient local channel without expiry, the last messages before the span up to its depth, with
-    the log time of the first message in the span and their own publish times. `progress` receives
-    the completed share, 0 to 1. Raise `LogError` if a log is damaged, there is no message, there
-    are more channels than a log can have, or the output exists or cannot be written.
+    Raise `LogError` if a log is damaged, there is no message, there are more channels than a log
+    can have, or the output exists or cannot be written.
+
+    Parameters
+    ----------
+    progress : callable
+        Receives the completed share, 0 to 1.
+    latched : bool
+        Begin with the messages that a late subscriber would still receive: for each transient
+        local channel without expiry, the last messages before the span up to its depth, with the
+        log time of the first message in the span and their own publish times.
     """
     with new_file(output) as temporary, temporary.open("xb") as stream:
         return write_log(selection, stream, output.name, progress, latched=latched).repeated

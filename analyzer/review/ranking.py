@@ -142,18 +142,34 @@ def make_queue(  # noqa: PLR0913
     audible: Spans | None = None,
     progress: Progress = ignore_progress,
 ) -> ReviewQueue:
-    """Choose up to `count` spans that teach a model most, or whose labels are probably wrong.
+    """Choose the spans that teach a model most, or whose labels are probably wrong.
 
-    `other` is another labelling, to find disagreements; two names of one class are no disagreement.
-    `ranking` is one of `RANKINGS`, to rank by it alone; by default spans are ranked by the weighted
-    sum of uncertainty, disagreement and novelty, without `border_pieces`. Mostly silent spans are
-    not `uncertain`, since there is nothing to judge. The most `useful` spans sound like most of the
-    sounds that the model is uncertain of, with rare classes preferred; those within `audible`, time
-    with kept sound, go first. There is at most one span of each segment, except for `useful` spans.
-    `progress` receives the share of the logs that is read, 0 to 1.
+    Parameters
+    ----------
+    other : NamedLabelling or None
+        Another labelling, to find disagreements; two names of one class are no disagreement.
+    count : int
+        Maximum number of spans.
+    ranking : str, optional
+        One of `RANKINGS`, to rank by it alone; by default by the weighted sum of uncertainty,
+        disagreement and novelty, without `border_pieces`. Mostly silent spans are not `uncertain`,
+        since there is nothing to judge. The most `useful` spans sound like most of the sounds that
+        the model is uncertain of, with rare classes preferred.
+    audible : Spans, optional
+        Time with kept sound: `useful` spans within it go first.
+    progress : callable, optional
+        Called with the share of the logs that is read, 0 to 1.
 
-    Raise `DataError` if nothing is left to review, there is nothing to rank by, or there are more
-    than five million spans.
+    Returns
+    -------
+    ReviewQueue
+        At most one span of each segment, except for `useful` spans.
+
+    Raises
+    ------
+    DataError
+        If nothing is left to review, there is nothing to rank by, or there are more than five
+        million spans.
     """
     other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))

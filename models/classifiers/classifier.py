@@ -159,11 +159,21 @@ class Classifier:
     ) -> tuple[Float32, Float32]:
         """Mix features and embeddings: features decide on silence, both on the class of a sound.
 
-        `probabilities` [shape=(n, C)] are from `classify` without evidence, `by_heads` [shape=(n,
-        C)] from `EmbeddingHeads.log_probabilities`, NaN where there is no embedding; `evidence`
-        [shape=(n, C)] is as in `classify`. Rows without embedding and evidence keep their
-        probabilities. The result is that of `classify`: probabilities [shape=(n, C)] and novelty
-        [shape=(n,)].
+        Parameters
+        ----------
+        probabilities : np.ndarray [shape=(n, C)], float32
+            From `classify` without evidence.
+        by_heads : np.ndarray [shape=(n, C)], float64
+            From `EmbeddingHeads.log_probabilities`; NaN where there is no embedding. Rows without
+            embedding and evidence keep their probabilities.
+        evidence : np.ndarray [shape=(n, C)], float64, optional
+            Further evidence, as in `classify`.
+
+        Returns
+        -------
+        probabilities : np.ndarray [shape=(n, C)], float32
+        novelty : np.ndarray [shape=(n,)], float32
+            As from `classify`.
         """
         embedded = np.isfinite(by_heads.sum(axis=1))
         changed = embedded if evidence is None else embedded | evidence.any(axis=1)
@@ -178,7 +188,18 @@ class Classifier:
         return self._in_steps(probabilities)
 
     def probabilities(self, inputs: Float32) -> Float32:
-        """Compute `classify`'s probabilities [shape=(n, C)] of finite inputs [shape=(n, width)]."""
+        """Compute the probability of each class in each window.
+
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+            Finite.
+
+        Returns
+        -------
+        np.ndarray [shape=(n, C)], float32
+            In the order of the model's classes, as from `classify`.
+        """
         return self.classify(inputs)[0]
 
     def classify(
@@ -187,14 +208,25 @@ class Classifier:
         evidence: Float64 | None = None,
         by_heads: Float64 | None = None,
     ) -> tuple[Float32, Float32]:
-        """Compute class probabilities [shape=(n, C)] and the novelty of each window [shape=(n,)].
+        """Compute the probability of each class, and the novelty of each window.
 
-        `inputs` [shape=(n, width)] are finite. `evidence` [shape=(n, C)] is added to the logarithms
-        of the probabilities; `by_heads` is as in `mix`. Probabilities are in the order of the
-        model's classes, in steps of 2**-16, and every row sums to 1 within half a step per class;
-        older models' are not rounded. Novelty is the probability, 0 to 1, that the sound is not of
-        the likeliest class other than `unknown`; for older models the value of the kind of
-        classifier, or NaN.
+        Parameters
+        ----------
+        inputs : np.ndarray [shape=(n, width)], float32
+            Finite.
+        evidence : np.ndarray [shape=(n, C)], float64, optional
+            Further evidence, added to the logarithms of the probabilities.
+        by_heads : np.ndarray [shape=(n, C)], float64, optional
+            As in `mix`.
+
+        Returns
+        -------
+        probabilities : np.ndarray [shape=(n, C)], float32
+            In the order of the model's classes, in steps of 2**-16; every row sums to 1 within
+            half a step per class. Older models' probabilities are not rounded.
+        novelty : np.ndarray [shape=(n,)], float32
+            Probability that the sound is not of the likeliest class other than `unknown`, 0 to 1;
+            for older models the value of the kind of classifier, or NaN.
         """
         if by_heads is not None:
             return self.mix(self.classify(inputs)[0], by_heads, evidence)

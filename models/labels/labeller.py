@@ -125,12 +125,22 @@ class Labeller:
         unlabelled: int,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> None:
-        """Take over from another labeller before frame number `frame`, at which segments begin.
+        """Take over from another labeller before a frame, at which segments begin.
 
-        `features` [shape=(n, d)] and `stamps` [shape=(n,)], in nanoseconds of UTC, are of the last
-        n frames before it, `floors` [shape=(m, b)] of the last m <= n; None if the feature set has
-        no bands. `unlabelled` is the number of the first frame not labelled by the other labeller;
-        `auxiliary` covers at least the last second before the frame.
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+            Of the last n frames before that frame.
+        floors : np.ndarray [shape=(m, b)], float64, or None
+            Floors at the last m of these frames, m <= n; None if the feature set has no bands.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of these frames in nanoseconds of UTC.
+        frame : int
+            Number of the frame.
+        unlabelled : int
+            Number of the first frame not labelled by the other labeller.
+        auxiliary : Auxiliary, optional
+            Of at least the last second before the frame.
         """
         self._first_label, self._first_segment = unlabelled, frame
         powers, known = self._classifier.feature_set.band_powers, None
@@ -152,13 +162,27 @@ class Labeller:
         stamps: Int64,
         auxiliary: Auxiliary = NO_AUXILIARY,
     ) -> tuple[FrameLabels, list[Segment]]:
-        """Add frames; return labels and segments, whose end is decided, that they complete.
+        """Add successive frames.
 
-        `features` [shape=(n, d)] are those of the frames, `floors` of the last of them; `stamps`
-        [shape=(n,)] are their starts in nanoseconds of UTC. Frames without a floor are not
-        labelled; `floors` is None if the feature set has no bands. `auxiliary` has the directions
-        and embeddings that become available with these frames. A frame has a label once its window
-        and embeddings are complete.
+        Parameters
+        ----------
+        features : np.ndarray [shape=(n, d)], float32
+        floors : Floors or None
+            Floors at the last of these frames; frames without a floor are not labelled. None if the
+            feature set has no bands.
+        first : int
+            Number of the first frame.
+        stamps : np.ndarray [shape=(n,)], int64
+            Starts of the frames in nanoseconds of UTC.
+        auxiliary : Auxiliary, optional
+            Directions and embeddings that become available with these frames.
+
+        Returns
+        -------
+        labels : FrameLabels
+            Of the frames whose windows and embeddings are now complete.
+        segments : list of Segment
+            Segments whose end is decided by these frames.
         """
         self._converge(floors, first)
         window = self._advance(features, floors if self.timing.needs_floor else None, stamps)

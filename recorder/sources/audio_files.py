@@ -37,16 +37,29 @@ _NO_NUMBERS = "samples are not finite (NaN or infinity)"
 
 
 class FileSource:
-    """Several audio files in a row, as one stream of frames; samples short of a frame are dropped.
+    """Several audio files in a row, as one stream of frames.
 
-    `start` is the time of the first sample, in nanoseconds of UTC. `times` has the start of each
-    file, from `arrange`, or None for the end of the previous file; a later start makes a gap, an
-    earlier one is ignored. With `realtime`, frames come in real time. `channels` is that of an
-    array, which the files must have; None: mixed to one, as by `read_audio`. `channel` is the
-    selected one, from 1. `progress` receives the share of the sound read so far, 0 to 1.
+    Trailing samples that do not fill a frame are dropped.
 
     Raise `SourceError` if a file is missing, is not audio, is empty, has an unsupported sample
-    rate, other channels than the array, or not the selected one; if times are out of a log's range.
+    rate, other channels than the array, or not the selected one; if the times are out of the range
+    of a log.
+
+    Parameters
+    ----------
+    start : int
+        Time of the first sample in nanoseconds of UTC.
+    times : sequence of (FileTime or None), optional
+        Start of each file, from `arrange`; None, or no sequence: the end of the previous file. A
+        later start makes a gap; an earlier one is ignored, and the file follows.
+    realtime : bool
+        Whether to yield frames in real time.
+    channels : int or None
+        Channels of an array, which the files must have; None: mixed to one, as by `read_audio`.
+    channel : int or None
+        Selected channel, counted from 1.
+    progress : callable
+        Called with the share of the sound read so far, 0 to 1.
     """
 
     def __init__(  # noqa: PLR0913

@@ -63,17 +63,33 @@ def check_device(device: str) -> None:
 
 
 class MicrophoneSource:
-    """One microphone as one stream of frames; later only the same device, or the fallback, is used.
+    """One microphone as one stream of frames.
 
-    `device` is as listed by `hearthlog devices`, empty for the default one, or a network address;
-    the attribute is the current or last device, without user and password of an address.
-    `fallback`, no array, is used while it is missing. With `waits`, a device missing at the start
-    is awaited; one that lacks the channels of the array is an error without a fallback. `channels`
-    is that of an array. `channel`, from 1, is the device's; by default, and for the fallback, the
-    first, or the best one if the first has much less sound.
+    After the first successful start only the same device is used again, or the fallback.
 
     Raise `SourceError` if this machine cannot capture microphones, or cannot capture this one and
     `waits` is false; if an address is invalid.
+
+    Parameters
+    ----------
+    device : str
+        As `hearthlog devices` lists it, empty for the default one, or a network address.
+    fallback : str, optional
+        Another device, used while this one is missing; by default none. It is no array.
+    waits : bool, optional
+        Whether to wait at the start for a missing device, as later. A device that lacks the
+        channels of the array is an error without a fallback.
+    channels : int or None
+        Channels of an array; None for a single microphone.
+    channel : int or None
+        Channel of the device, counted from 1; by default, and for the fallback, the first one, or
+        the best one if the first has much less sound.
+
+    Attributes
+    ----------
+    device : str
+        Name of the current or last device; before that, as given. Without the user and the password
+        of an address.
     """
 
     def __init__(  # noqa: PLR0913

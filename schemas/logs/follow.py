@@ -129,15 +129,33 @@ def follow_messages(  # noqa: PLR0913
     infos: bool = False,
     ticks: bool = False,
 ) -> Iterator[tuple[Path, list[RawMessages]]]:
-    """Read the encoded messages of logs as they are written, from `start` on, as `follow` does.
+    """Read the encoded messages of logs as they are written; as `follow` does.
 
-    A list may be empty, as after each log that is not being written, to return control to the
-    caller. `damaged` receives the error of a damaged log, which is not read further; and once per
-    incident that of a log or a folder that is unreadable or missing, which is retried; by default
-    the error is raised. With `infos`, the `AudioStreamInfo` messages of active logs come first,
-    including those written before. With `ticks`, the folder comes with an empty list five times a
-    second while there is no new data, for callers that measure time since the last data. Raise
-    `LogError` if the folder does not exist, or any error that `damaged` raises.
+    Raise `LogError` if the folder does not exist, or any error that `damaged` raises.
+
+    Parameters
+    ----------
+    start : int, optional
+        Log time, in nanoseconds of UTC, of the first messages to read; by default only messages
+        written from now on.
+    stop : threading.Event, optional
+        Ends the reading when set; by default it never ends.
+    damaged : callable
+        Called with the error of a damaged log, which is not read further; and once per incident
+        with that of a log or a folder that is unreadable or missing, which is retried. By default
+        the error is raised.
+    infos : bool
+        Whether to start with the `AudioStreamInfo` messages of active logs, including those
+        written before.
+    ticks : bool
+        Whether to yield the folder with an empty list five times a second while there is no new
+        data, for callers that measure time since the last data.
+
+    Yields
+    ------
+    messages : list of RawMessages
+        Messages written to the log since the last time; possibly empty, as after each log that is
+        not being written, to return control to the caller.
     """
     stop = stop or Event()
     if not folder.is_dir():
