@@ -21,7 +21,7 @@ from spliced import run, small_disk, write_log
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import ROUNDING, find_coverage
-from hearthlog.analyzer.marks.formats.formats import FORMATS
+from hearthlog.analyzer.marks.formats import FORMATS
 from hearthlog.analyzer.marks.marks import (
     LATEST,
     QUEUE,

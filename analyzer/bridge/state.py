@@ -18,8 +18,8 @@ from hearthlog.recorder.log.folder_lock import node_locks
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.logs.files import log_name, walk_logs
+from hearthlog.schemas.logs.metadata import update_advice
 from hearthlog.schemas.new_files import create_file, open_lock, private_folder
-from hearthlog.schemas.release import update_advice
 
 
 class BridgeError(HearthlogError):

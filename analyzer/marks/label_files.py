@@ -11,7 +11,7 @@ from typing import NamedTuple, cast
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import ROUNDING, Coverage
 from hearthlog.analyzer.logs.text_files import read_text
-from hearthlog.analyzer.marks.formats.formats import AUDACITY, RAVEN, LabelFormat, find_format
+from hearthlog.analyzer.marks.formats import AUDACITY, RAVEN, LabelFormat, find_format
 from hearthlog.analyzer.marks.formats.labels import (
     OTHER,
     OVERLAP,

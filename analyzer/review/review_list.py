@@ -16,7 +16,7 @@ from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, pieces
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
-from hearthlog.analyzer.marks.formats.formats import find_format
+from hearthlog.analyzer.marks.formats import find_format
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.review.ranking import USEFUL, ReviewQueue
 from hearthlog.models.classes import CLASS_NAME

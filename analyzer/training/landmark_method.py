@@ -27,8 +27,7 @@ from hearthlog.models.classifiers.landmarks import (
     all_landmarks,
 )
 from hearthlog.models.classifiers.model import Array
-from hearthlog.models.classifiers.rbf_distances import RoundedDistances
-from hearthlog.models.classifiers.scaler import Scaler
+from hearthlog.models.classifiers.rbf_distances import RoundedDistances, Scaler
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
 _ROOT = 0.5  # exponent of a class's window count in its number of landmarks

@@ -40,7 +40,7 @@ def fitted_scaler(inputs: Float32) -> StandardScaler:
 
 
 def scaler_arrays(scaler: StandardScaler) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `hearthlog.models.classifiers.scaler`."""
+    """Return the arrays of `hearthlog.models.classifiers.rbf_distances`."""
     return {"scaler_mean": scaler.mean_, "scaler_scale": scaler.scale_}
 
 

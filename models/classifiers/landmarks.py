@@ -13,8 +13,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.rbf_distances import RoundedDistances
-from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
+from hearthlog.models.classifiers.rbf_distances import (
+    SCALER,
+    RoundedDistances,
+    Scaler,
+    scaler_problem,
+    scaler_shapes,
+)
 from hearthlog.schemas.arrays import Float32, Float64
 
 _LANDMARKS_AT_ONCE = 256  # no BLAS splits a product of this size among threads

@@ -23,8 +23,8 @@ from hearthlog.models.errors import ModelError
 from hearthlog.schemas.arrays import Float32, Float64, Int32, Int64
 from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.logs.metadata import update_advice
 from hearthlog.schemas.messages.topics import EmbeddingSpace
-from hearthlog.schemas.release import update_advice
 
 TEXT = re.compile(r"[^\x00-\x1f\x7f]{0,300}")  # limit of all other strings in a description
 MOST_SPANS = 1000  # forty kilobytes

@@ -1,12 +1,14 @@
 """Squared distances of windows to the vectors of a machine, scaled for its kernel."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.schemas.arrays import Float64
+from hearthlog.models.classifiers.model import Array
+from hearthlog.schemas.arrays import Float32, Float64
 
 _EXACT = 4096  # steps: its square, 2^24, is the limit up to which float32 holds all whole numbers
 _FARTHEST = 1 << 20  # steps: with a thousand inputs, sums of squares are exact in float64
@@ -107,3 +109,34 @@ def _exact(values: Float64, rounded: Float64) -> Prepared:
     """Convert values to float32 if that is exact."""
     longest = float(np.vecdot(rounded, rounded).max(initial=0.0)) ** 0.5
     return Prepared(values if longest > _EXACT else values.astype(np.float32), longest)
+
+
+SCALER: Mapping[str, np.dtype[Any]] = {
+    "scaler_mean": np.dtype(np.float64),
+    "scaler_scale": np.dtype(np.float64),
+}
+_SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
+
+
+class Scaler:
+    """Scales inputs by a model's mean and standard deviation."""
+
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
+        self._mean = arrays["scaler_mean"]
+        self._scale = arrays["scaler_scale"]
+
+    def __call__(self, inputs: Float32) -> Float64:
+        """Scale inputs, of shape (n, width)."""
+        return (inputs - self._mean) / self._scale
+
+
+def scaler_shapes(width: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays `SCALER` for a number of inputs."""
+    return dict.fromkeys(SCALER, (width,))
+
+
+def scaler_problem(arrays: Mapping[str, Array]) -> str | None:
+    """Return an error in the arrays of `Scaler`, which are finite and of valid shapes; or None."""
+    if (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
+        return None
+    return "scaler_scale has values that are not positive"

@@ -12,12 +12,15 @@ from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.learned_windows import target_problem
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import (
+    SCALER,
     Distances,
     Prepared,
     RoundedDistances,
+    Scaler,
     UnroundedDistances,
+    scaler_problem,
+    scaler_shapes,
 )
-from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.schemas.arrays import Float32, Float64
 
 HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1

@@ -22,7 +22,6 @@ from hearthlog.schemas.messages.topics import (
     check_microphone_name,
     check_scenario_name,
 )
-from hearthlog.schemas.release import update_advice
 
 HEARTHLOG_METADATA = "hearthlog"
 THINNED = "thinned"  # message kinds dropped from a log
@@ -323,3 +322,23 @@ def earlier_digests(log: Path) -> list[str]:
     with LogFile(log) as file:
         records = provenance_records(file)
     return [digest for record in records for digest in record.get(THINNED_OF, "").split()]
+
+
+_RELEASE = re.compile(r"(\d{1,4})\.(\d{1,4})\.(\d{1,4})")
+
+
+def update_advice(written_by: object) -> str:
+    """Return the advice for a file that only a later release reads in full.
+
+    `written_by` is the release that wrote the file, such as `0.4.0`; anything else, as a file may
+    contain, gives the advice without a release.
+    """
+    release, own = _numbers(written_by), _numbers(__version__)
+    if release is None or own is None or release <= own:
+        return "update hearthlog"
+    return f"update hearthlog to {written_by} or later"
+
+
+def _numbers(text: object) -> tuple[int, ...] | None:
+    found = _RELEASE.fullmatch(text) if isinstance(text, str) else None
+    return None if found is None else tuple(int(number) for number in found.groups())

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
+from hearthlog.analyzer.marks.formats import PATTERNS, find_format
 from hearthlog.schemas.errors import HearthlogError, listed, shortened
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.options import (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 from typer.core import TyperCommand
 
-from hearthlog.analyzer.marks.formats.formats import PATTERNS, find_format
+from hearthlog.analyzer.marks.formats import PATTERNS, find_format
 from hearthlog.schemas.errors import HearthlogError, printable
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.discover import add_groups, add_voices
@@ -387,7 +387,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
     """Write the spans of a queue and their kept audio, for use without a viewer."""
     from hearthlog.analyzer.logs.labelling import find_labellings
     from hearthlog.analyzer.logs.layers import find_coverage, zone_of
-    from hearthlog.analyzer.marks.formats.formats import AUDACITY
+    from hearthlog.analyzer.marks.formats import AUDACITY
     from hearthlog.analyzer.marks.label_files import write_labels
     from hearthlog.analyzer.review.review_list import (
         drawn_minutes,

@@ -10,7 +10,7 @@ from hearthlog.models.batch_invariant import aligned, rowwise_matmul
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind, NoParameters
 from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
+from hearthlog.models.classifiers.rbf_distances import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.schemas.arrays import Float32, Float64
 
 MOST_UNITS = 1024

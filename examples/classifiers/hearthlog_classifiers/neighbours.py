@@ -9,8 +9,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.rbf_distances import RoundedDistances
-from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
+from hearthlog.models.classifiers.rbf_distances import (
+    SCALER,
+    RoundedDistances,
+    Scaler,
+    scaler_problem,
+    scaler_shapes,
+)
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog_classifiers.shares import log_shares
 

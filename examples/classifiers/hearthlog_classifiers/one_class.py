@@ -10,8 +10,13 @@ from hearthlog.models.batch_invariant import aligned, rowwise_matmul
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.rbf_distances import RoundedDistances
-from hearthlog.models.classifiers.scaler import SCALER, Scaler, scaler_problem, scaler_shapes
+from hearthlog.models.classifiers.rbf_distances import (
+    SCALER,
+    RoundedDistances,
+    Scaler,
+    scaler_problem,
+    scaler_shapes,
+)
 from hearthlog.schemas.arrays import Float32, Float64
 
 _VECTORS_AT_ONCE = 128  # times the classes, a product this small no BLAS divides among threads
