@@ -9,6 +9,7 @@ import subprocess
 import termios
 import time
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 
 import numpy as np
@@ -184,6 +185,26 @@ def test_ctrl_c_at_any_question_leaves_nothing_changed(home, last):
     assert (status, lines) == (130, ["hearthlog: nothing was changed"]), shown
     assert "Traceback" not in shown
     assert list(folder.iterdir()) == []
+
+
+def test_ctrl_c_after_the_questions_leaves_nothing_changed(home):
+    folder, env = home
+    with socket.create_server(("127.0.0.1", 0)) as server:  # which never answers
+        proxy = f"http://127.0.0.1:{server.getsockname()[1]}"
+        env = env | {"HTTPS_PROXY": proxy, "https_proxy": proxy, "NO_PROXY": "", "no_proxy": ""}
+        given = [word for name, values in ANSWERED.items() for word in (name, *values)]
+        given[given.index("none")] = "yamnet"
+        given.remove("--yes")
+        with dialogue(folder, env, "--no-service", "--config", "home.toml", *given) as seen:
+            seen.answer("Do this")
+            server.settimeout(SECONDS)
+            with server.accept()[0]:
+                seen.interrupt()
+            status, shown = seen.end()
+    assert status == 130, shown
+    line = "hearthlog: interrupted: the configuration and the service are as before"
+    assert shown.splitlines()[-1] == line
+    assert times(folder) == {}
 
 
 def run(folder, env, *options):
@@ -420,6 +441,34 @@ def test_root_sets_up_a_service_that_records(unset):
     assert "-[bridge.page]" in result.stderr
     assert unset.shows("MainPID") not in {before, "0"}
     assert unset.shows("ActiveState", unit="hearthlog-bridge") == "inactive"
+
+
+def test_ctrl_c_while_the_service_starts_keeps_what_it_needs(unset):
+    unset.write(f"{UNIT}.d/slow.conf", "[Service]\nExecStartPre=/bin/sleep 100\n")
+    with ThreadPoolExecutor() as pool:
+        result = pool.submit(set_up, unset, check=False)
+        unset.wait(lambda: unset.shows("ActiveState") == "activating")
+        unset.run("pkill", "-INT", "-f", "hearthlog setup")
+        result = result.result()
+    assert result.returncode == 1
+    line = "hearthlog: interrupted: hearthlog.service is installed, and may not have started; "
+    assert result.stderr.splitlines()[-1] == f"{line}run the command again"
+    unset.run("test", "-e", "/etc/hearthlog.toml")
+    unset.run("id", "hearthlog")
+    unset.run("rm", "-r", f"{UNIT}.d")
+    assert "the labels of mic arrive" in set_up(unset).stdout
+
+
+def test_a_bridge_that_cannot_run_is_refused_before_the_recorder_is_installed(unset):
+    text = '[bridge.delivery]\nurls_file = "/root/urls"\n'
+    unset.write("/root/urls", "json://127.0.0.1:9\n")
+    unset.write("/etc/hearthlog.toml", text)
+    result = set_up(unset, check=False)
+    assert result.returncode == 1
+    assert "/root/urls: urls_file is in a folder that the service does not see" in result.stderr
+    assert unset.run("cat", "/etc/hearthlog.toml").stdout == text
+    assert unset.run("id", "hearthlog", check=False).returncode
+    assert unset.run("ls", UNIT, check=False).returncode
 
 
 def test_a_user_sets_up_a_service_that_records_in_the_current_folder(unset):

@@ -4,7 +4,7 @@ import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -127,10 +127,24 @@ def setup(
         text = _text(installation, present, answers)
         _confirm(asker, installation, present, answers, text)
     except (KeyboardInterrupt, EOFError, typer.Abort):
-        print(file=sys.stderr)
-        print_notice("nothing was changed")
-        raise typer.Exit(130) from None
-    _carry_out(installation, answers, text)
+        _end_interrupted("nothing was changed")
+    try:
+        is_recording = _carry_out(installation, answers, text)
+    except KeyboardInterrupt:
+        _end_interrupted("interrupted: the configuration and the service are as before")
+    try:
+        if is_recording:
+            _wait_for_labels(installation, answers)
+    except KeyboardInterrupt:
+        doctor = _command(installation, "doctor --live", _logs(installation))
+        _end_interrupted(f"the recorder runs, without a label yet: {doctor} says what it waits for")
+    _print_next(installation, answers)
+
+
+def _end_interrupted(line: str) -> NoReturn:
+    print(file=sys.stderr)
+    print_notice(line)
+    raise typer.Exit(130) from None
 
 
 def _installation(config: Path | None, *, service: bool) -> Installation:
@@ -223,8 +237,11 @@ def _confirm(
         raise typer.Abort
 
 
-def _carry_out(installation: Installation, answers: "Answers", text: str) -> None:
-    """Change this machine; after a failure before the start of the service it is as before."""
+def _carry_out(installation: Installation, answers: "Answers", text: str) -> bool:
+    """Change this machine; after a failure before the start of the service it is as before.
+
+    Return whether the service runs.
+    """
     from hearthlog.models.embedding.networks import find_network
     from hearthlog.tools.cli.models import fetch
     from hearthlog.tools.service import unit
@@ -237,7 +254,7 @@ def _carry_out(installation: Installation, answers: "Answers", text: str) -> Non
     is_recording = False
     try:
         with written_files(installation.config, text, answers.secrets, installation.account):
-            _check_configuration(installation)
+            _check_configuration(installation, answers)
             try:
                 is_recording = installation.has_service and _install(installation, answers)
             except unit.StartError as error:  # its needs are met: the journal says more
@@ -248,20 +265,22 @@ def _carry_out(installation: Installation, answers: "Answers", text: str) -> Non
         raise
     if failure is not None:
         raise failure
-    if is_recording:
-        _wait_for_labels(installation, answers)
-    _print_next(installation, answers)
+    return is_recording
 
 
-def _check_configuration(installation: Installation) -> None:
+def _check_configuration(installation: Installation, answers: "Answers") -> None:
     from hearthlog.recorder.errors import ConfigurationError
     from hearthlog.tools.cli.recorder import findings
+    from hearthlog.tools.service import unit
 
     if installation.folder.is_dir():
         os.chdir(installation.folder)
     errors, problems, warnings = findings(installation.config)
     if errors or problems:
         raise ConfigurationError(*map(str, errors), *problems)
+    account = installation.account
+    if account is not None and answers.has_bridge() and not unit.is_packaged(unit.BRIDGE_NAME):
+        unit.checked_bridge(installation.config, account)  # before the recorder is installed
     for line in warnings:
         print_notice(line)
 
@@ -292,11 +311,10 @@ def _wait_for_labels(installation: Installation, answers: "Answers") -> None:
     """Wait until each microphone has a label in the log that is being written."""
     from threading import Event
 
-    from hearthlog.recorder.config import load_settings
     from hearthlog.schemas.logs.follow import follow_messages
     from hearthlog.tools.cli.terminal import share_done
 
-    logs = installation.folder / load_settings(installation.config, {}, {}).output
+    logs = _logs(installation)
     end = time.monotonic() + _LABEL_SECONDS
     missing = {f"/{room}/label" for _, room in answers.microphones}
     start = time.time_ns()
@@ -320,6 +338,12 @@ def _wait_for_labels(installation: Installation, answers: "Answers") -> None:
     print_lines([f"{logs}: the labels of {', '.join(r for _, r in answers.microphones)} arrive"])
 
 
+def _logs(installation: Installation) -> Path:
+    from hearthlog.recorder.config import load_settings
+
+    return installation.folder / load_settings(installation.config, {}, {}).output
+
+
 def _command(installation: Installation, verb: str, *arguments: object) -> str:
     """Return a command in backticks, of the user who may read the logs."""
     who = "" if installation.account is None else f"sudo -u {installation.account} "
@@ -328,9 +352,7 @@ def _command(installation: Installation, verb: str, *arguments: object) -> str:
 
 def _print_next(installation: Installation, answers: "Answers") -> None:
     """Print what to do next."""
-    from hearthlog.recorder.config import load_settings
-
-    logs = installation.folder / load_settings(installation.config, {}, {}).output
+    logs = _logs(installation)
     lines = []
     if not installation.has_service:
         lines.append(f"to record: {_command(installation, 'record --config', installation.config)}")

@@ -277,9 +277,19 @@ def start_unit(name: str, *options: str, is_running: bool) -> bool:
 
     Raise `ServiceError` if it does not start.
     """
-    if not is_running:
-        _systemctl(*options, "enable", name, env={"SYSTEMD_OFFLINE": "1"})
-        return False
+    try:
+        if is_running:
+            _start(name, *options)
+        else:
+            _systemctl(*options, "enable", name, env={"SYSTEMD_OFFLINE": "1"})
+    except KeyboardInterrupt as error:
+        raise StartError(
+            f"interrupted: {name} is installed, and may not have started; run the command again"
+        ) from error
+    return is_running
+
+
+def _start(name: str, *options: str) -> None:
     _systemctl(*options, "daemon-reload")
     _systemctl(*options, "enable", name)
     try:
@@ -288,7 +298,6 @@ def start_unit(name: str, *options: str, is_running: bool) -> bool:
         raise StartError(
             f"{name} did not start; `journalctl {' '.join([*options, '-u'])} {name}` says why"
         ) from error
-    return True
 
 
 def stop_unit(name: str) -> None:
@@ -427,7 +436,15 @@ def install_bridge(config: Path, account: str | None) -> Installed:
     """
     check_root()
     unit = place_of(SYSTEM_UNITS, BRIDGE_NAME)
-    config = config.absolute()
+    write_unit(unit, checked_bridge(config.absolute(), account))
+    return Installed(unit, start_unit(BRIDGE_NAME, is_running=is_systemd_running()))
+
+
+def checked_bridge(config: Path, account: str | None) -> str:
+    """Return the unit of the bridge, after checking that it can run.
+
+    Raise `ConfigurationError` and `ServiceError` as `install_bridge`.
+    """
     check_program_seen()
     check_seen("the configuration", config)
     for name in [name for name in os.environ if name.startswith("HEARTHLOG_")]:
@@ -447,9 +464,7 @@ def install_bridge(config: Path, account: str | None) -> Installed:
     figures = None if bridge.prometheus is None else bridge.prometheus.text_file
     written = [] if figures is None else [figures.absolute().parent]
     written += [] if bridge.state is None else [bridge.state.absolute()]
-    text = bridge_unit(verb_command("bridge", config), account, RECORDER, logs, written)
-    write_unit(unit, text)
-    return Installed(unit, start_unit(BRIDGE_NAME, is_running=is_systemd_running()))
+    return bridge_unit(verb_command("bridge", config), account, RECORDER, logs, written)
 
 
 def _check_files(bridge: BridgeSettings) -> None:
