@@ -21,6 +21,7 @@ from test_service import LOGS, UNIT, USER_ID, machine, service, wait_for_labels
 
 from hearthlog.analyzer.http import free_port
 from hearthlog.tools.cli.level_meter import users_of_microphones
+from hearthlog.tools.service.unit import bridge_unit
 
 __all__ = ["machine", "service"]
 
@@ -421,12 +422,12 @@ def set_up(machine, *options, **how):
 
 
 BRIDGE_UNIT = "/etc/systemd/system/hearthlog-bridge.service"
+LIBRARY = "[Service]\nEnvironment=LD_LIBRARY_PATH=/opt/python/lib\n"  # of the bridge's Python
 
 
 def test_root_sets_up_a_service_that_records(unset):
     unset.write("/root/password", "secret\n")
-    library = "[Service]\nEnvironment=LD_LIBRARY_PATH=/opt/python/lib\n"
-    unset.write(f"{BRIDGE_UNIT}.d/python.conf", library)
+    unset.write(f"{BRIDGE_UNIT}.d/python.conf", LIBRARY)
     how = ("--microphone", "labmic=kitchen", "--node", "anna", "--page", "--mqtt", "127.0.0.1")
     login = ("--mqtt-user", "anna", "--mqtt-password-file", "/root/password")
     result = set_up(unset, *how, *login)
@@ -508,6 +509,7 @@ def test_a_service_that_cannot_run_leaves_nothing_changed(unset):
 
 
 PACKAGED = "/usr/lib/systemd/system/hearthlog.service"
+PACKAGED_BRIDGE = "/usr/lib/systemd/system/hearthlog-bridge.service"
 
 
 def test_the_service_of_a_package_is_restarted_as_it_is(unset):
@@ -522,3 +524,13 @@ def test_the_service_of_a_package_is_restarted_as_it_is(unset):
     assert f"{PACKAGED}: reads /etc/hearthlog.toml; give that" in line
     unset.run("systemctl", "disable", "--now", "hearthlog")
     unset.run("rm", PACKAGED)
+
+
+def test_the_bridge_of_a_package_reads_the_logs_and_secrets_of_the_recorder(unset):
+    text = bridge_unit([PROGRAM, "bridge", "--config", "/etc/hearthlog.toml"], None, "hearthlog",
+                       LOGS, [])  # fmt: skip
+    unset.write(PACKAGED_BRIDGE, text)
+    unset.write(f"{BRIDGE_UNIT}.d/python.conf", LIBRARY)
+    assert "the page: http://127.0.0.1:8380/?token=" in set_up(unset, "--page").stdout
+    assert unset.shows("ActiveState", unit="hearthlog-bridge") == "active"
+    unset.run("rm", PACKAGED_BRIDGE)

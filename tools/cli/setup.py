@@ -278,9 +278,8 @@ def _check_configuration(installation: Installation, answers: "Answers") -> None
     errors, problems, warnings = findings(installation.config)
     if errors or problems:
         raise ConfigurationError(*map(str, errors), *problems)
-    account = installation.account
-    if account is not None and answers.has_bridge() and not unit.is_packaged(unit.BRIDGE_NAME):
-        unit.checked_bridge(installation.config, account)  # before the recorder is installed
+    if installation.account is not None and answers.has_bridge():  # before the recorder starts
+        unit.checked_bridge(installation.config, installation.account)
     for line in warnings:
         print_notice(line)
 
@@ -297,10 +296,10 @@ def _install(installation: Installation, answers: "Answers") -> bool:
         if is_bridge and (is_user or not answers.has_bridge()):
             if installation.is_running(name):
                 unit.stop_unit(name)
-        elif installation.account is not None and unit.is_packaged(name):
+        elif installation.account is not None and not is_bridge and unit.is_packaged(name):
             unit.start_unit(name, is_running=is_running)
         else:
-            account = installation.account if is_bridge else None
+            account = installation.account if is_bridge else None  # it reads logs and secrets
             install_service(
                 user=is_user, config=installation.config, account=account, bridge=is_bridge
             )
