@@ -489,6 +489,20 @@ def test_a_user_sets_up_a_service_that_records_in_the_current_folder(unset):
     unset.run("rm", "-r", "/home/anna/hearing", "/home/anna/.config/systemd")
 
 
+def test_a_user_is_refused_a_second_recorder_on_the_machine(unset):
+    unset.run("systemctl", "start", f"user@{USER_ID}")
+    set_up(unset)
+    env = {"XDG_RUNTIME_DIR": f"/run/user/{USER_ID}", "HOME": "/home/anna"}
+    command = f"cd && {PROGRAM} setup --yes"
+    result = unset.run("sh", "-c", command, check=False, user="anna", env=env)
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[-1] == (
+        f"hearthlog: {UNIT} records on this machine: change it with `sudo hearthlog setup`, or "
+        "first end it: sudo systemctl disable --now hearthlog"
+    )
+    assert unset.run("ls", "/home/anna").stdout == ""
+
+
 def test_a_service_of_another_installation_is_left_alone(unset):
     set_up(unset)
     text = unset.run("cat", UNIT).stdout.replace(PREFIX, "/opt/other")

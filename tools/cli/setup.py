@@ -156,6 +156,12 @@ def _installation(config: Path | None, *, service: bool) -> Installation:
     folder = unit.STATE if is_system and service else Path.cwd()
     account = _ACCOUNT if is_system and service else None
     installation = Installation(config.absolute(), folder, account, service)
+    of_machine = Installation(config, folder, _ACCOUNT, service)
+    if not is_system and of_machine.is_running(unit.NAME):
+        raise SetupError(
+            f"{of_machine.unit(unit.NAME)} records on this machine: change it with `sudo hearthlog "
+            f"setup`, or first end it: sudo systemctl disable --now {unit.NAME.partition('.')[0]}"
+        )
     if service:
         for name, verb in ((unit.NAME, "record"), (unit.BRIDGE_NAME, "bridge")):
             there = installation.unit(name)
