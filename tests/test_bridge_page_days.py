@@ -189,13 +189,18 @@ def coughs_at(*hours, sure=True):
         ),
         (
             [*coughs_at(3), *coughs_at(4, sure=False), (5, 3, "crying", 0.9)],
-            "coughing twice (03:00 and 04:00, 1 of them not sure) and crying once (05:00)",
-            "zweimal Husten (03:00 und 04:00, davon 1 unsicher) und einmal Weinen (05:00)",
+            "coughing twice (1 not sure) and crying once",
+            "zweimal Husten (1 unsicher) und einmal Weinen",
+        ),
+        (
+            [*coughs_at(1, 2, 2.5, 3), (5, 3, "crying", 0.9)],
+            "coughing 4 times and crying once (05:00)",
+            "4-mal Husten und einmal Weinen (05:00)",
         ),
         (
             [*coughs_at(3), (5, 3, "crying", 0.6)],
-            "coughing once (03:00) and perhaps crying once (05:00)",
-            "einmal Husten (03:00) und vielleicht einmal Weinen (05:00)",
+            "coughing once and perhaps crying once",
+            "einmal Husten und vielleicht einmal Weinen",
         ),
     ],
 )
@@ -207,6 +212,24 @@ def test_the_sentence_tells_what_is_sure_from_what_may_be(sounds, english, germa
             "de": ("Eine ruhige Nacht: ", ", dem Klang nach."),
         }[language]
         assert sentence == f"{start}{what}{end}"
+
+
+def test_a_sentence_about_several_classes_is_short_and_begins_with_the_most_important():
+    rings = [(hour, 4, "phone_ring", 0.6 if hour > 11 else 0.9) for hour in (9, 9.5, 10, 11.1)]
+    sounds = [*coughs_at(8, 8.5, 9.1, 10.1), *coughs_at(12, sure=False), (11, 3, "yelling", 0.9)]
+    home = home_at(23, tiled((-3, 23), *sounds, *rings))._replace(is_past=True)
+    home.microphones[0].names = ["silence", "coughing", "yelling", "phone_ring"]
+    assert picture_of(home)["sentence"] == (
+        "Coughing 5 times (1 not sure) and shouting once (11:00), by the sound of it."
+    )
+    counts = {lane["label"]: lane["count"] for lane in picture_of(home)["rooms"][0]["lanes"]}
+    assert counts["phone_ring"] == 4, "the rest is below"
+    crying = [(hour, 3, "crying", 0.9) for hour in (13, 14, 15)]
+    home = home_at(23, tiled((-3, 23), *sounds, *crying))._replace(is_past=True)
+    home.microphones[0].names = ["silence", "coughing", "crying", "yelling"]
+    assert picture_of(home)["sentence"] == (
+        "Coughing 5 times (1 not sure), crying 3 times and shouting once, by the sound of it."
+    ), "none that worries is left out"
 
 
 def test_the_sentence_names_a_room_once_for_what_is_sure_and_what_may_be_there():

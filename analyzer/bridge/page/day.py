@@ -251,6 +251,7 @@ _PARTLY = ("night.partly", "day.partly", "day.past partly")
 _NOON = 12
 _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 3  # of a class
+_LONGEST = 84  # characters of a sentence about several classes: four lines of a phone
 
 
 SoundsOfRooms = dict[str, dict[str, Sequence[SoundEvent]]]  # by class and microphone
@@ -325,10 +326,26 @@ def _is_quiet(found: Mapping[str, Sequence[SoundEvent]], length: int) -> bool:
 
 
 def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
+    """Return a sentence that is short, if several classes are in it.
+
+    It has times of day and the class that worries least, as far as there is room.
+    """
+    names = ([name for name in found if name in IMPORTANT] or [*found])[:_MOST_CLASSES]
+    while True:
+        shown = {name: found[name] for name in names}
+        for times in (_MOST_CLOCKS, 1, 0):
+            sentence = _sentence_of(when, shown, home, times)
+            if not names[1:] or len(sentence) <= _LONGEST:
+                return sentence
+        if names[-1] in IMPORTANT - {PHONE_RING}:
+            return sentence
+        names.pop()
+
+
+def _sentence_of(when: str, found: SoundsOfRooms, home: HomeDay, clocks: int) -> str:
     words = home.words
-    names = [name for name in found if name in IMPORTANT] or [*found]
-    names = names[:_MOST_CLASSES]
-    parts = [_class_and_times(name, found[name], home, brief=len(names) > 1) for name in names]
+    most = clocks if len(found) > 1 else None
+    parts = [_class_and_times(name, found[name], home, most) for name in found]
     is_simple = all(len(part) == 1 for part in parts)
     texts = [", ".join(part) for part in parts]
     what = words.listed(texts) if is_simple else "; ".join(texts)
@@ -339,12 +356,17 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
 
 
 def _class_and_times(
-    name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay, *, brief: bool
+    name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay, most: int | None
 ) -> list[str]:
     """Format the counts of a class, by room: rooms may hear the same sound, so none are added.
 
-    In each room first the events that are counted on, then those that are not sure; in brief, how
-    many of all are not sure.
+    In each room first the events that are counted on, then those that are not sure.
+
+    Parameters
+    ----------
+    most : int or None
+        In a sentence about several classes, how many times of day are written out: more are left
+        out, and it says how many of all events are not sure.
     """
     words = home.words
     shown = words.inside(words.class_words(name))
@@ -352,20 +374,20 @@ def _class_and_times(
     for microphone, events in rooms.items():
         unsure = [event for event in events if home.is_unsure(event)]
         sure = [event for event in events if event not in unsure]
-        if brief and sure and unsure:
-            where = _where(name, microphone, events, home)
-            some = words.text("not sure.some", count=words.number(len(unsure)))
+        if most is not None and sure and unsure:
+            where = _where(name, microphone, events, home, most)
+            some = words.text("not sure.in brief", count=words.number(len(unsure)))
             where = f"{where}, {some}" if where else some
             times = words.times(len(events))
             parts.append(_times_of(times, where, "" if parts else shown, words))
             continue
         if sure:
-            where = _where(name, microphone, sure, home)
+            where = _where(name, microphone, sure, home, most)
             parts.append(_times_of(words.times(len(sure)), where, "" if parts else shown, words))
         if unsure:
             count = len(unsure)
             times = words.more_times(count) if sure else words.times(count)
-            where = _where(name, "" if sure else microphone, unsure, home)
+            where = _where(name, "" if sure else microphone, unsure, home, most)
             text = _times_of(times, where, "" if parts else shown, words)
             parts.append(words.text("perhaps", what=text))
     return parts
@@ -379,7 +401,9 @@ def _times_of(times: str, where: str, name: str, words: Words) -> str:
     return words.text(key, **{"class": name, "times": times, "clocks": where})
 
 
-def _where(name: str, microphone: str, events: Sequence[SoundEvent], home: HomeDay) -> str:
+def _where(
+    name: str, microphone: str, events: Sequence[SoundEvent], home: HomeDay, most: int | None
+) -> str:
     """Format in which of several rooms, and for an important class when, a sound was heard."""
     words = home.words
     place = room(microphone) if microphone and len(home.microphones) > 1 else ""
@@ -387,6 +411,8 @@ def _where(name: str, microphone: str, events: Sequence[SoundEvent], home: HomeD
         return place
     clocks = [*dict.fromkeys(clock(event.start, home.zone) for event in events)]
     when = words.listed(clocks)
+    if most is not None and len(clocks) > most:
+        return place
     if len(clocks) > _MOST_CLOCKS:
         when = words.text("range", first=clocks[0], last=clocks[-1])
     return words.text("room and clocks", room=place, clocks=when) if place else when
