@@ -464,7 +464,7 @@ def test_a_day_is_quiet_if_at_most_six_of_its_hours_have_five_minutes_of_sound(
 @pytest.mark.parametrize(
     ("hours", "text"),
     [
-        (range(5, 24), "Sunday was quiet, as far as it was recorded (19 of 24 hours)."),
+        (range(5, 24), "Sunday was quiet (19 of 24 hours recorded)."),
         (
             range(6, 18),
             "Sunday from 06:00 to 18:00: nothing but quiet. The other 12 hours were not recorded.",
@@ -501,6 +501,37 @@ def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
 ):
     write_day(tmp_path / "logs", DAY, sounds, hours=hours)
     assert text in headline(tmp_path / "logs", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("hours", "now", "hatched", "text"),
+    [
+        (range(10), "10:12", 0, "from 00:00 to 10:00: nothing but quiet. The rest of the day is not"),
+        (
+            range(8, 10),
+            "12:00",
+            100,  # of three hours
+            "nothing but quiet. 10 h 00 min before 12:00 not recorded. The rest of the day is not",
+        ),
+        (range(20), "20:30", 0, "Sunday until 20:00 was quiet."),
+        (
+            range(5, 20),
+            "20:30",
+            21,  # of a day
+            "Sunday from 05:00 to 20:00: nothing but quiet. 5 h 00 min before 20:00 not recorded.",
+        ),
+    ],
+)
+def test_hours_to_come_are_not_called_not_recorded(tmp_path, hours, now, hatched, text):
+    write_day(tmp_path / "logs", DAY, hours=hours)
+    page = tmp_path / "page.html"
+    moment = day_span(DAY, UTC)[0] + int(at(now)) * NANOSECONDS
+    make_report(find_home_logs([tmp_path / "logs"]), Period(DAY, 1, UTC), page, now=moment)
+    said = text_of(page.read_text())
+    assert text in said
+    assert "other" not in said.partition("As labelled by")[0]
+    gaps = re.findall(r'class="gap" style="left: ([\d.]+)%; width: ([\d.]+)%', page.read_text())
+    assert max((float(left) + float(width) for left, width in gaps), default=0) <= hatched
 
 
 def test_a_minute_of_a_day_is_no_hour_and_leaves_the_rest_of_the_day(tmp_path):

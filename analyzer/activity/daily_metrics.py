@@ -250,6 +250,17 @@ class DayMetrics:
     span: Spans  # a single span, like the night
     night: Spans
     coverage: Spans  # covered spans of the day
+    over: Spans  # the part of the day that is not still to come
+
+    @property
+    def coming(self) -> int:
+        """Nanoseconds of the day that are still to come."""
+        return self.span.length - self.over.length
+
+    @property
+    def missing(self) -> Spans:
+        """Spans of the day, as far as it is over, without coverage."""
+        return without(self.over, self.coverage)
 
     @property
     def share(self) -> float:
@@ -377,13 +388,22 @@ class DayMetrics:
         return Clock(60 * local.hour + local.minute)
 
 
-def day_of(home: HomeMetrics, day: date, zone: tzinfo) -> DayMetrics:
-    """Return the figures of a local day; its night is from 22:00 on the day before to 07:00."""
+def day_of(home: HomeMetrics, day: date, zone: tzinfo, now: int | None = None) -> DayMetrics:
+    """Return the figures of a local day; its night is from 22:00 on the day before to 07:00.
+
+    After `now`, in nanoseconds of UTC, the day is still to come, and so is an hour at most before
+    it that is not in the logs yet. By default the day is over.
+    """
     start, end = day_span(day, zone)
     night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))
     span = one(start, end)
     near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
-    return DayMetrics(day, near, zone, span, night, common(near.coverage, span))
+    coverage = common(near.coverage, span)
+    over = span
+    if now is not None and start < now < end:
+        recorded = int(coverage.ends[-1]) if coverage.length else start
+        over = one(start, recorded if now - recorded < HOUR else now)
+    return DayMetrics(day, near, zone, span, night, coverage, over)
 
 
 def _share(covered: Spans, span: Spans) -> float:

@@ -111,13 +111,15 @@ def _day(day: DayMetrics) -> str:
     """Return whether a day was quiet, and how much of it is known."""
     name = weekday(day.day)
     hours = rounded(day.coverage.length / MINUTE) / 60  # as the page says it
-    hours_of_day = rounded(day.span.length / HOUR)
+    hours_of_day = rounded(day.over.length / HOUR)
     if states_missing_time(day):
         return _recorded_part(day)
     lively = _lively(day)
+    if day.coming:
+        name += f" until {clock_text(int(day.over.ends[0]), day.zone)}"
     partly = ""
-    if day.span.length / HOUR - hours >= _MISSING_HOURS:
-        partly = f", as far as it was recorded ({int(hours)} of {hours_of_day} hours)"
+    if day.missing.length / HOUR >= _MISSING_HOURS:
+        partly = f" ({int(hours)} of {hours_of_day} hours recorded)"
     if not is_quiet(day):
         return f"{name} had sound in {lively.sum()} of {hours_of_day} hours{partly}."
     if not lively.any():
@@ -171,8 +173,15 @@ def _missing(day: DayMetrics) -> Iterator[str]:
     if not states_missing_time(day) or day.coverage.length < MINUTE:
         return
     hours = rounded(day.coverage.length / HOUR)
-    other = f"other {rounded(day.span.length / HOUR) - hours} hours were"
-    yield f"The {other if hours else 'rest of the day was'} not recorded."
+    number = rounded(day.over.length / HOUR) - hours
+    if day.coming:
+        if day.missing.length >= MINUTE:
+            before = Duration(day.missing.length / MINUTE).text
+            yield f"{before} before {clock_text(int(day.over.ends[0]), day.zone)} not recorded."
+        yield "The rest of the day is not recorded yet."
+    else:
+        other = f"other {number} hours were"
+        yield f"The {other if hours else 'rest of the day was'} not recorded."
 
 
 def _is_known(day: DayMetrics) -> bool:

@@ -172,7 +172,7 @@ def _description(timeline: DayTimeline) -> str:
         )
         if not lane.empty:
             parts.append(f"{lane.words} {len(lane.counted)}{uncounted}")
-    zone, spans = timeline.day.zone, without(timeline.day.span, timeline.day.coverage)
+    zone, spans = timeline.day.zone, timeline.day.missing
     gaps = [
         f"{clock_text(start, zone)} to {clock_text(end, zone)}"
         for start, end in zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)

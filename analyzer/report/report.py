@@ -1,5 +1,6 @@
 """Report of a home: from logs to a page and a picture."""
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -36,7 +37,7 @@ from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, check_day, netw
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import common, joined, one, rows_at
+from hearthlog.analyzer.logs.spans import Spans, common, joined, rows_at
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import Account
@@ -76,6 +77,7 @@ def make_report(  # noqa: PLR0913
     progress: Progress = ignore_progress,
     *,
     draw: Draw | None = None,
+    now: int | None = None,
 ) -> WrittenReport:
     """Write the report of a day or a week.
 
@@ -84,7 +86,8 @@ def make_report(  # noqa: PLR0913
     `save_timelines`, which needs matplotlib; by default there is only the page. `progress` receives
     the share of the logs read, 0 to 1. Raise `DataError` if these days have no logs or no labels,
     or the labelling does not exist; `LogError` if segments are invalid, or a file exists or cannot
-    be written.
+    be written. After `now`, in nanoseconds of UTC, by default the current time, a day is still to
+    come.
     """
     picture = page.with_suffix(".png")
     if draw is not None and picture == page:
@@ -92,7 +95,7 @@ def make_report(  # noqa: PLR0913
     paths = [page] if draw is None else [page, picture]
     for path in paths:
         check_new(path)
-    account, losses = read_account(logs, period, labelling, progress)
+    account, losses = read_account(logs, period, labelling, progress, now)
     text = day_page(account) if period.days == 1 else week_page(account)
     with ExitStack() as files:
         html, *png = [files.enter_context(new_file(path)) for path in paths]
@@ -103,7 +106,11 @@ def make_report(  # noqa: PLR0913
 
 
 def read_account(
-    logs: HomeLogs, period: Period, labelling: str = LIVE, progress: Progress = ignore_progress
+    logs: HomeLogs,
+    period: Period,
+    labelling: str = LIVE,
+    progress: Progress = ignore_progress,
+    now: int | None = None,
 ) -> tuple[Account, Sequence[str]]:
     """Read the data of a page, and the read errors.
 
@@ -121,7 +128,8 @@ def read_account(
     metrics = whole_home(data, checks)
     routines = Routines(Profiles(home_sound(data, metrics), zone, night_after=False))
     past = [day_of(metrics, day, zone) for day in earlier]
-    shown = [day_of(metrics, day, zone) for day in days]
+    now = time.time_ns() if now is None else now
+    shown = [day_of(metrics, day, zone, now) for day in days]
     span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
     account = Account(
         nodes=data.nodes,
@@ -133,7 +141,7 @@ def read_account(
         earlier=[day for day in past if any(map(day.comparable, metrics.classes))],
         judged={day: routines.judge(day) for day in days},
         beside={day: len(routines.earlier(day)) for day in days},
-        uncovered=_unrecorded(data, *span),
+        uncovered=_unrecorded(data, [day.over for day in shown]),
         gaps=_within(data.gaps, span),
         troubles=_within(data.troubles, span),
         doubts=_doubts(logs, data, labelling, shown),
@@ -183,12 +191,13 @@ def _scenarios(
     return read_scenario_minutes(logs, spans, data.lose, data.hidden)
 
 
-def _unrecorded(data: HomeData, start: int, end: int) -> dict[str, float]:
-    """Return the hours without coverage of each microphone."""
-    length = end - start
+def _unrecorded(data: HomeData, days: Sequence[Spans]) -> dict[str, float]:
+    """Return the hours of some days without coverage of each microphone."""
+    length = sum(day.length for day in days)
     hours: dict[str, float] = {}
     for (_, microphone), segments in data.segments.items():
-        own = common(joined(segments.starts, segments.ends), one(start, end)).length
+        covered = joined(segments.starts, segments.ends)
+        own = sum(common(covered, day).length for day in days)
         hours[microphone] = max(hours.get(microphone, 0.0), (length - own) / HOUR)
     return hours
 

@@ -38,8 +38,9 @@ def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
     if states_missing_time(day):  # and what sounded
         yield _off_for_the_rest(account)
     else:
-        is_partly = day.span.length - day.coverage.length >= _MINUTE  # `not_recorded` says so
-        yield f"{'' if is_partly else 'The whole day was recorded.'} {_loudest(day)}".strip()
+        is_partly = day.missing.length >= _MINUTE  # `not_recorded` says so
+        complete = "Recorded until then." if day.coming else "The whole day was recorded."
+        yield f"{'' if is_partly else complete} {_loudest(day)}".strip()
     yield _television(day)
     if account.comparable:
         yield _changes(account, day)
@@ -94,8 +95,8 @@ def not_recorded(account: Account) -> Iterator[str]:
 
     The total comes first, unless the headline has it.
     """
-    length = sum(day.span.length for day in account.days)
-    missing = length - sum(day.coverage.length for day in account.days)
+    length = sum(day.over.length for day in account.days)
+    missing = sum(day.missing.length for day in account.days)
     is_stated = len(account.days) == 1 and states_missing_time(account.days[0])
     if missing >= _MINUTE and not is_stated:
         text = Duration(missing / _MINUTE).text
@@ -156,10 +157,11 @@ def plain(name: str) -> str:
 
 def _off_for_the_rest(account: Account) -> str:
     """Return why the time missing in the headline was not recorded, if no gap explains it."""
-    missing = sum(day.span.length - day.coverage.length for day in account.days)
-    if missing - _unexplained(account) >= _MINUTE:
+    missing = sum(day.missing.length for day in account.days)
+    if missing < _MINUTE or missing - _unexplained(account) >= _MINUTE:
         return ""
-    return "In the rest of the day the recorder was off, or its logs are not here."
+    rest = "Then" if account.days[0].coming else "In the rest of the day"
+    return f"{rest} the recorder was off, or its logs are not here."
 
 
 def _loudest(day: DayMetrics) -> str:
@@ -232,7 +234,7 @@ def _unexplained(account: Account) -> int:
     starts = np.array([gap.start for gap in account.gaps], np.int64)
     ends = np.array([gap.end for gap in account.gaps], np.int64)
     explained = joined(starts, ends)
-    missing = (without(without(day.span, day.coverage), explained) for day in account.days)
+    missing = (without(day.missing, explained) for day in account.days)
     return sum(spans.length for spans in missing)
 
 

@@ -164,8 +164,8 @@ def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimel
         span,
         round(span.length / _step(day, span)),
         [_lane(day, span, name) for name in names],
-        list(_blocks(span, without(span, day.coverage))),
-        list(_runs(lefts, lengths(day.coverage, hours) < MINUTE)),
+        list(_blocks(span, common(day.missing, span))),
+        list(_runs(lefts, (lengths(day.coverage, hours) < MINUTE) & (hours[:-1] < day.over.ends[0]))),
         list(_runs(lefts, night)),
         list(_ticks(lefts, clock)),
     )
@@ -229,7 +229,7 @@ def _lane(day: DayMetrics, span: Spans, name: str) -> TimelineLane:
     spans = day.home.spans[name]
     events = joined(spans.starts, spans.ends, EVENT_PAUSE)
     counts = np.isin(events.starts, day.home.minutes.counted(name, events.starts))
-    gaps = without(without(span, day.home.listened[name]), without(span, day.coverage))
+    gaps = without(common(day.coverage, span), day.home.listened[name])
     step = _step(day, span)
     counted, uncounted = (
         (np.stack(common(Spans(events.starts[own], events.ends[own]), span), axis=1) - span.starts)
