@@ -247,7 +247,7 @@ def test_where_no_sound_was_kept_there_are_features_one_below_the_other(timeline
     microphone, grid = timeline.microphones["mic"], timeline.grid
     image, text = features_image(microphone, grid, (66, 1000))
     plot = microphone.plots[FEATURES, ""]
-    assert text == "No sound was kept here: features, energy last"
+    assert text == "Features, as no sound was kept here"
     energy = plot.values[np.arange(1000) * grid.count // 1000, plot.names.index("energy")]
     order = np.argsort(energy)
     assert (np.diff(image[-1, order]) >= 0).all()

@@ -171,7 +171,9 @@ def check_rows(png, timeline):
     assert rows[-1] == "silence"
     assert len(run) > 8
     around = slice(run[-1] - len(run) * len(rows), run[-1] + 1)
+    begin = picture.place(timeline.grid.start)
     top, bottom = picture.begin_at_cursor(around)
+    assert abs(picture.place(timeline.grid.start) - begin) <= 1, "it has the scale of the lanes"
     height = (bottom - top) / len(rows)
     checked = set()
     for time, text in blocks_of(timeline):

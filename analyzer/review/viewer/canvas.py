@@ -21,7 +21,9 @@ _STROKE_WIDTH = 2.0  # pixels
 _STRIP_LINES, _STRIP_WIDTH = 12, 5.0  # screen points
 # As many lines as fill a row of 37 points, as of nine classes in a window of 1440.
 _ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 6, 6.0, 0.8
-ROWS_HEIGHT = 0.2  # of all rows: with numbers as wide as those of lanes, both begin at one place
+# Of all rows. The space of an axis is as wide as its widest number, and digits differ in width:
+# with 0.4 here as on the axis of the lanes, both begin at one place, and have one scale of time.
+ROWS_HEIGHT = 0.44
 _SHADES = 10  # of a row; each change of its colour is a line of its own for the viewer
 _GROUND = np.array((13, 13, 13))  # behind the plots of the viewer
 _FILLING = 400  # texts that leave no pause in the data
