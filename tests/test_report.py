@@ -506,7 +506,12 @@ def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
 @pytest.mark.parametrize(
     ("hours", "now", "hatched", "text"),
     [
-        (range(10), "10:12", 0, "from 00:00 to 10:00: nothing but quiet. The rest of the day is not"),
+        (
+            range(10),
+            "10:12",
+            0,
+            "from 00:00 to 10:00: nothing but quiet. The rest of the day is not",
+        ),
         (
             range(8, 10),
             "12:00",

@@ -165,7 +165,9 @@ def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimel
         round(span.length / _step(day, span)),
         [_lane(day, span, name) for name in names],
         list(_blocks(span, common(day.missing, span))),
-        list(_runs(lefts, (lengths(day.coverage, hours) < MINUTE) & (hours[:-1] < day.over.ends[0]))),
+        list(
+            _runs(lefts, (lengths(day.coverage, hours) < MINUTE) & (hours[:-1] < day.over.ends[0]))
+        ),
         list(_runs(lefts, night)),
         list(_ticks(lefts, clock)),
     )

@@ -251,7 +251,7 @@ _PARTLY = ("night.partly", "day.partly", "day.past partly")
 _NOON = 12
 _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 3  # of a class
-_LONGEST = 84  # characters of a sentence about several classes: four lines of a phone
+_LONGEST = 72  # characters of a sentence about several classes: four lines of a phone
 
 
 SoundsOfRooms = dict[str, dict[str, Sequence[SoundEvent]]]  # by class and microphone
