@@ -224,6 +224,9 @@ def test_a_sentence_about_several_classes_is_short_and_begins_with_the_most_impo
     )
     counts = {lane["label"]: lane["count"] for lane in picture_of(home)["rooms"][0]["lanes"]}
     assert counts["phone_ring"] == 4, "the rest is below"
+    home = home_at(23, tiled((-3, 23), *sounds[:-1], *rings))._replace(is_past=True)
+    home.microphones[0].names = ["silence", "coughing", "phone_ring"]
+    assert picture_of(home)["sentence"] == "Coughing 5 times (1 not sure), by the sound of it."
     crying = [(hour, 3, "crying", 0.9) for hour in (13, 14, 15)]
     home = home_at(23, tiled((-3, 23), *sounds, *crying))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "crying", "yelling"]

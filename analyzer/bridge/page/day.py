@@ -331,10 +331,11 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     It has times of day and the class that worries least, as far as there is room.
     """
     names = ([name for name in found if name in IMPORTANT] or [*found])[:_MOST_CLASSES]
+    is_brief = len(names) > 1
     while True:
         shown = {name: found[name] for name in names}
         for times in (_MOST_CLOCKS, 1, 0):
-            sentence = _sentence_of(when, shown, home, times)
+            sentence = _sentence_of(when, shown, home, times if is_brief else None)
             if not names[1:] or len(sentence) <= _LONGEST:
                 return sentence
         if names[-1] in IMPORTANT - {PHONE_RING}:
@@ -342,9 +343,8 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
         names.pop()
 
 
-def _sentence_of(when: str, found: SoundsOfRooms, home: HomeDay, clocks: int) -> str:
+def _sentence_of(when: str, found: SoundsOfRooms, home: HomeDay, most: int | None) -> str:
     words = home.words
-    most = clocks if len(found) > 1 else None
     parts = [_class_and_times(name, found[name], home, most) for name in found]
     is_simple = all(len(part) == 1 for part in parts)
     texts = [", ".join(part) for part in parts]
@@ -365,8 +365,8 @@ def _class_and_times(
     Parameters
     ----------
     most : int or None
-        In a sentence about several classes, how many times of day are written out: more are left
-        out, and it says how many of all events are not sure.
+        In a sentence about one of several classes or more, how many times of day are written out:
+        more are left out, and it says how many of all events are not sure.
     """
     words = home.words
     shown = words.inside(words.class_words(name))
