@@ -248,7 +248,7 @@ def behind_ingress():
         connection.close()
         return found
 
-    yield SimpleNamespace(query=query, content=content, admission=admission)
+    yield SimpleNamespace(request=query, content=content, admission=admission)
     page.end()
 
 
