@@ -67,6 +67,7 @@ def test_an_evening_with_nothing_but_a_microphone(
     with recording(labmic.env) as process:
         wait_for(lambda: len(sounds()) > 5)
         info = hearthlog("info", "logs")
+        assert info.stdout.startswith("Home, microphone mic: ")
         assert "a starter model, not trained on this home" in info.stdout
         assert info.stdout.splitlines()[2].endswith("hearthlog review logs --queue")
         queue = hearthlog("review", "logs", "--queue", "--save", "ten.txt")

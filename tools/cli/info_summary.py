@@ -109,6 +109,8 @@ class Overview:
             sorted({log_name(path).node for path in self._summary.files} - {""}) if names else []
         )
         whose = f"Home {listed(nodes, 'and')}" if nodes else "Logs"
+        if nodes == ["home"]:  # the default name
+            whose = "Home"
         if names:
             whose += (
                 f", {'microphone' if len(names) == 1 else 'microphones'} {listed(names, 'and')}"
