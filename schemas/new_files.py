@@ -251,7 +251,7 @@ def _temporary(path: Path) -> Iterator[Path]:
     except FileExistsError as error:
         raise _exists(path) from error
     except OSError as error:
-        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise LogError(_not_written(path, error)) from error
     finally:
         if temporary.is_dir():
             shutil.rmtree(temporary, ignore_errors=True)
@@ -279,7 +279,12 @@ def _put_in_store(path: Any, *, new: bool) -> Iterator[Path]:
             with store_errors(path):
                 _put(temporary, path, new=new)
     except OSError as error:
-        raise LogError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise LogError(_not_written(path, error)) from error
+
+
+def _not_written(path: Any, error: OSError) -> str:
+    remedy = "; make room" if error.errno in {errno.ENOSPC, errno.EDQUOT} else ""
+    return f"{path}: cannot be written ({error.strerror or error}){remedy}"
 
 
 def _put(file: Path, path: Any, *, new: bool) -> None:

@@ -886,7 +886,8 @@ def test_a_full_disk_leaves_no_output(recorded, sound, hearthlog, tmp_path, form
         result = hearthlog("export", logs, "--output", output, "--format", form)
         assert (result.returncode, result.stdout) == (1, "")
         assert (
-            result.stderr == f"hearthlog: {output}: cannot be written (No space left on device)\n"
+            result.stderr
+            == f"hearthlog: {output}: cannot be written (No space left on device); make room\n"
         )
         assert list(disk.iterdir()) == [disk / "full"]
 

@@ -532,9 +532,9 @@ def test_hours_to_come_are_not_called_not_recorded(tmp_path, hours, now, hatched
     page = tmp_path / "page.html"
     moment = day_span(DAY, UTC)[0] + int(at(now)) * NANOSECONDS
     make_report(find_home_logs([tmp_path / "logs"]), Period(DAY, 1, UTC), page, now=moment)
-    said = text_of(page.read_text())
-    assert text in said
-    assert "other" not in said.partition("As labelled by")[0]
+    shown = text_of(page.read_text())
+    assert text in shown
+    assert "other" not in shown.partition("As labelled by")[0]
     gaps = re.findall(r'class="gap" style="left: ([\d.]+)%; width: ([\d.]+)%', page.read_text())
     assert max((float(left) + float(width) for left, width in gaps), default=0) <= hatched
 

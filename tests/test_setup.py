@@ -208,6 +208,26 @@ def test_ctrl_c_after_the_questions_leaves_nothing_changed(home):
     assert times(folder) == {}
 
 
+@pytest.mark.parametrize(
+    ("microphones", "line"),
+    [
+        (["nullsink=kitchen", "nullsink=hall"], "two microphones have the device 'nullsink'"),
+        (["nullsink=kitchen", "pulse=kitchen"], "two microphones have the name 'kitchen'"),
+    ],
+)
+def test_two_microphones_that_cannot_be_told_apart_are_refused_before_the_rest(
+    home, microphones, line
+):
+    folder, env = home
+    answered = {**ANSWERED, "--microphone": (microphones[0], "--microphone", microphones[1])}
+    given = [word for name, values in answered.items() for word in (name, *values)]
+    result = run(folder, env, "--no-service", "--config", "home.toml", *given)
+    assert result.returncode == 1
+    assert result.stderr.splitlines()[-1] == f"hearthlog: {line}: give each its own"
+    assert "Configuration" not in result.stderr
+    assert times(folder) == {}
+
+
 def run(folder, env, *options):
     return subprocess.run(
         [*FRESH_HEARTHLOG, "setup", *options], cwd=folder, env=env, stdin=subprocess.DEVNULL,
@@ -493,13 +513,14 @@ def test_a_user_is_refused_a_second_recorder_on_the_machine(unset):
     unset.run("systemctl", "start", f"user@{USER_ID}")
     set_up(unset)
     env = {"XDG_RUNTIME_DIR": f"/run/user/{USER_ID}", "HOME": "/home/anna"}
-    command = f"cd && {PROGRAM} setup --yes"
-    result = unset.run("sh", "-c", command, check=False, user="anna", env=env)
-    assert result.returncode == 1
-    assert result.stderr.splitlines()[-1] == (
-        f"hearthlog: {UNIT} records on this machine: change it with `sudo hearthlog setup`, or "
-        "first end it: sudo systemctl disable --now hearthlog"
-    )
+    for verb in ("setup --yes", "install-service --user"):
+        command = f"cd && {PROGRAM} {verb}"
+        result = unset.run("sh", "-c", command, check=False, user="anna", env=env)
+        assert result.returncode == 1
+        assert result.stderr.splitlines()[-1] == (
+            f"hearthlog: {UNIT} records on this machine: change it with `sudo hearthlog setup`, "
+            "or first end it: sudo systemctl disable --now hearthlog"
+        )
     assert unset.run("ls", "/home/anna").stdout == ""
 
 

@@ -156,12 +156,8 @@ def _installation(config: Path | None, *, service: bool) -> Installation:
     folder = unit.STATE if is_system and service else Path.cwd()
     account = _ACCOUNT if is_system and service else None
     installation = Installation(config.absolute(), folder, account, service)
-    of_machine = Installation(config, folder, _ACCOUNT, service)
-    if not is_system and of_machine.is_running(unit.NAME):
-        raise SetupError(
-            f"{of_machine.unit(unit.NAME)} records on this machine: change it with `sudo hearthlog "
-            f"setup`, or first end it: sudo systemctl disable --now {unit.NAME.partition('.')[0]}"
-        )
+    if service and not is_system:
+        unit.check_no_other_recorder()
     if service:
         for name, verb in ((unit.NAME, "record"), (unit.BRIDGE_NAME, "bridge")):
             there = installation.unit(name)
@@ -190,9 +186,16 @@ def _check_disk(installation: Installation, present: Present) -> None:
 
 
 def _text(installation: Installation, present: Present, answers: "Answers") -> str:
+    from hearthlog.recorder.addresses import public_name
     from hearthlog.recorder.errors import ConfigurationError
     from hearthlog.tools.service.configuration_file import configuration_text
 
+    devices, rooms = zip(*answers.microphones, strict=True)
+    for key, values in (("device", devices), ("name", rooms)):
+        twice = [value for value in values if values.count(value) > 1]
+        if twice:
+            shown = repr(public_name(twice[0])) if twice[0] else "of the default"
+            raise SetupError(f"two microphones have the {key} {shown}: give each its own")
     try:
         return configuration_text(present.text, answers)
     except ConfigurationError as error:

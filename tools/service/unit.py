@@ -220,6 +220,19 @@ def check_unit(unit: Path, verb: str, config: Path, folder: Path | None) -> None
         raise ServiceError(f"{unit}: reads {own}; give that: --config {own}")
 
 
+def check_no_other_recorder() -> None:
+    """Raise `ServiceError` if the service of the machine records: a user's would be a second."""
+    unit = packaged_unit(NAME) if is_packaged(NAME) else SYSTEM_UNITS / NAME
+    if not unit.exists() or not is_systemd_running():
+        return
+    command = ["systemctl", "is-active", "--quiet", NAME]
+    if subprocess.run(command, check=False).returncode == 0:  # noqa: S603
+        raise ServiceError(
+            f"{unit} records on this machine: change it with `sudo hearthlog setup`, or first end "
+            f"it: sudo systemctl disable --now {NAME.partition('.')[0]}"
+        )
+
+
 def packaged_unit(name: str) -> Path:
     """Return the path of a unit of the distribution."""
     return _PACKAGED_UNITS / name
@@ -368,6 +381,7 @@ def install_for_user(config: Path | None) -> Installed:
 
     Raise `ConfigurationError` and `ServiceError` as `install_for_system`.
     """
+    check_no_other_recorder()
     unit = place_of(user_units(), NAME)
     config = None if config is None else config.absolute()
     needs = _rehearse(Path.cwd(), config, None)
