@@ -516,14 +516,14 @@ def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
             range(8, 10),
             "12:00",
             100,  # of three hours
-            "nothing but quiet. 10 h 00 min before 12:00 not recorded. The rest of the day is not",
+            "nothing but quiet. 10 h 00 min before 12:00 were not recorded. The rest of the day is",
         ),
         (range(20), "20:30", 0, "Sunday until 20:00 was quiet."),
         (
             range(5, 20),
             "20:30",
             21,  # of a day
-            "Sunday from 05:00 to 20:00: nothing but quiet. 5 h 00 min before 20:00 not recorded.",
+            "from 05:00 to 20:00: nothing but quiet. 5 h 00 min before 20:00 were not recorded.",
         ),
     ],
 )

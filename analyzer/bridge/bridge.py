@@ -229,7 +229,7 @@ def open_outputs(
 ) -> tuple[dict[str, Output], int]:
     """Open the configured outputs; return also the log time from which they need events.
 
-    The time is nanoseconds of UTC.
+    The time is in nanoseconds of UTC.
     """
     moment = today(time.time_ns(), home.zone)
     since = min(moment.midnight, moment.night) - _EARLIER

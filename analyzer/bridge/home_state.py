@@ -255,7 +255,7 @@ class LiveMicrophone:
     ) -> dict[str, tuple[int | None, int | None]]:
         """Count the events that began since midnight, and those of the last night, by class.
 
-        None is in place of 0 if coverage is too low for a count of 0.
+        A count is None in place of 0 if coverage is too low for a count of 0.
         """
         key = self._changes, corrections.number, today[1:], self.never_tell, *self.classes
         if key != self._counts[0]:

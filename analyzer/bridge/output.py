@@ -72,7 +72,7 @@ class Totals:
     def count(self, state: HomeState, end: int | None = None) -> list[Total]:
         """Return the totals by microphone and class, of events that begin before `end`, if given.
 
-        It is in nanoseconds of UTC. A class without events has 0.
+        `end` is in nanoseconds of UTC. A class without events has 0.
         """
         sums = {total[:2]: total for total in self._kept.totals}
         for microphone in state.every():

@@ -176,8 +176,8 @@ def _missing(day: DayMetrics) -> Iterator[str]:
     number = rounded(day.over.length / HOUR) - hours
     if day.coming:
         if day.missing.length >= MINUTE:
-            before = Duration(day.missing.length / MINUTE).text
-            yield f"{before} before {clock_text(int(day.over.ends[0]), day.zone)} not recorded."
+            missing, end = Duration(day.missing.length / MINUTE).text, int(day.over.ends[0])
+            yield f"{missing} before {clock_text(end, day.zone)} were not recorded."
         yield "The rest of the day is not recorded yet."
     else:
         other = f"other {number} hours were"

@@ -400,7 +400,7 @@ class Delivery:
 def message(notification: Notification, zone: tzinfo, now: int | None = None) -> str:
     """Format a notification: local time, text, and a remark if late by `now` (nanoseconds of UTC).
 
-    The current time is the default.
+    By default `now` is the current time.
     """
     late = (time.time_ns() if now is None else now) - notification.due > _LATE
     moment = f"{local_time(notification.time, zone):%Y-%m-%d %H:%M}"

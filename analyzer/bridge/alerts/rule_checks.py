@@ -61,7 +61,7 @@ def unknown_microphone(
 ) -> str:
     """Report that a rule's microphone is not configured or, if `recorded`, not in the logs.
 
-    Empty if it is.
+    Empty if the microphone is there.
     """
     name = rule.microphone if isinstance(rule, SoundRule) else ""
     if not microphones or name in {"", *microphones}:

@@ -87,7 +87,7 @@ class _Content(BaseModel, extra="forbid"):
 class RetainedTopics:
     """Persistent record of retained topics, muted classes and last published events.
 
-    `is_new` if there was no record.
+    `is_new`: there was no record.
     """
 
     def __init__(self, state: BridgeState, say: Callable[[str], None]) -> None:
