@@ -486,7 +486,7 @@ def test_a_full_disk_leaves_no_output(recorded, refused, tmp_path):
     with small_disk(tmp_path / "disk", "200k") as disk:
         output = disk / "x.mcap"
         message = refused("merge", recorded, "-o", output)
-        assert message == f"{output}: cannot be written (No space left on device)"
+        assert message == f"{output}: cannot be written (No space left on device); make room"
         assert list(disk.iterdir()) == []
 
 
