@@ -138,7 +138,7 @@ def _read_pause(folder: Path) -> bytes:
 
 
 def _is_paused(folder: Path) -> bool:
-    if not (folder / _PAUSE_FILE).exists():
+    if not os.path.exists(f"{folder}/{_PAUSE_FILE}"):  # noqa: PTH110  at each block of sound
         return False
     end = paused_until(folder)
     return end is None or time.time() < end

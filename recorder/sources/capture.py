@@ -304,8 +304,7 @@ def _capture(  # noqa: PLR0913, PLR0917
             head, samples = blocks.get(timeout=1.0)
         except queue.Empty:
             continue
-        output.write(head)
-        output.write(_some_channels(samples, channels, wanted))
+        output.write(head + _some_channels(samples, channels, wanted))  # one wake-up of the reader
 
 
 def _open(

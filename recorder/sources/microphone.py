@@ -43,7 +43,8 @@ from hearthlog.schemas.frames import NANOSECONDS
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source
 _RETRY_SECONDS = (0.5, 1.0, 2.0, 5.0, 10.0)
 _HEALTH_SECONDS = 10.0
-_LOOK_SECONDS = 0.25
+_LOOK_SECONDS = 0.25  # between looks at the end of a pause
+_BLOCK_WAIT_SECONDS = 0.7  # for a block: more than its length, as each wake-up costs
 _OVERFLOWS, _OVERFLOW_SECONDS = 5, 60.0  # so many in this time require a longer buffer
 _SILENT_FRAMES = 200  # ten seconds
 _FALLBACK_SECONDS = 10.0  # from the loss of the device to the fallback
@@ -181,7 +182,7 @@ class MicrophoneSource:
         last_block = time.monotonic() + max(_FIRST_BLOCK_SECONDS - stale, 0.0)
         while not stop.is_set():
             try:
-                blocks = capture.blocks(_LOOK_SECONDS)
+                blocks = capture.blocks(_BLOCK_WAIT_SECONDS)
             except DeviceError as error:
                 return str(error)
             if blocks is None:
