@@ -7,6 +7,9 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
+# As in the command, and before the import of numpy: idle threads of BLAS burn a core.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 from brokers import broker
