@@ -235,7 +235,7 @@ def lines_to(take: Callable[[str], None]) -> Iterator[None]:
         _takers.remove(take)
 
 
-def say(text: str) -> None:
+def announce(text: str) -> None:
     """Print a line on standard error."""
     if _takers:
         _takers[-1](f"hearthlog: {text}")
@@ -268,7 +268,7 @@ class HealthJournal:
         is_old = now - self._reported_at.get(microphone, 0.0) >= _AGAIN_SECONDS
         if trouble != before or (trouble and is_old):
             self._reported_at[microphone] = now
-            say(f"{microphone}: {health.summary}")
+            announce(f"{microphone}: {health.summary}")
 
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of malloc.h

@@ -11,7 +11,7 @@ from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.starter import BY_FEATURES, NETWORK
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Event, Frames, Gap, SoundSource, merged_events
-from hearthlog.recorder.host import ServiceManager, keep_freed_blocks, keep_one_heap, say
+from hearthlog.recorder.host import ServiceManager, announce, keep_freed_blocks, keep_one_heap
 from hearthlog.recorder.labelling.embedder_probe import (
     NO_NETWORK,
     check_network,
@@ -196,7 +196,7 @@ def _embedder(settings: Settings, microphones: int) -> tuple[Embedder | None, st
     """Return the embedding network, or why there is none; print the reason if it failed to load."""
     embedder, why = open_embedder(settings.embedding, microphones)
     if why:
-        say(why)
+        announce(why)
         return embedder, "the network cannot be used"
     if embedder is not None:
         return embedder, f"it does not use the network {embedder.source.network}"
@@ -216,7 +216,7 @@ def _report_starters(
             by = f"features alone, as {why}"
         if name:
             who = f"the starter model {name}, not trained on this home"
-            say(f"the labels are by {who}: by {by}")
+            announce(f"the labels are by {who}: by {by}")
 
 
 def _record(  # noqa: PLR0913, PLR0917

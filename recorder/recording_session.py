@@ -28,7 +28,7 @@ from hearthlog.recorder.events import (
     SourceHealth,
     event_time,
 )
-from hearthlog.recorder.host import HealthJournal, MachineWatch, say
+from hearthlog.recorder.host import HealthJournal, MachineWatch, announce
 from hearthlog.recorder.labelling.labelling_models import LabellingModels, ModelChange
 from hearthlog.recorder.log.clips import ClipRecorder
 from hearthlog.recorder.log.description import LogDescription, describe_log, join_descriptions
@@ -247,7 +247,7 @@ class RecordingSession:
             for labelling, (model, classifier) in stream.models.in_use.items():
                 of_it = labelling == LIVE or is_by_names(model)
                 if of_it and (why := classifier.lacking_embeddings(stream.pipeline.embedding)):
-                    say(f"{name}: model {model.name}: {why}")
+                    announce(f"{name}: model {model.name}: {why}")
 
     def add(self, microphone: str, event: Event) -> None:
         """Record an event of a source; for audio files raise `LogError` as `RollingLog.write`."""
@@ -263,7 +263,7 @@ class RecordingSession:
             self._journal.add(microphone, stream.pipeline.judged(event))
             self._look_at_the_machine(stream, event.stamp)
         for notice in self._log.notices():
-            say(notice.text)
+            announce(notice.text)
             self._log.write(stream.pipeline.notice_messages("disk", self._now, notice))
         if self._state is not None:
             self._update(self._state, microphone, event)
@@ -321,7 +321,7 @@ class RecordingSession:
             messages, problems = self._keeper.tick(self._now)
             self._log.write(stream.pipeline.release(messages))
             for problem in problems:
-                say(problem)
+                announce(problem)
 
     def _look_at_the_machine(self, stream: MicrophoneStream, stamp: int) -> None:
         """Log the health of the host, at most as often as that of the first microphone."""

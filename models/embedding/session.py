@@ -197,7 +197,7 @@ class OnnxModel:
     """
 
     def __init__(
-        self, data: bytes, window: int, input_name: str = "", whose: str = "its card"
+        self, data: bytes, window: int, input_name: str = "", owner: str = "its card"
     ) -> None:
         self._runtime = _runtime()
         _check_file(data)
@@ -211,7 +211,7 @@ class OnnxModel:
             )
         except Exception as error:  # onnxruntime raises a dozen types without a common base
             raise ModelError(f"is no network that onnxruntime takes ({error})") from error
-        self._input, self._shape = self._only_input(window, input_name, whose)
+        self._input, self._shape = self._only_input(window, input_name, owner)
         self.outputs = {each.name: list(each.shape) for each in self._session.get_outputs()}
 
     def run(self, samples: Float32, outputs: Sequence[str], options: Any = None) -> list[Any]:
@@ -258,7 +258,7 @@ class OnnxModel:
             watch.cancel()
         return values
 
-    def _only_input(self, window: int, input_name: str, whose: str) -> tuple[str, tuple[int, ...]]:
+    def _only_input(self, window: int, input_name: str, owner: str) -> tuple[str, tuple[int, ...]]:
         """Return the name of the input, and the shape of its samples."""
         inputs = {each.name: each for each in self._session.get_inputs()}
         wanted = input_name or next(iter(inputs), "")
@@ -270,7 +270,7 @@ class OnnxModel:
         fits = all(not isinstance(dim, int) or dim == size for dim, size in zip(dims, shape))  # noqa: B905  a network without dimensions has none
         if kind != "tensor(float)" or not dims or not fits:
             what = f"{wanted}: {kind} of shape {dims}"
-            raise ModelError(f"takes {what}; the window of {whose} has {window} samples")
+            raise ModelError(f"takes {what}; the window of {owner} has {window} samples")
         return wanted, shape
 
 
@@ -282,7 +282,7 @@ class OnnxSession:
     """
 
     def __init__(self, data: bytes, window: int, embedding: int, names: int) -> None:
-        self._model = OnnxModel(data, window, whose="this network")
+        self._model = OnnxModel(data, window, owner="this network")
         self._outputs = [self._output(width) for width in (embedding, names)]
 
     def _output(self, width: int) -> str:

@@ -16,7 +16,7 @@ from hearthlog.models.modelfile.modelfile import SUFFIX
 from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
 from hearthlog.recorder.config import NO_MODEL, Settings
 from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.recorder.host import say
+from hearthlog.recorder.host import announce
 from hearthlog.recorder.labelling.model_watch import (
     CandidateWatch,
     Loaded,
@@ -133,7 +133,7 @@ class LabellingModels:
         """Return the refusals of models since the last call, and check for new models."""
         refusals = [f"{text}; it is left out until the next start" for text in self._left_out or ()]
         for text in refusals:
-            say(text)
+            announce(text)
         if self._left_out:
             self._left_out = []
         for watch in self._watches.values():

@@ -25,7 +25,7 @@ from hearthlog.models.modelfile.registry import (
     read_judgement,
 )
 from hearthlog.models.starter import GENERAL, STARTERS
-from hearthlog.recorder.host import give_back, say
+from hearthlog.recorder.host import announce, give_back
 
 LOOK_SECONDS = 1.0
 
@@ -98,7 +98,7 @@ class ModelWatch:
         except ModelError as error:
             raise ModelError(f"{self._where()}{error}") from error
         for line in damaged:
-            say(f"{self._where()}{line}. It keeps labelling")
+            announce(f"{self._where()}{line}. It keeps labelling")
         if not damaged and not self._scenario:
             _warn_if_changed(path, loaded.model)
         return loaded
@@ -126,7 +126,7 @@ class ModelWatch:
         if is_known:
             return ""
         text = self._refusal(self.held.model.name, reason)
-        say(text)
+        announce(text)
         return text
 
     def close(self) -> None:
@@ -201,7 +201,7 @@ class ModelWatch:
     def _refuse(self, reason: str, name: str = "") -> None:
         text = self._refusal(name or self._path.stem, reason)
         self._results.put(text)
-        say(text)
+        announce(text)
 
     def _refusal(self, name: str, reason: str) -> str:
         return f"{self._where()}model {name} refused: {reason}; going on with {self._last.name}"
@@ -212,7 +212,7 @@ class ModelWatch:
 
 def _warn_if_simulated(model: Model) -> None:
     if model.description.training_data.simulated:
-        say(
+        announce(
             f"model {model.name} was trained on simulated sounds only and is mostly wrong about "
             "real ones, whatever its confidence; train one from recordings"
         )
@@ -223,7 +223,7 @@ def _warn_if_changed(path: Path, champion: Model) -> None:
     is_kept = path.is_symlink() and judgements_of(path.parent)
     is_known = is_starter(champion.name, champion.sha256)
     if is_kept and not is_known and read_judgement(path.parent, champion.sha256) is None:
-        say(
+        announce(
             f"model {champion.name} is not the file that was promoted: it was replaced, or the "
             "disk has changed a bit of it; it keeps labelling. Restore it from a backup, or "
             f"check the present file with `hearthlog models promote {champion.name}`"
@@ -313,4 +313,4 @@ class CandidateWatch:
         text = f"candidate refused: {reason}"
         self._results.put(text)
         self._results.put(None)
-        say(text)
+        announce(text)

@@ -67,7 +67,7 @@ class TypeChecks:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._hashes: dict[str, str] = {}
-        self._told: set[tuple[str, ...]] = set()
+        self._reported: set[tuple[str, ...]] = set()
         node.create_timer(_CHECK_SECONDS, self._check)
 
     def expect(self, topic: str, type_hash: str) -> None:
@@ -92,9 +92,9 @@ class TypeChecks:
                     self._tell(topic, end.node_name, end.topic_type, theirs, expected)
 
     def _tell(self, topic: str, node: str, name: str, theirs: str, expected: str) -> None:
-        if (topic, node, theirs) in self._told:
+        if (topic, node, theirs) in self._reported:
             return
-        self._told.add((topic, node, theirs))
+        self._reported.add((topic, node, theirs))
         self._node.get_logger().error(
             f"{topic}: node {node} has another {name} ({theirs[:15]}…, here {expected[:15]}…) and "
             f"understands nothing of it: build hearthlog_msgs there anew, from this hearthlog"
@@ -119,7 +119,7 @@ def wait_for_subscribers(publishers: Iterable[Any]) -> None:
 
 
 def run(make_node: Callable[[], Any]) -> None:
-    """Run a node until it is enough, Ctrl-C comes, or it is asked to end.
+    """Run a node until it is enough, Ctrl-C comes, or a request to end.
 
     The handlers of rclpy are not used: they end the context while others publish.
     """

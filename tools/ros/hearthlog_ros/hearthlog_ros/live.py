@@ -30,8 +30,8 @@ _DELAY_SECONDS = 1.5  # a block of sound, a new file, writing and reading, and a
 _LOOK_SECONDS = 0.5  # for a folder that is not there yet
 _FIND_SECONDS = 3.0  # of patience with subscribers that want another quality of service
 _FIND_LOOK_SECONDS = 0.02
-_HEARD = ("", AUDIO_LAYER)  # layers; the others speak of what was heard before
-_EVERY_FRAME = ("/features", "/label")  # others speak now and then, and of what was before
+_SOUND_LAYERS = ("", AUDIO_LAYER)  # the others are about earlier sound
+_EVERY_FRAME = ("/features", "/label")  # others are less frequent, and about earlier sound
 _BEFORE = 10_000_000_000  # ns that a recorder's clock may be behind
 _NANOSECONDS = 1_000_000_000
 
@@ -118,16 +118,16 @@ class Live(Node):
         while not self._folder.is_dir():
             if self._stop.wait(_LOOK_SECONDS):
                 return
-        tell = self.get_logger().error
+        report = self.get_logger().error
         followed = follow_messages(
             self._folder,
             start=start,
             stop=self._stop,
-            damaged=lambda error: tell(str(error)),
+            damaged=lambda error: report(str(error)),
             infos=True,
         )
         for path, parts in followed:
-            if log_name(path).layer in _HEARD:
+            if log_name(path).layer in _SOUND_LAYERS:
                 yield parts
 
     def _publish(self, part: RawMessages, row: int) -> None:
