@@ -17,9 +17,9 @@ demo: $(VENV)/.analyzer
 	$(BIN)/hearthlog demo --output demo
 
 # SEED=7 tries other examples of what tests draw at random; without it they are the same every time.
-# Three at once, for many tests wait for sound.
+# Four at once, for many tests wait for sound.
 test: $(VENV)/.dev
-	$(BIN)/pytest -n 3 --dist worksteal $(if $(SEED),--hypothesis-seed=$(SEED))
+	$(BIN)/pytest -n 4 --dist worksteal $(if $(SEED),--hypothesis-seed=$(SEED))
 
 # What developers measure with: a short form of each.
 test-lab: $(VENV)/.dev

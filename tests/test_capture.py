@@ -76,14 +76,11 @@ def realtime_offset():
     return time.time_ns() - time.monotonic_ns()
 
 
-@pytest.mark.parametrize("seconds", [60])
-def test_every_sample_of_a_minute_is_heard_and_gives_the_features_of_the_batch(
-    labmic, tmp_path, seconds
-):
+def test_every_sample_is_captured_and_gives_the_features_of_the_batch(labmic, tmp_path):
     data = sound()
     labmic.configure(data=data)
     with recording(labmic, tmp_path / "logs") as process:
-        wait_for_frames(tmp_path / "logs", seconds * 20, seconds + 30)
+        wait_for_frames(tmp_path / "logs", 20 * 20, 50)
     assert process.returncode == 0, process.errors
     frames, stamps, values = features(tmp_path / "logs")
     np.testing.assert_array_equal(frames, np.arange(len(frames)))
