@@ -14,6 +14,7 @@ import typer
 from hearthlog.analyzer.marks.formats import PATTERNS, find_format
 from hearthlog.schemas.errors import HearthlogError, listed, shortened
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.new_files import check_new
 from hearthlog.tools.cli.options import (
     End,
     LocalLog,
@@ -186,7 +187,6 @@ def export_labels(
     from hearthlog.analyzer.logs.layers import find_coverage
     from hearthlog.analyzer.marks.label_files import write_labels
     from hearthlog.analyzer.marks.marks import read_marks
-    from hearthlog.schemas.new_files import check_new
 
     _check_use(output, scenario)
     check_new(output)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hearthlog.schemas.errors import listed
+from hearthlog.schemas.frames import millisecond_text
 from hearthlog.tools.cli.options import End, Json, Start, Timezone, log_location, parse_span
 from hearthlog.tools.cli.terminal import (
     end_with_warnings,
@@ -110,7 +112,6 @@ def bridge(
 
 def _unmute(state: "BridgeState", classes: list[str], say: "Callable[[str], None]") -> None:
     from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics
-    from hearthlog.schemas.errors import listed
 
     topics = RetainedTopics(state, say)
     muted = topics.muted()
@@ -207,7 +208,6 @@ def replay(
 def _check_node(home: "HomeLogs", node: str) -> None:
     from hearthlog.analyzer.activity.segments import nodes_of
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.schemas.errors import listed
 
     nodes = nodes_of(home)
     if node not in nodes:
@@ -229,8 +229,6 @@ def _span(home: "HomeLogs", node: str, first: int | None, last: int | None) -> t
 
 
 def _utc(time: int) -> str:
-    from hearthlog.schemas.frames import millisecond_text
-
     return f"{millisecond_text(time)[:16]}Z"
 
 

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.schemas.errors import HearthlogError
+from hearthlog.tools.cli.options import parse_time, starter_here
+
 if TYPE_CHECKING:
     from hearthlog.models.classifiers.model import Model
     from hearthlog.tools.home.simulate import LabelledSpan, Truth
@@ -42,9 +45,7 @@ def demo(
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.recording import record_files
     from hearthlog.recorder.sources.audio_files import FileSource
-    from hearthlog.schemas.errors import HearthlogError
     from hearthlog.tools.cli.info import info
-    from hearthlog.tools.cli.options import parse_time, starter_here
     from hearthlog.tools.home.simulate import write_day
 
     if look and not has_display():

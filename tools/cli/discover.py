@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.schemas.errors import printable
+from hearthlog.schemas.frames import read_time, time_text
+from hearthlog.schemas.new_files import new_file
 from hearthlog.tools.cli.options import (
     End,
     Json,
     LocalLogs,
     Start,
     Timezone,
+    check_output,
     parse_span,
     reviewer_name,
 )
@@ -264,7 +267,6 @@ def _print(summary: "GroupsSummary", zone: "tzinfo") -> None:
 
 def _place(summary: "GroupSummary | VoiceSummary", zone: "tzinfo") -> str:
     from hearthlog.analyzer.logs.local_time import local_time
-    from hearthlog.schemas.frames import read_time
 
     example = summary.examples[0]
     start = local_time(read_time(example.start), zone)
@@ -328,7 +330,6 @@ def voices(
     from hearthlog.analyzer.discover.voices import VOICES, load_voices, save_voices
     from hearthlog.analyzer.logs.home_logs import find_home_logs
     from hearthlog.analyzer.logs.local_time import home_zone
-    from hearthlog.tools.cli.options import check_output
 
     if output is not None:
         check_output("--output", output, ".csv", "a table")
@@ -391,8 +392,6 @@ def _write_turns(output: Path, speech: "HomeSpeech", voices: "HomeVoices", of: "
 
     from hearthlog.analyzer.discover.speech import spoken_spans
     from hearthlog.analyzer.logs.text_files import disarmed
-    from hearthlog.schemas.frames import time_text
-    from hearthlog.schemas.new_files import new_file
 
     with (
         new_file(output) as temporary,

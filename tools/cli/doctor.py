@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.errors import abridged, printable, shortened
+from hearthlog.schemas.errors import LogError, abridged, printable, shortened
+from hearthlog.schemas.new_files import new_file
 from hearthlog.tools.cli.options import Json, LocalLogs, check_output
-from hearthlog.tools.cli.terminal import number, print_lines, print_notice, wrong_use
+from hearthlog.tools.cli.terminal import number, print_lines, print_notice, share_done, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.doctor.findings import Findings
@@ -59,7 +60,6 @@ def doctor(
         _examine_live(paths[0], ping_url, ping_file, as_json=as_json)
         return
     from hearthlog.analyzer.doctor.examination import examine
-    from hearthlog.tools.cli.terminal import share_done
 
     missing: list[str] = []
     with share_done("reading logs") as progress:
@@ -79,7 +79,6 @@ def _network_changes(paths: list[Path]) -> list[str]:
     """Return when a home gained, changed or lost a network, which is no fault of a log."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs, network_changes
     from hearthlog.analyzer.logs.local_time import home_zone
-    from hearthlog.schemas.errors import LogError
 
     try:
         home = find_home_logs(paths)
@@ -92,7 +91,6 @@ def _write_bundle(bundle: Path, folder: Path) -> None:
     from zipfile import ZIP_DEFLATED, ZipFile
 
     from hearthlog.analyzer.recorder_status import support_bundle
-    from hearthlog.schemas.new_files import new_file
 
     check_output("--bundle", bundle, ".zip", "a bundle")
     with new_file(bundle) as temporary, ZipFile(temporary, "x", ZIP_DEFLATED) as archive:
@@ -175,8 +173,6 @@ def recover(
 
     The log itself is not changed. Exit status 3: something was lost.
     """
-    from hearthlog.schemas.errors import LogError
-
     if output is not None and (len(logs) > 1 or in_place):
         wrong_use("--output goes with one log, and not with --in-place")
     report = []
@@ -203,9 +199,7 @@ def recover(
 
 def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
     from hearthlog.schemas.logs.files import SUFFIX, stem
-    from hearthlog.schemas.new_files import new_file
     from hearthlog.schemas.salvage.recover import recover_in_place, recover_log
-    from hearthlog.tools.cli.terminal import share_done
 
     with share_done(f"recovering {log.name}") as progress:
         if in_place:

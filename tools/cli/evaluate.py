@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperGroup
 
-from hearthlog.schemas.errors import shortened
+from hearthlog.schemas.errors import Progress, shortened
 from hearthlog.tools.cli.options import (
     METHOD,
     METHODS,
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.training.method import Method
     from hearthlog.analyzer.training.scores import Bin, Scores
     from hearthlog.models.classifiers.model import Model
-    from hearthlog.schemas.errors import Progress
 
 
 ModelFile = Annotated[Path, typer.Argument(help="Model file.")]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+from hearthlog.schemas.errors import LogError, listed
 from hearthlog.tools.cli.options import End, Json, Logs, Start, Timezone, parse_span, read_day
 from hearthlog.tools.cli.terminal import (
     end_with_warnings,
@@ -143,7 +144,6 @@ def _chosen_span(
     from hearthlog.analyzer.logs.home_logs import check_day
     from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
     from hearthlog.analyzer.logs.local_time import today as today_at
-    from hearthlog.schemas.errors import LogError
 
     ends = logs.end()
     if ends is None:
@@ -243,7 +243,6 @@ def _print(
 ) -> None:
     from hearthlog.analyzer.logs.local_time import local_time
     from hearthlog.models.classes import in_words
-    from hearthlog.schemas.errors import listed
 
     several = len({name for event in found for name in event.microphones}) > 1
     days = len({_date(event.start, zone) for event in found}) > 1
@@ -315,7 +314,6 @@ def _play(found: Sequence["HomeEvent"], logs: "HomeLogs", zone: tzinfo) -> None:
     from hearthlog.analyzer.logs.clips import kept_sound, play_sound
     from hearthlog.analyzer.logs.local_time import local_time
     from hearthlog.models.classes import in_words
-    from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.files import audio_path
     from hearthlog.schemas.messages.topics import LIVE, labelling_topic
 

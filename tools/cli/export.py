@@ -13,6 +13,7 @@ from hearthlog.tools.cli.terminal import (
     end_with_warnings,
     number,
     print_notice,
+    share_done,
     unfinished_lines,
     wrong_use,
 )
@@ -64,7 +65,6 @@ def export(
     from hearthlog.analyzer.export.exporter import export as save
     from hearthlog.analyzer.export.exporter import exportable
     from hearthlog.analyzer.logs.selection import select
-    from hearthlog.tools.cli.terminal import share_done
 
     if in_place:
         if output_format != "rosbag2" or output or topics or start or end:
@@ -96,7 +96,6 @@ def export(
 
 def _describe_as_bag(logs: list[Path]) -> None:
     from hearthlog.analyzer.export.bags import describe_as_bag
-    from hearthlog.tools.cli.terminal import share_done
 
     if len(logs) != 1:
         wrong_use("--in-place: name one folder of logs")
@@ -174,7 +173,6 @@ def cut(
     """
     from hearthlog.analyzer.export.merge import merge_logs
     from hearthlog.analyzer.logs.selection import select
-    from hearthlog.tools.cli.terminal import share_done
 
     check_output("--output", output, ".mcap", "a log")
     selection = select(logs, topics or [], *parse_span(start, end))
@@ -194,7 +192,6 @@ def merge(logs: Logs, *, output: NewLog) -> None:
     """
     from hearthlog.analyzer.export.merge import merge_logs
     from hearthlog.analyzer.logs.selection import select
-    from hearthlog.tools.cli.terminal import share_done
 
     check_output("--output", output, ".mcap", "a log")
     selection = select(logs)

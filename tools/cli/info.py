@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hearthlog.schemas.errors import HearthlogError, LogError, Progress, printable
+from hearthlog.schemas.new_files import check_new
 from hearthlog.tools.cli.options import Json, Log, Scheduler, log_location, logs_folder
 from hearthlog.tools.cli.terminal import (
     first_of,
@@ -421,7 +422,6 @@ def catalog(
         label_amounts,
     )
     from hearthlog.schemas.logs.files import check_allowed
-    from hearthlog.schemas.new_files import check_new
 
     check_allowed(folder)
     if folder.is_file():

@@ -21,6 +21,7 @@ from hearthlog.tools.cli.terminal import (
     print_lines,
     print_notice,
     print_table,
+    share_done,
     wrong_use,
 )
 
@@ -72,7 +73,6 @@ def _put(network: "EmbeddingNetwork") -> Path:
     """Download a network unless present; return its path."""
     from hearthlog.models.embedding.networks import folder_for_new, read_network_file
     from hearthlog.models.errors import ModelError
-    from hearthlog.tools.cli.terminal import share_done
     from hearthlog.tools.download import DownloadError, download
 
     path = folder_for_new() / network.filename
@@ -340,7 +340,6 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import first_starter, insist, is_starter, load
     from hearthlog.models.starter import BY_FEATURES, with_network
-    from hearthlog.tools.cli.terminal import share_done
 
     model, first = load(folder, name), first_starter(folder)
     pairs = ((one, with_network(one)) for one in BY_FEATURES)
@@ -430,7 +429,6 @@ def _recordings(
     from hearthlog.analyzer.training.home_recordings import home_recordings
     from hearthlog.analyzer.training.manifest import SkippedClip
     from hearthlog.models.features.installed import feature_set
-    from hearthlog.tools.cli.terminal import share_done
 
     features = feature_set(model.description.feature_set)
     if logs is not None:
@@ -475,7 +473,6 @@ def _minutes_in_logs(a: "Model", b: "Model", logs: Path) -> list["_ClassShare"]:
     from hearthlog.analyzer.promotion.comparison import gather_evidence
     from hearthlog.analyzer.promotion.paired_labels import time_words
     from hearthlog.analyzer.promotion.recent_time import recent_logs
-    from hearthlog.tools.cli.terminal import share_done
 
     with share_done("listening to the logs with both") as report:
         evidence = gather_evidence(a, b, recent_logs([logs]), report)

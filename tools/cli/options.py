@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import read_time
+from hearthlog.schemas.new_files import check_new
 from hearthlog.tools.cli.terminal import wrong_use
 
 if TYPE_CHECKING:
@@ -210,7 +213,6 @@ def starter_of(model: Path, logs: "Iterable[Path]") -> Path:
     from hearthlog.models.classifiers.classifier import Classifier
     from hearthlog.models.modelfile.modelfile import load_model, starter_for
     from hearthlog.models.starter import NETWORK
-    from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.files import find_logs
 
     other = starter_for(model, NETWORK)
@@ -231,8 +233,6 @@ def check_output(option: str, path: Path | None, suffix: str, what: str) -> None
 
     Raise `LogError` if the file exists.
     """
-    from hearthlog.schemas.new_files import check_new
-
     if path is not None and path.suffix != suffix:
         wrong_use(f"{option} {path}: {what} is named *{suffix}")
     if path is not None:
@@ -241,8 +241,6 @@ def check_output(option: str, path: Path | None, suffix: str, what: str) -> None
 
 def parse_time(text: str, option: str) -> int:
     """Parse a time, in nanoseconds of UTC; invalid text ends with wrong use."""
-    from hearthlog.schemas.frames import read_time
-
     try:
         return read_time(text)
     except ValueError:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hearthlog.schemas.errors import HearthlogError, ignore_progress
+from hearthlog.schemas.errors import HearthlogError, Progress, ignore_progress
 from hearthlog.tools.cli.options import (
     MaxBagFiles,
     MaxRecordSize,
@@ -21,7 +21,7 @@ from hearthlog.tools.cli.options import (
     parse_time,
     scenario_files,
 )
-from hearthlog.tools.cli.terminal import number, print_notice, wrong_use
+from hearthlog.tools.cli.terminal import number, print_notice, share_done, wrong_use
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from hearthlog.recorder.labelling.model_watch import ReloadRequests
     from hearthlog.recorder.recording_session import RecorderState, RecordingSummary
     from hearthlog.recorder.sources.audio_files import FileSource
-    from hearthlog.schemas.errors import Progress
 
 _HIDDEN = {"owner": 0o077, "group": 0o027, "all": 0o022}  # umask by `readable_by`
 
@@ -133,7 +132,6 @@ def record(
     """
     from hearthlog.recorder.config import NO_MODEL, exposed_passwords, load_settings
     from hearthlog.recorder.recording import record_files
-    from hearthlog.tools.cli.terminal import share_done
 
     given = {
         "output": output,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.tools.cli.options import (
     Json,
     LogsFolder,
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from hearthlog.recorder.config_problems import Key, Origins
     from hearthlog.recorder.disk_keeper import Thinned
     from hearthlog.recorder.retention import Deletion, KeepingRules
-    from hearthlog.schemas.errors import HearthlogError
 
 
 def devices(*, as_json: Json = False) -> None:
@@ -221,7 +221,6 @@ def retain(
     deleted.
     """
     from hearthlog.recorder.config import load_settings
-    from hearthlog.schemas.errors import LogError
 
     given = {
         "output": output,
@@ -254,7 +253,6 @@ def _retain(rules: "KeepingRules", *, dry_run: bool) -> _Done:
     from hearthlog.recorder.disk_keeper import plan_thinning, thin
     from hearthlog.recorder.host import disk_of
     from hearthlog.recorder.retention import carry_out, plan_retention, recorded_days, recorded_logs
-    from hearthlog.schemas.errors import LogError
 
     root, failures = Path(rules.root), list[OSError]()
     logs = recorded_logs(root, rules.node, failures)

@@ -70,7 +70,6 @@ def relabel(
     Exit status 3: a log is damaged, or was not relabelled; the others are done.
     """
     from hearthlog.analyzer.workers import open_workers
-    from hearthlog.tools.cli.terminal import share_done
 
     count = workers or os.cpu_count() or 1
     with open_workers(count, scheduler, _TASKS) as pool:

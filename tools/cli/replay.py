@@ -13,8 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.new_files import check_new
 from hearthlog.tools.cli.options import Json, LocalLog, Microphone, scenario_files
-from hearthlog.tools.cli.terminal import moment, print_notice, print_recording, wrong_use
+from hearthlog.tools.cli.terminal import (
+    moment,
+    print_notice,
+    print_recording,
+    share_done,
+    wrong_use,
+)
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import RecorderInfo
@@ -198,9 +206,6 @@ def _parse_rate(text: str) -> float | None:
 
 def _check_output(output: Path | None, source: Path) -> None:
     """Refuse an existing output, or one among the replayed logs."""
-    from hearthlog.schemas.errors import LogError
-    from hearthlog.schemas.new_files import check_new
-
     if output is None:
         return
     if output.suffix == ".rrd":
@@ -218,7 +223,6 @@ def _check_output(output: Path | None, source: Path) -> None:
 
 def _run(logs: "LogSet", options: "ReplayOptions", stop: Flag) -> "Replay":
     from hearthlog.analyzer.replay.replay import replay as replay_logs
-    from hearthlog.tools.cli.terminal import share_done
 
     def run(options: "ReplayOptions") -> "Replay":
         with share_done("replaying") as progress:

@@ -15,6 +15,7 @@ from typer.core import TyperCommand
 from hearthlog.analyzer.marks.formats import PATTERNS, find_format
 from hearthlog.schemas.errors import HearthlogError, printable
 from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.new_files import check_new, new_file
 from hearthlog.tools.cli.discover import add_groups, add_voices
 from hearthlog.tools.cli.options import (
     End,
@@ -401,7 +402,6 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
         write_sounds,
     )
     from hearthlog.schemas.messages.topics import scenario_name
-    from hearthlog.schemas.new_files import check_new, new_file
 
     if find_format(path) is None:
         wrong_use(f"--save {path}: of a queue it is a label file, {PATTERNS}")

@@ -24,7 +24,7 @@ from hearthlog.tools.cli.setup_questions import (
     page_of,
     timezone_of,
 )
-from hearthlog.tools.cli.terminal import print_lines, print_notice, wrong_use
+from hearthlog.tools.cli.terminal import print_lines, print_notice, share_done, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.tools.service.configuration_file import Answers
@@ -320,7 +320,6 @@ def _wait_for_labels(installation: Installation, answers: "Answers") -> None:
     from threading import Event
 
     from hearthlog.schemas.logs.follow import follow_messages
-    from hearthlog.tools.cli.terminal import share_done
 
     logs = _logs(installation)
     end = time.monotonic() + _LABEL_SECONDS

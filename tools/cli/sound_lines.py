@@ -8,6 +8,8 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.terminal import ReportOnce, bar_of, cropped
 
 if TYPE_CHECKING:
@@ -24,8 +26,6 @@ def print_sounds(logs: Path, newest: int | None, timezone: str | None, stop: Eve
     from hearthlog.analyzer.logs.layers import zone_of
     from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.analyzer.review.current_sounds import CurrentSounds
-    from hearthlog.schemas.errors import LogError
-    from hearthlog.schemas.frames import NANOSECONDS
     from hearthlog.schemas.logs.follow import follow_messages
 
     home_zone(timezone)

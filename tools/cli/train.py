@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 from hearthlog.schemas.errors import listed
+from hearthlog.schemas.new_files import private_folder
 from hearthlog.tools.cli.options import (
     CLIPS,
     METHOD,
@@ -206,8 +207,6 @@ def _print_next(verdict: "Verdict", output: Path) -> None:
 
 def _next_model(name: str) -> Path:
     """Return a new model path for the home or a scenario; creates the folder of models."""
-    from hearthlog.schemas.new_files import private_folder
-
     folder = models_folder()
     numbers = (path.stem.removeprefix(f"{name}-") for path in folder.glob(f"{name}-*.safetensors"))
     number = max((int(text) for text in numbers if text.isdecimal()), default=0) + 1

@@ -13,6 +13,8 @@ from urllib.parse import urlsplit
 
 import typer
 
+from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.new_files import check_new, new_file
 from hearthlog.tools.cli.options import LogsFolder, Timezone, parse_span
 from hearthlog.tools.cli.terminal import ReportOnce, print_notice, show_page, wrong_use
 
@@ -241,7 +243,6 @@ def _write_layout(logs: Path, file: Path, *, serves: bool) -> None:
         plotjuggler_layout,
     )
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.schemas.new_files import check_new, new_file
 
     kinds = {
         FOXGLOVE_SUFFIX: (foxglove_layout, "Foxglove or Lichtblick: Layouts, Import from file"),
@@ -350,7 +351,6 @@ def _follow(
     from hearthlog.analyzer.logs.layers import zone_of
     from hearthlog.analyzer.review.current_sounds import CurrentSounds
     from hearthlog.analyzer.review.live_timeline import LiveTimeline
-    from hearthlog.schemas.errors import LogError
     from hearthlog.schemas.logs.follow import follow_messages
 
     damaged = ReportOnce()
