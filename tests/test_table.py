@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from hearthlog.tools.cli.terminal import print_confusion, print_notice, print_table
+from hearthlog.tools.cli.tables import print_counts
+from hearthlog.tools.cli.terminal import print_notice, print_table
 
 HEAD = ("class", "support", "false alarms/day")
 ROWS = [("objects_activity", "123", "5019.8"), ("a\x1b[31m\nb", "7", "-")]
@@ -109,8 +110,9 @@ def test_a_message_that_is_piped_is_one_line(capfd):
 
 
 def test_a_confusion_matrix_that_is_too_wide_is_not_drawn(capsys):
-    print_confusion(["one", "two"], [["10", "2"], ["3", "400"]], "confusion")
-    assert capsys.readouterr().out == "confusion\none  10    2\ntwo   3  400\n"
+    print_counts(["one", "two"], [[10, 2], [3, 400]])
+    title = "confusion: true class in rows, predicted in columns"
+    assert capsys.readouterr().out == f"{title}\nOne  10    2\nTwo   3  400\n"
     names = [f"class_{place}" for place in range(40)]
-    print_confusion(names, [["12345"] * 40] * 40, "confusion")
+    print_counts(names, [[12345] * 40] * 40)
     assert capsys.readouterr().out.startswith("confusion: too many classes")

@@ -6,8 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from shlex import quote
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,12 +24,12 @@ from hearthlog.tools.cli.options import (
     reviewer_name,
 )
 from hearthlog.tools.cli.terminal import (
-    JUDGED_BY,
     NAME_WIDTH,
     end_with_warnings,
     number,
     print_notice,
     print_table,
+    suggest_training,
     wrong_use,
 )
 
@@ -113,7 +112,8 @@ def import_labels(
         read_list,
     )
 
-    log, labels = _log_and_labels(log, labels)
+    if labels is None:  # a single argument is the labels
+        log, labels = Path(logs_folder()), log
     _check_use(labels, scenario)
     name, now = reviewer_name(reviewer), time.time_ns()
     choice = Choice(tier or (), _columns(column or []))
@@ -133,7 +133,8 @@ def import_labels(
         )
     losses = list(_losses(left_out))
     if not by_log:
-        _end_without_labels(losses)
+        print_notice(*losses)
+        raise typer.Exit(1)
     every_mark = [mark for marks in by_log.values() for mark in marks]
     looked = looked_at(spans, every_mark, coverage, name, now)
     taken: list[Mark] = []
@@ -143,9 +144,11 @@ def import_labels(
             mark._replace(reviewer=mark.reviewer or name, made=mark.made or now)
             for mark in new_marks(by_log.get(path, []), read_marks(path, scenario))
         ]
-        known = {span._replace(reviewer="", made=0) for span in read_reviewed(path, scenario)}
+        before = {span._replace(reviewer="", made=0) for span in read_reviewed(path, scenario)}
         reviewed = [
-            span for span in looked.get(path, []) if span._replace(reviewer="", made=0) not in known
+            span
+            for span in looked.get(path, [])
+            if span._replace(reviewer="", made=0) not in before
         ]
         if new or reviewed:
             print(write_marks(path, new, reviewed=reviewed, scenario=scenario))
@@ -166,12 +169,7 @@ def import_labels(
                 f"{number(len(others), 'mark')} outside the spans of {queue}: your own choice"
             )
     if taken:
-        what, of = (
-            (f"scenario {scenario}, from these", f" --scenario {scenario}")
-            if scenario
-            else (f"this home, from these ({JUDGED_BY})", "")
-        )
-        print_notice(f"next: a model of {what}: hearthlog train --home {quote(str(log))}{of}")
+        suggest_training([log], scenario, "these")
     end_with_warnings(losses)
 
 
@@ -201,17 +199,6 @@ def export_labels(
     }
     write_labels(output, sorted(marks, key=lambda mark: (mark.start, mark)), coverage)
     print(output)
-
-
-def _log_and_labels(first: Path, second: Path | None) -> tuple[Path, Path]:
-    """Return the logs and the labels; a single argument is the labels."""
-    return (Path(logs_folder()), first) if second is None else (first, second)
-
-
-def _end_without_labels(losses: list[str]) -> NoReturn:
-    for line in losses:
-        print_notice(line)
-    raise typer.Exit(1)
 
 
 def _check_use(path: Path, scenario: str) -> None:
@@ -282,10 +269,9 @@ def _losses(left_out: "SkippedLabels") -> Iterator[str]:
 
 
 def _print_amounts(marks: "Sequence[Mark]") -> None:
-    counts: Counter[str] = Counter()
+    counts = Counter(mark.label for mark in marks)
     lengths: Counter[str] = Counter()
     for mark in marks:
-        counts[mark.label] += 1
         lengths[mark.label] += mark.end - mark.start
     rows = [
         (label, f"{number(count, 'mark')}, {lengths[label] / NANOSECONDS:.2f} s")

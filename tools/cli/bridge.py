@@ -4,7 +4,6 @@ import signal
 from collections.abc import Callable, Sequence
 from datetime import tzinfo
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -20,6 +19,7 @@ from hearthlog.tools.cli.terminal import (
     print_notice,
     print_table,
     share_done,
+    stopped_by,
     wrong_use,
 )
 
@@ -85,35 +85,33 @@ def bridge(
     if not (own.page or own.ping or any(modules.values())):
         lacking = [name for name, is_there in modules.items() if not is_there]
         require(*lacking)  # the other outputs run without them
-    stop = Event()
-    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(each, lambda *_: stop.set())
+    stop = stopped_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     never_tell = frozenset(map(class_name, settings.never_tell))
     home = RecorderAddress(
         logs or settings.output, settings.node, time_zone(settings.timezone), never_tell
     )
-    say = ProblemReporter(print_notice)
-    state = BridgeState(state_folder(own.state, home.folder), home.node, say)
+    report = ProblemReporter(print_notice)
+    state = BridgeState(state_folder(own.state, home.folder), home.node, report)
     for line in [*exposed_files(own, config, state.folder), *exposed_passwords(settings, config)]:
-        say(line)
+        report(line)
     microphones = [] if logs else configured_microphones(settings)
     for line in rule_doubts(own.alert, settings, microphones):
-        say(f"alerts: {line}")
+        report(f"alerts: {line}")
     try:
         if own.mqtt or own.prometheus or own.alert:
             state.claim(home.folder)
         if unmute:
-            _unmute(state, [class_name(name) for name in unmute], say)
-        outputs, since = open_outputs(own, home, state, say)
-        Bridge(home, since, outputs, say).run(stop)
+            _unmute(state, [class_name(name) for name in unmute], report)
+        outputs, since = open_outputs(own, home, state, report)
+        Bridge(home, since, outputs, report).run(stop)
     finally:
         state.close()
 
 
-def _unmute(state: "BridgeState", classes: list[str], say: "Callable[[str], None]") -> None:
+def _unmute(state: "BridgeState", classes: list[str], report: "Callable[[str], None]") -> None:
     from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics
 
-    topics = RetainedTopics(state, say)
+    topics = RetainedTopics(state, report)
     muted = topics.muted()
     if others := [name for name in classes if name not in muted]:
         there = f"muted: {listed(muted, 'and')}" if muted else "no class is muted"
@@ -249,7 +247,7 @@ def _print(
             rule.rule,
             str(len(own)),
             f"{len(own) / weeks:.1f}" if weeks >= 1 / 7 else "",  # meaningless for minutes
-            str(_unknown(own)),
+            str(sum(not ring.is_known for ring in own)),
         )
         for rule in rules
         for own in [found[rule.name]]
@@ -272,10 +270,6 @@ def _local(time: int, zone: tzinfo) -> str:
     from hearthlog.analyzer.logs.local_time import local_time
 
     return f"{local_time(time, zone):%Y-%m-%d %H:%M}"
-
-
-def _unknown(notifications: "Sequence[Notification]") -> int:
-    return sum(not ring.is_known for ring in notifications)
 
 
 def _as_json(

@@ -64,8 +64,7 @@ def doctor(
     missing: list[str] = []
     with share_done("reading logs") as progress:
         files = examine(paths, progress, missing)
-    for line in [*missing, *_network_changes(paths)]:
-        print_notice(line)
+    print_notice(*missing, *_network_changes(paths))
     if as_json:
         print(json.dumps(_as_json(files), indent=2))
     else:
@@ -187,7 +186,7 @@ def recover(
             failed = True
             continue
         lost |= not recovery.lossless
-        _say(log, recovery)
+        _report_recovery(log, recovery)
         report.append(_recovery_as_json(log, path, recovery))
         if not as_json:
             print(path)
@@ -209,7 +208,7 @@ def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, 
             return path, recover_log(log, temporary, path.name, progress)
 
 
-def _say(log: Path, recovery: "Recovery") -> None:
+def _report_recovery(log: Path, recovery: "Recovery") -> None:
     expected = [topic.expected for topic in recovery.topics.values() if topic.expected is not None]
     of = f" of {sum(expected)}" if expected else ""
     end = "" if recovery.complete else "; the log had no end, or a damaged one"
@@ -217,8 +216,8 @@ def _say(log: Path, recovery: "Recovery") -> None:
     if recovery.escaped:
         what = "bytes that are not UTF-8 become \\xNN in the names or metadata of"
         print_notice(f"{log}: {what} {abridged([shortened(n, 60) for n in recovery.escaped], 5)}")
-    for text in dict.fromkeys([*map(str, recovery.damages), *recovery.losses]):
-        print_notice(f"{log}: {text}")
+    texts = dict.fromkeys([*map(str, recovery.damages), *recovery.losses])
+    print_notice(*(f"{log}: {text}" for text in texts))
 
 
 def _recovery_as_json(log: Path, path: Path, recovery: "Recovery") -> dict[str, Any]:

@@ -270,7 +270,7 @@ def evaluate_log(
 
 @evaluate.command("model")
 def evaluate_model(
-    model: Annotated[Path, typer.Argument(help="Model file.")],
+    model: ModelFile,
     *,
     data: Clips,
     scenario: OwnScenario = None,
@@ -285,17 +285,13 @@ def evaluate_model(
 
     require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation import model_scores as evaluation
-    from hearthlog.analyzer.training.manifest import left_out_lines, load_scenario, scenario_of
+    from hearthlog.analyzer.training.manifest import left_out_lines
     from hearthlog.models.features.installed import feature_set
-    from hearthlog.models.modelfile.modelfile import load_model
 
     check_output("--plot", plot, ".png", "a picture")
-    loaded = load_model(starter_here(model))
+    loaded, clips, classes, left_out = read_model_and_clips(model, data, scenario)
     seconds = feature_set(loaded.description.feature_set).window_seconds
-    classes = load_scenario(scenario) if scenario else scenario_of(loaded)
     evaluation.check_classes(loaded, classes)
-    left_out: list[SkippedClip] = []
-    clips = labelled_clips([data], classes.labels, left_out)
     with share_done(f"listening to {len(clips)} clips", announce=True) as report:
         result = evaluation.evaluate_model(loaded, clips, classes, report)
     scores = result.scores

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from hearthlog.schemas.errors import LogError, listed
-from hearthlog.tools.cli.options import End, Json, Logs, Start, Timezone, parse_span, read_day
+from hearthlog.tools.cli.options import (
+    Day,
+    End,
+    Json,
+    Labels,
+    Logs,
+    Start,
+    Timezone,
+    parse_span,
+    read_day,
+)
 from hearthlog.tools.cli.terminal import (
     end_with_warnings,
     print_json,
@@ -43,13 +53,7 @@ def events(
             help="Class, such as coughing or talking; may be repeated. By default all sounds."
         ),
     ] = None,
-    day: Annotated[
-        str | None,
-        typer.Option(
-            help="Such as 2026-03-01, today or yesterday; by default the last complete day in "
-            "the logs."
-        ),
-    ] = None,
+    day: Day = None,
     night: Annotated[
         bool,
         typer.Option(
@@ -58,9 +62,7 @@ def events(
     ] = False,
     start: Start = None,
     end: End = None,
-    labels: Annotated[
-        str, typer.Option(help="Labelling: live, or the model of a relabel layer.")
-    ] = "live",
+    labels: Labels = "live",
     timezone: Timezone = None,
     play: Annotated[
         bool, typer.Option("--play", help="Play the kept sound of each, one after the other.")

@@ -88,6 +88,11 @@ def export(
         wrong_use(f"{output} is for one topic: choose one with --topics ({names})")
     with share_done("exporting") as progress:
         repeated = save(selection, output, format_, progress, folder=not one_file)
+    _end(output, repeated, selection)
+
+
+def _end(output: Path, repeated: int, selection: "LogSelection") -> None:
+    """Print what was written; end with exit status 3 if a log is unfinished."""
     print(output)
     if repeated:
         print_notice(f"{number(repeated, 'message')} left out, which the logs contain twice")
@@ -102,10 +107,8 @@ def _describe_as_bag(logs: list[Path]) -> None:
     with share_done("reading") as progress:
         bag = describe_as_bag(logs[0], progress)
     print(bag.metadata)
-    warnings = []
-    if bag.unfinished:
-        names = ", ".join(map(str, bag.unfinished))
-        warnings.append(f"not in the bag, because it is unfinished: {names}")
+    names = ", ".join(map(str, bag.unfinished))
+    warnings = [f"not in the bag, because it is unfinished: {names}"] if names else []
     if bag.overlapping:
         warnings.append(
             f"{bag.overlapping[0]} begins before another log ends, and rosbag2 plays one log "
@@ -178,10 +181,7 @@ def cut(
     selection = select(logs, topics or [], *parse_span(start, end))
     with share_done("cutting") as progress:
         repeated = merge_logs(selection, output, progress, latched=True)
-    print(output)
-    if repeated:
-        print_notice(f"{number(repeated, 'message')} left out, which the logs contain twice")
-    end_with_warnings(unfinished_lines(selection.unfinished))
+    _end(output, repeated, selection)
 
 
 def merge(logs: Logs, *, output: NewLog) -> None:
@@ -197,7 +197,4 @@ def merge(logs: Logs, *, output: NewLog) -> None:
     selection = select(logs)
     with share_done("merging") as progress:
         repeated = merge_logs(selection, output, progress)
-    print(output)
-    if repeated:
-        print_notice(f"{number(repeated, 'message')} left out, which the logs contain twice")
-    end_with_warnings(unfinished_lines(selection.unfinished))
+    _end(output, repeated, selection)

@@ -12,7 +12,7 @@ import typer
 
 from hearthlog.schemas.errors import HearthlogError, LogError, Progress, printable
 from hearthlog.schemas.new_files import check_new
-from hearthlog.tools.cli.options import Json, Log, Scheduler, log_location, logs_folder
+from hearthlog.tools.cli.options import IN_LOGS, Json, Log, Scheduler, log_location
 from hearthlog.tools.cli.terminal import (
     first_of,
     long_bar,
@@ -26,11 +26,13 @@ from hearthlog.tools.cli.terminal import (
 )
 
 if TYPE_CHECKING:
+    from collections import Counter
+
     from hearthlog.analyzer.activity.home_events import EventTotal
     from hearthlog.analyzer.logs.catalog import Catalog, HomeTotals, LabelAmount
     from hearthlog.analyzer.logs.home_logs import HomeLogs
     from hearthlog.analyzer.logs.summary import LogSummary
-    from hearthlog.schemas.logs.contents import Status
+    from hearthlog.schemas.logs.contents import LoggedGap, Status
     from hearthlog.schemas.logs.metadata import RecordedScenario
     from hearthlog.tools.cli.info_summary import Accuracy, Overview
 
@@ -61,8 +63,7 @@ def info(
 
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
-    for error in summary.damaged.values():
-        print_notice(error)
+    print_notice(*summary.damaged.values())
     if not summary.files:
         raise typer.Exit(1)
     for stream in summary.streams:
@@ -95,7 +96,7 @@ def info(
         print_lines(_stream_lines(summary))
         print_lines(_model_lines(summary, path, logs, scenarios))
         print_lines(() if accuracy is None else accuracy.lines())
-        print_lines(_gap_lines(summary, overview))
+        print_lines(first_of("gap", [_gap_text(gap, overview) for gap in summary.gaps]))
         if verbose or not summary.streams:
             _print_files(summary)
         else:
@@ -111,27 +112,20 @@ def _model_lines(
     scenarios: "Sequence[RecordedScenario]",
 ) -> Iterator[str]:
     """Yield the names of the models that label in addition to the recorder's."""
-    if (candidate := _candidate(summary, path, logs)) is not None:
-        yield candidate
-    for one in scenarios:
-        yield f"scenario {one.name}, {one.microphone}: model {one.model} ({one.sha256[:12]})"
-
-
-def _candidate(summary: "LogSummary", path: Path, logs: "HomeLogs") -> str | None:
-    """Return a line on the candidate model; None without one."""
     from hearthlog.schemas.messages.topics import CANDIDATE
 
-    if not any(name.endswith(f"/{CANDIDATE}/label") for name in summary.topics):
-        return None
+    has_candidate = any(name.endswith(f"/{CANDIDATE}/label") for name in summary.topics)
     later: set[str] = set()  # recorders without a candidate since
-    for record in logs.records():
+    for record in logs.records() if has_candidate else ():
         node = record.get("node", "")
         if name := record.get("candidate"):
             sha256, was = record.get("candidate_sha256", "")[:12], "was " * (node in later)
             compare = f"hearthlog models compare --live --logs {quote(str(path))}"
-            return f"candidate: {name} ({sha256}), {was}on trial: `{compare}`"
+            yield f"candidate: {name} ({sha256}), {was}on trial: `{compare}`"
+            break
         later.add(node)
-    return None
+    for one in scenarios:
+        yield f"scenario {one.name}, {one.microphone}: model {one.model} ({one.sha256[:12]})"
 
 
 def _scenarios(summary: "LogSummary", logs: "HomeLogs") -> "list[RecordedScenario]":
@@ -176,8 +170,7 @@ def _accuracy(summary: "LogSummary", logs: "HomeLogs") -> "Accuracy | None":
     except LogError as error:
         print_notice(str(error))
         return None
-    for loss in accuracy.losses:
-        print_notice(loss)
+    print_notice(*accuracy.losses)
     return accuracy
 
 
@@ -190,9 +183,9 @@ def _each(paths: Sequence[Path], progress: Progress) -> Iterator[Path]:
 def _as_json(summary: "LogSummary") -> dict[str, Any]:
     first, last = summary.span or (None, None)
     return {
-        "files": [str(path) for path in summary.files],
-        "unfinished": [str(path) for path in summary.unfinished],
-        "layers": [str(path) for path in summary.layers],
+        "files": list(map(str, summary.files)),
+        "unfinished": list(map(str, summary.unfinished)),
+        "layers": list(map(str, summary.layers)),
         "damaged": {str(path): error for path, error in summary.damaged.items()},
         "size_bytes": summary.size,
         "chunks": summary.chunks,
@@ -214,15 +207,14 @@ def _as_json(summary: "LogSummary") -> dict[str, Any]:
             for name, topic in summary.topics.items()
         },
         "labels": {
-            microphone: {label: seconds / 60 for label, seconds in labels.most_common()}
-            for microphone, labels in summary.label_seconds.items()
+            microphone: _in_minutes(labels) for microphone, labels in summary.label_seconds.items()
         },
         "segments": {
             microphone: dict(labels.most_common())
             for microphone, labels in summary.segments.items()
         },
         "segment_minutes": {
-            microphone: {label: seconds / 60 for label, seconds in labels.most_common()}
+            microphone: _in_minutes(labels)
             for microphone, labels in summary.segment_seconds.items()
         },
         "unsure": {
@@ -239,12 +231,15 @@ def _as_json(summary: "LogSummary") -> dict[str, Any]:
     }
 
 
+def _in_minutes(seconds: "Counter[str]") -> dict[str, float]:
+    return {label: value / 60 for label, value in seconds.most_common()}
+
+
 def _health(health: "Status | None") -> dict[str, str] | None:
     if health is None:
         return None
-    level = _LEVELS[min(health.level, len(_LEVELS) - 1)]
     return {
-        "level": level,
+        "level": _LEVELS[min(health.level, len(_LEVELS) - 1)],
         "name": health.name,
         "message": health.message,
         "time": str(moment(health.time)),
@@ -353,13 +348,9 @@ def _stream_lines(summary: "LogSummary") -> Iterator[str]:
         )
 
 
-def _gap_lines(summary: "LogSummary", overview: "Overview") -> Iterator[str]:
-    lines = [
-        f"{gap.microphone} {overview.local(gap.start)} {gap.seconds:.3f} s, "
-        f"{number(gap.frames_lost, 'frame')}: {gap.reason}"
-        for gap in summary.gaps
-    ]
-    yield from first_of("gap", lines)
+def _gap_text(gap: "LoggedGap", overview: "Overview") -> str:
+    lost = f"{gap.seconds:.3f} s, {number(gap.frames_lost, 'frame')}"
+    return f"{gap.microphone} {overview.local(gap.start)} {lost}: {gap.reason}"
 
 
 def _layer_rows(summary: "LogSummary") -> Iterator[tuple[str, ...]]:
@@ -390,8 +381,7 @@ def catalog(
         typer.Argument(
             help="Folder that holds the logs or homes, or a URL such as s3://bucket/homes.",
             parser=log_location,
-            default_factory=logs_folder,
-            show_default="logs",
+            **IN_LOGS,
         ),
     ],
     *,
@@ -434,15 +424,18 @@ def catalog(
         export_parquet(files, export)
     amounts = label_amounts(files)
     damaged = files.of_state(DAMAGED)
-    for row in damaged:
-        print_notice(f"{folder / row.path}: {row.error}")
+    print_notice(*(f"{folder / row.path}: {row.error}" for row in damaged))
     unfinished = [row.path for row in files.of_state(UNFINISHED)]
     if as_json:
         result = {
             "files": len(files),
             "unfinished": unfinished,
             "damaged": {row.path: row.error for row in damaged},
-            "homes": [_home(home) for home in homes(files)],
+            "homes": [
+                asdict(home)
+                | {"start": moment(home.start), "end": moment(home.end), "hours": home.hours}
+                for home in homes(files)
+            ],
             "labels": [asdict(label) for label in amounts if not label.scenario],
             "scenarios": [asdict(label) for label in amounts if label.scenario],
         }
@@ -459,8 +452,8 @@ def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
     from hearthlog.analyzer.workers import open_workers
 
     previous = read_catalog(folder)
-    for line in () if previous is None else previous.unusable:
-        print_notice(f"{line}; it is rebuilt")
+    unusable = () if previous is None else previous.unusable
+    print_notice(*(f"{line}; it is rebuilt" for line in unusable))
     try:
         with open_workers(workers, scheduler) as pool, share_done("reading logs") as progress:
             return write_catalog(folder, previous, progress, pool)
@@ -469,11 +462,6 @@ def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
             "interrupted; the catalogue has what was read so far, and the same command continues"
         )
         raise
-
-
-def _home(home: "HomeTotals") -> dict[str, object]:
-    times = {"start": moment(home.start), "end": moment(home.end)}
-    return asdict(home) | times | {"hours": home.hours}
 
 
 def _print_homes(

@@ -193,8 +193,7 @@ def _status_of(step: Callable[[], Any]) -> str | int | None:
     except (HearthlogError, ModuleNotFoundError, OSError) as error:
         if _debug["on"]:
             raise
-        for line in getattr(error, "lines", None) or [_message(error)]:
-            print_notice(line)
+        print_notice(*(getattr(error, "lines", None) or [_message(error)]))
         return error.status if isinstance(error, HearthlogError) else 1
 
 

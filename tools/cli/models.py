@@ -1,6 +1,7 @@
 """`hearthlog models`: models of a folder, their promotion, and networks to download."""
 
 import json
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
@@ -12,6 +13,7 @@ from hearthlog.tools.cli.options import (
     Json,
     OwnScenario,
     labelled_clips,
+    logs_folder,
     models_folder,
     starter_here,
 )
@@ -49,7 +51,13 @@ def fetch(
     verifies the digest of the file, and tests the network. Exit status 3: the network is
     installed but does not work.
     """
-    from hearthlog.models.embedding.networks import NETWORKS, network_folders
+    from hearthlog.models.embedding.networks import (
+        NETWORKS,
+        folder_for_new,
+        network_folders,
+        read_network_file,
+    )
+    from hearthlog.tools.download import put
     from hearthlog.tools.service.unit import NAME, SYSTEM_UNITS
 
     if name is None:
@@ -59,7 +67,11 @@ def fetch(
         return
     network = NETWORKS.get(name)
     print_notice(f"{network.attribution}; its licence is {network.licence}")
-    path = _put(network) if source is None else _put_from(network, source)
+    path = folder_for_new() / network.filename
+    if source is None:
+        _download(network, path)
+    else:
+        put(read_network_file(network, source)[0], path)
     print(path)
     if path.is_relative_to(network_folders()[0]) and (SYSTEM_UNITS / NAME).exists():
         print_notice(
@@ -69,20 +81,16 @@ def fetch(
     end_with_warnings(_tried(network, path))
 
 
-def _put(network: "EmbeddingNetwork") -> Path:
-    """Download a network unless present; return its path."""
-    from hearthlog.models.embedding.networks import folder_for_new, read_network_file
+def _download(network: "EmbeddingNetwork", path: Path) -> None:
+    """Download a network unless present."""
+    from hearthlog.models.embedding.networks import read_network_file
     from hearthlog.models.errors import ModelError
     from hearthlog.tools.download import DownloadError, download
 
-    path = folder_for_new() / network.filename
-    try:
+    with suppress(ModelError):
         read_network_file(network, path)
-    except ModelError:
-        pass
-    else:
         print_notice("it is already installed")
-        return path
+        return
     file = network.files[0]
     if not file.url:
         raise ModelError(f"{network.name}: it has no download address; give its file with --from")
@@ -92,17 +100,6 @@ def _put(network: "EmbeddingNetwork") -> Path:
             download(file.url, path, file.size, file.sha256, report)
     except DownloadError as error:
         raise DownloadError(f"{error}; or give its file: models fetch NAME --from FILE") from error
-    return path
-
-
-def _put_from(network: "EmbeddingNetwork", source: Path) -> Path:
-    from hearthlog.models.embedding.networks import folder_for_new, read_network_file
-    from hearthlog.tools.download import put
-
-    data, _ = read_network_file(network, source)
-    path = folder_for_new() / network.filename
-    put(data, path)
-    return path
 
 
 def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
@@ -121,12 +118,8 @@ def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
         return [str(error)]
     if probe.different_answers:
         first = probe.different_answers[0]
-        return [
-            (
-                f"{path}: differs from the network that models were trained with ({first}): "
-                "labels are worse"
-            )
-        ]
+        differs = f"{path}: differs from the network that models were trained with ({first}): "
+        return [f"{differs}labels are worse"]
     print_notice(
         f"it works: {1000 * probe.seconds:.2g} ms for a window; recorders take it when they start"
     )
@@ -146,8 +139,7 @@ def _list() -> None:
             continue
         size = f"{network.files[0].size / 1e6:.1f} MB"
         there = find_network(name) or "not there"
-        line = f"{name}: {there} ({size}, {network.licence}; {network.attribution})"
-        print_lines([line])
+        print_lines([f"{name}: {there} ({size}, {network.licence}; {network.attribution})"])
     end_with_warnings(problems)
 
 
@@ -244,7 +236,7 @@ def compare(
     if live:
         if data or scenario or (a, b) != ("champion", "candidate"):
             wrong_use("--live compares champion and candidate, and takes --logs only")
-        _compare_live(logs or _logs_folder(), as_json=as_json)
+        _compare_live(logs or Path(logs_folder()), as_json=as_json)
         return
     if (data is None) == (logs is None):
         wrong_use("give either --data or --logs, or --live")
@@ -315,7 +307,7 @@ def promote(
     place = models_folder(folder)
     name = _starter_here(place, name)
     if to == "champion":
-        _check_harmless(place, name, logs or [_logs_folder()], anyway=anyway)
+        _check_harmless(place, name, logs or [Path(logs_folder())], anyway=anyway)
     else:
         _check_against_champion(place, name)
     model, before = promote_model(place, name, to)
@@ -340,11 +332,12 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     from hearthlog.models.errors import ModelError
     from hearthlog.models.modelfile.registry import first_starter, insist, is_starter, load
     from hearthlog.models.starter import BY_FEATURES, with_network
+    from hearthlog.tools.cli.promotion import print_verdict, refusal
 
     model, first = load(folder, name), first_starter(folder)
-    pairs = ((one, with_network(one)) for one in BY_FEATURES)
-    firsts = next((pair for pair in pairs if first in pair), ())
-    is_first = is_starter(model.name, model.sha256) and model.name in firsts
+    pairs = [(one, with_network(one)) for one in BY_FEATURES]
+    is_first = any(first in pair and model.name in pair for pair in pairs)
+    is_first = is_first and is_starter(model.name, model.sha256)
     if anyway or is_first:
         insist(folder, model.sha256)
         return
@@ -353,13 +346,9 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
         with share_done(f"judging {model.name}", announce=True) as report:
             verdict = judge(folder, model, home, report)
         own = folder == models_folder()
-        from hearthlog.tools.cli.promotion import print_verdict
-
         print_verdict(verdict, home, model.name if own else str(folder / model.name))
         judgement = verdict.judgement
     if not judgement.may_label:
-        from hearthlog.tools.cli.promotion import refusal
-
         raise ModelError(refusal(judgement, model.name))
 
 
@@ -409,12 +398,6 @@ def _compare_live(logs: Path, *, as_json: bool) -> None:
     else:
         print_trial(trial)
     end_with_warnings(trial.losses)
-
-
-def _logs_folder() -> Path:
-    from hearthlog.recorder.config import load_settings
-
-    return load_settings(None, {}, {}).output
 
 
 def _recordings(

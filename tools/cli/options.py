@@ -4,7 +4,7 @@ import getpass
 from contextlib import suppress
 from datetime import date, datetime, timedelta, tzinfo
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -48,55 +48,21 @@ def logs_folder() -> str:
     return str(load_settings(None, {}, {}).output)
 
 
-def _logs_folders() -> list[str]:
-    return [logs_folder()]
-
+IN_LOGS: dict[str, Any] = {"default_factory": logs_folder, "show_default": "logs"}
+_EACH_IN_LOGS: dict[str, Any] = {"default_factory": lambda: [logs_folder()], "show_default": "logs"}
+_ANY_LOGS = "Logs, or folders of logs, or URLs such as s3://bucket/home."
 
 # Readability is checked on access, with better messages than typer's.
-Log = Annotated[
-    Path,
-    typer.Argument(
-        help=LOG_HELP,
-        parser=log_location,
-        default_factory=logs_folder,
-        show_default="logs",
-    ),
-]
+Log = Annotated[Path, typer.Argument(help=LOG_HELP, parser=log_location, **IN_LOGS)]
 LocalLog = Annotated[
-    Path,
-    typer.Argument(
-        help="A log, or a folder of logs.",
-        readable=False,
-        default_factory=logs_folder,
-        show_default="logs",
-    ),
+    Path, typer.Argument(help="A log, or a folder of logs.", readable=False, **IN_LOGS)
 ]
-Logs = Annotated[
-    list[Path],
-    typer.Argument(
-        help="Logs, or folders of logs, or URLs such as s3://bucket/home.",
-        parser=log_location,
-        default_factory=_logs_folders,
-        show_default="logs",
-    ),
-]
+Logs = Annotated[list[Path], typer.Argument(help=_ANY_LOGS, parser=log_location, **_EACH_IN_LOGS)]
 LocalLogs = Annotated[
-    list[Path],
-    typer.Argument(
-        help="Logs, or folders of logs.",
-        readable=False,
-        default_factory=_logs_folders,
-        show_default="logs",
-    ),
+    list[Path], typer.Argument(help="Logs, or folders of logs.", readable=False, **_EACH_IN_LOGS)
 ]
 LogsFolder = Annotated[
-    Path,
-    typer.Argument(
-        help="Folder of a recorder's logs.",
-        readable=False,
-        default_factory=logs_folder,
-        show_default="logs",
-    ),
+    Path, typer.Argument(help="Folder of a recorder's logs.", readable=False, **IN_LOGS)
 ]
 Topics = Annotated[
     list[str] | None,
@@ -156,6 +122,16 @@ Clips = Annotated[Path, typer.Option(help=CLIPS)]
 SCENARIO = "Classes: bathroom, general, or a TOML file."
 OwnScenario = Annotated[
     str | None, typer.Option(help=SCENARIO, show_default="the scenario of the (first) model")
+]
+Day = Annotated[
+    str | None,
+    typer.Option(
+        help="Such as 2026-03-01, today or yesterday; by default the last complete day in the logs."
+    ),
+]
+Labels = Annotated[str, typer.Option(help="Labelling: live, or the model of a relabel layer.")]
+RecorderConfiguration = Annotated[
+    Path | None, typer.Option(help="Configuration of the recorder, a TOML file.")
 ]
 Scheduler = Annotated[
     str | None, typer.Option(help="Dask cluster to work on, such as tcp://host:port.")
@@ -233,10 +209,11 @@ def check_output(option: str, path: Path | None, suffix: str, what: str) -> None
 
     Raise `LogError` if the file exists.
     """
-    if path is not None and path.suffix != suffix:
+    if path is None:
+        return
+    if path.suffix != suffix:
         wrong_use(f"{option} {path}: {what} is named *{suffix}")
-    if path is not None:
-        check_new(path)
+    check_new(path)
 
 
 def parse_time(text: str, option: str) -> int:
@@ -294,30 +271,29 @@ def scenario_files(given: list[str] | None) -> dict[str, Path]:
 
 
 def chosen_method(name: str | None, **parameters: float | None) -> "Method":
-    """Return a training method with the given parameters; by default the best method."""
+    """Return a training method with the given parameters.
+
+    By default it is the best one, without a network if the recorder disables networks.
+    """
     from hearthlog.analyzer.errors import DataError
-    from hearthlog.analyzer.training.train import method_named
+    from hearthlog.analyzer.training.train import DEFAULT, default_method, method_named
+    from hearthlog.recorder.config import load_settings
+    from hearthlog.recorder.labelling.embedder_probe import NO_NETWORK
 
     chosen = {key: value for key, value in parameters.items() if value is not None}
     for key, value in chosen.items():
         if not 0 < value < float("inf"):
             wrong_use(f"--{key} {value:g}: it must be more than 0")
     try:
-        method = _best_method() if name is None else method_named(name)
+        if name is not None:
+            method = method_named(name)
+        elif load_settings(None, {}, {}).embedding == NO_NETWORK:
+            method = DEFAULT
+        else:
+            method = default_method()
         return method.with_parameters(chosen)
     except DataError as error:
         wrong_use(str(error))
-
-
-def _best_method() -> "Method":
-    """Return the default training method; needs no network if the recorder disables networks."""
-    from hearthlog.analyzer.training.train import DEFAULT, default_method
-    from hearthlog.recorder.config import load_settings
-    from hearthlog.recorder.labelling.embedder_probe import NO_NETWORK
-
-    if load_settings(None, {}, {}).embedding == NO_NETWORK:
-        return DEFAULT
-    return default_method()
 
 
 def reviewer_name(option: str | None) -> str:

@@ -22,8 +22,6 @@ _SHOWN = 8  # changes listed
 
 def print_changes(changes: "LabelChanges", before: str, after: str) -> None:
     """Print the longest changes, and the minutes of each class."""
-    from hearthlog.analyzer.promotion.paired_labels import time_words
-
     for change in changes.pairs()[:_SHOWN]:
         print(f"  {change}")
     rows = [
@@ -52,9 +50,10 @@ def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
     if evidence.changes.pairs():
         command = shlex.join(["hearthlog", "review", *map(str, home), "--queue", model])
         print(printable(f"listen to the changes: `{command}`"))
-    _print_right("sounds of the minutes that were drawn at random", evidence.random, verdict)
-    _print_right("silences of these minutes", evidence.quiet, verdict)
-    _print_right("other marked sounds that it was not trained on", evidence.marks, verdict)
+    models = verdict.model, verdict.champion
+    _print_right("sounds of the minutes that were drawn at random", evidence.random, *models)
+    _print_right("silences of these minutes", evidence.quiet, *models)
+    _print_right("other marked sounds that it was not trained on", evidence.marks, *models)
     if not evidence.random.sounds + evidence.quiet.sounds:
         print(
             "no randomly drawn minutes of this home are reviewed, so wrong marks go unnoticed; "
@@ -71,8 +70,6 @@ def refusal(judgement: "Judgement", name: str) -> str:
 
 
 def _print_changes(evidence: "HomeComparison", model: str, champion: str) -> None:
-    from hearthlog.analyzer.promotion.paired_labels import time_words
-
     changes = evidence.changes
     much, end = ("", ":") if changes.pairs() else (f" less than half a minute{changes.each}", "")
     period = "" if changes.each else f" of the {time_words(evidence.recorded)} recorded"
@@ -86,12 +83,10 @@ def _print_changes(evidence: "HomeComparison", model: str, champion: str) -> Non
     print_changes(changes, champion, model)
 
 
-def _print_right(what: str, right: "PairedAccuracy", verdict: "Verdict") -> None:
+def _print_right(what: str, right: "PairedAccuracy", model: str, champion: str) -> None:
     if right.sounds:
-        print(
-            f"of {right.sounds} {what} {verdict.model} is right about {right.after}, "
-            f"{verdict.champion} about {right.before}"
-        )
+        count = f"of {right.sounds} {what} {model} is right about {right.after}"
+        print(printable(f"{count}, {champion} about {right.before}"))
 
 
 def trial_as_json(trial: Trial) -> dict[str, Any]:
@@ -118,26 +113,15 @@ def trial_as_json(trial: Trial) -> dict[str, Any]:
 
 def print_trial(trial: Trial) -> None:
     """Print how two models on trial differ, and which is correct more often."""
-    print(
-        printable(
-            f"{trial.candidate}, a candidate, beside {trial.champion}: "
-            f"{time_words(trial.minutes)} in which both labelled"
-        )
-    )
+    models = f"{trial.candidate}, a candidate, beside {trial.champion}"
+    print(printable(f"{models}: {time_words(trial.minutes)} in which both labelled"))
     print_changes(trial.changes, trial.champion, trial.candidate)
     print()
-    for what, right in (
-        ("sounds of minutes drawn at random", trial.random),
-        ("silences of minutes drawn at random", trial.quiet),
-        ("other marked sounds (marks are where the champion was wrong)", trial.marks),
-    ):
-        if right.sounds:
-            print(
-                printable(
-                    f"of {right.sounds} {what} {trial.candidate} is right about {right.after}, "
-                    f"{trial.champion} about {right.before}"
-                )
-            )
+    both = trial.candidate, trial.champion
+    _print_right("sounds of minutes drawn at random", trial.random, *both)
+    _print_right("silences of minutes drawn at random", trial.quiet, *both)
+    others = "other marked sounds (marks are where the champion was wrong)"
+    _print_right(others, trial.marks, *both)
     print(printable(_trial_verdict(trial)))
 
 

@@ -21,7 +21,7 @@ from hearthlog.tools.cli.options import (
     parse_time,
     scenario_files,
 )
-from hearthlog.tools.cli.terminal import number, print_notice, share_done, wrong_use
+from hearthlog.tools.cli.terminal import number, print_notice, share_done, stopped_by, wrong_use
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -150,15 +150,12 @@ def record(
     load = partial(load_settings, config, _given(given), microphone)
     configured = load()
     settings = with_model(configured)
-    for line in exposed_passwords(settings, config):
-        print_notice(line)
+    print_notice(*exposed_passwords(settings, config))
     if sys.stderr.isatty():
         _report_network(settings)
     os.umask(_HIDDEN[settings.readable_by])
     losses: list[str] = []
-    stop = Flag()
-    for signal_number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signal_number, lambda *_: stop.set())
+    stop = stopped_by(signal.SIGINT, signal.SIGTERM)
     reload_requests = _look_at_hangup(stop, load, configured)
     if files:
         if len(settings.microphone) > 1:
@@ -174,8 +171,7 @@ def record(
         losses = [*refused, *source.warnings]
         if not recording.labels and settings.model != NO_MODEL:
             doubts.append("the sound is too short for a label; a model needs one second")
-        for line in [*doubts, *losses]:
-            print_notice(line)
+        print_notice(*doubts, *losses)
     elif start is not None or realtime or start_pattern is not None:
         wrong_use("--start, --start-pattern and --realtime go with files")
     else:
@@ -183,7 +179,7 @@ def record(
         if reload_requests.restart:
             print_notice("the configuration has changed; restarting")
             os.execv(sys.executable, sys.orig_argv)  # noqa: S606  with the original arguments
-    _say(recording, losses)
+    _report(recording, losses)
 
 
 def _listen(
@@ -239,7 +235,7 @@ def _report_network(settings: "Settings") -> None:
     )
 
 
-def _say(recording: "RecordingSummary", losses: list[str]) -> None:
+def _report(recording: "RecordingSummary", losses: list[str]) -> None:
     """Print the recording's summary; end with status 3 after losses or refusals."""
     for log in recording.logs:
         print(log)
@@ -247,8 +243,7 @@ def _say(recording: "RecordingSummary", losses: list[str]) -> None:
     for old in recording.recovered:
         if old.completed:
             print_notice(f"completed {old.path}, which was left unfinished")
-    for old in damaged:
-        print_notice(str(old.damage))
+    print_notice(*(old.damage for old in damaged))
     if recording.gaps:
         gaps, frames = number(recording.gaps, "gap"), number(recording.frames_lost, "frame")
         print_notice(f"{gaps}, {frames} lost")

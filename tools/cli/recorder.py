@@ -18,6 +18,7 @@ from hearthlog.tools.cli.options import (
     MaxBagFiles,
     MaxRecordSize,
     MinFreeSpace,
+    RecorderConfiguration,
     RetentionDays,
 )
 from hearthlog.tools.cli.terminal import (
@@ -91,8 +92,7 @@ def check(
     read a text file, an alert can never notify, or something is deprecated.
     """
     errors, problems, warnings = findings(file)
-    for line in [*map(str, errors), *problems, *warnings]:
-        print_notice(line)
+    print_notice(*map(str, errors), *problems, *warnings)
     if errors or problems:
         raise typer.Exit(max([1, *(error.status for error in errors)]))
     print(f"{file}: valid")
@@ -206,9 +206,7 @@ def retain(
     max_bag_files: MaxBagFiles = None,
     max_record_size: MaxRecordSize = None,
     min_free_space: MinFreeSpace = None,
-    config: Annotated[
-        Path | None, typer.Option(help="Configuration of the recorder, a TOML file.")
-    ] = None,
+    config: RecorderConfiguration = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only show what would be deleted or thinned, and why.")
     ] = False,
@@ -311,9 +309,7 @@ def install_service(
         bool,
         typer.Option("--user", help="Install a user service, which records in the current folder."),
     ] = False,
-    config: Annotated[
-        Path | None, typer.Option(help="Configuration of the recorder, a TOML file.")
-    ] = None,
+    config: RecorderConfiguration = None,
     account: Annotated[
         str | None,
         typer.Option(

@@ -106,8 +106,7 @@ def _print(result: "Relabelled", model: str) -> None:
         print_notice(f"{logs_there} without embeddings for {model}: labelled by features only")
     for what, logs in (("not relabelled", result.failed), ("partly relabelled", result.lost)):
         named = [why if str(log.parent) in why else f"{log}: {why}" for log, why in logs.items()]
-        for line in first_of(what, sorted(named)):
-            print_notice(line)
+        print_notice(*first_of(what, sorted(named)))
 
 
 def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]:

@@ -21,6 +21,7 @@ from hearthlog.tools.cli.terminal import (
     print_notice,
     print_recording,
     share_done,
+    stopped_by,
     wrong_use,
 )
 
@@ -109,9 +110,7 @@ def replay(
     folder = path if path.is_dir() else path.parent
     models = _Models(model, (Path(), Path("models"), folder, starter_file(GENERAL).parent))
     models.report(logs.chosen(options))
-    stop = Flag()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stopped_by(signal.SIGINT, signal.SIGTERM)
     began = time.monotonic()
     result = _run(logs, replace(options, model=models), stop)
     took = time.monotonic() - began
@@ -124,16 +123,14 @@ def replay(
             print_recording(output)
         else:
             print(*result.logs, sep="\n")
-        for line in _figures(result, took):
-            print_notice(line)
+        print_notice(*_figures(result, took))
     warnings = _warnings(result)
     if models.are_recorded and not warnings and not result.compared.identical:
         warnings.append(
             "the same model gives other results than recorded: is this another "
             "version of hearthlog?"
         )
-    for line in warnings:
-        print_notice(line)
+    print_notice(*warnings)
     if warnings or models.are_lacking:
         raise typer.Exit(3)
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.options import NEAR, Logs, Timezone, read_date, read_day
+from hearthlog.tools.cli.options import NEAR, Day, Labels, Logs, Timezone, read_date, read_day
 from hearthlog.tools.cli.terminal import end_with_warnings, share_done, wrong_use
 
 if TYPE_CHECKING:
@@ -16,13 +16,7 @@ if TYPE_CHECKING:
 def report(
     logs: Logs,
     *,
-    day: Annotated[
-        str | None,
-        typer.Option(
-            help="Such as 2026-03-01, today or yesterday; by default the last complete day in "
-            "the logs."
-        ),
-    ] = None,
+    day: Day = None,
     week: Annotated[
         str | None, typer.Option(help="Such as 2026-W09, or a day in it: Monday to Sunday.")
     ] = None,
@@ -39,9 +33,7 @@ def report(
         bool,
         typer.Option("--no-picture", help="Write no PNG; the page contains the picture anyway."),
     ] = False,
-    labels: Annotated[
-        str, typer.Option(help="Labelling: live, or the model of a relabel layer.")
-    ] = "live",
+    labels: Labels = "live",
     timezone: Timezone = None,
 ) -> None:
     """Write a page about a day or a week, for a carer, and its picture.

@@ -1,10 +1,10 @@
 """`hearthlog review`: logs on one time axis, with marking."""
 
-import shlex
 import signal
 import sys
 from contextlib import suppress
-from datetime import date, datetime, timedelta
+from datetime import datetime
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -25,10 +25,10 @@ from hearthlog.tools.cli.options import (
     Timezone,
     models_folder,
     parse_span,
+    read_day,
     reviewer_name,
 )
 from hearthlog.tools.cli.terminal import (
-    JUDGED_BY,
     end_with_warnings,
     print_notice,
     print_recording,
@@ -36,6 +36,7 @@ from hearthlog.tools.cli.terminal import (
     read_keys,
     share_done,
     show_page,
+    suggest_training,
     wrong_use,
 )
 
@@ -189,18 +190,13 @@ def _end(number: int, _frame: object) -> None:
     raise SystemExit(128 + number)
 
 
-def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int | None, int | None]:
+def _day(logs: list[Path], text: str, timezone: str | None) -> tuple[int, int]:
     """Parse the option --day: local midnight to midnight."""
     from hearthlog.analyzer.logs.layers import zone_of
     from hearthlog.analyzer.logs.local_time import day_span
 
     zone = zone_of(logs, timezone)
-    today = datetime.now(zone).date()
-    near = {"today": today, "yesterday": today - timedelta(days=1)}
-    try:
-        return day_span(near.get(text) or date.fromisoformat(text), zone)
-    except (ValueError, OverflowError):
-        wrong_use(f"--day {text}: not a day such as 2026-03-01, today or yesterday")
+    return day_span(read_day("--day", text, zone), zone)
 
 
 def _open(*, web: bool, port: int | None) -> "Viewer":
@@ -243,11 +239,11 @@ def _show(
 
     microphone = _microphone(timeline, choice.microphone)
     items, marking = _work(timeline, logs, choice, microphone)
-    heard = timeline.microphones[microphone]
+    shown = timeline.microphones[microphone]
     if marking.scenario:
-        heard.reviewed_scenarios.setdefault(marking.scenario, no_spans())  # else it has no lane
+        shown.reviewed_scenarios.setdefault(marking.scenario, no_spans())  # else it has no lane
 
-    def say(text: str) -> None:
+    def announce(text: str) -> None:
         print(printable(text), flush=True)
         viewer.say(text)
 
@@ -264,16 +260,17 @@ def _show(
     session = ReviewSession(
         viewer,
         marking,
-        heard.classes_of(marking.scenario),
+        shown.classes_of(marking.scenario),
         home_zone(timeline.zone),
-        say,
+        announce,
         look_closely,
-        lambda start, end: listen(heard.clips, start, end),
+        lambda start, end: listen(shown.clips, start, end),
         stop_sound,
         items,
     )
     keys: SimpleQueue[str] = SimpleQueue()
-    _offer(viewer, session, keys, heard.clips if sound else None)
+    audio = partial(_playable, session, shown.clips)
+    viewer.offer(session.keys, keys.put, audio if sound else None)
     viewer.draw(timeline, close_up=bool(items))
     show_page(viewer.address)
     with read_keys(keys) as ended, suppress(KeyboardInterrupt):
@@ -286,24 +283,16 @@ def _show(
         viewer.write_checked(timeline, class_precision(timeline, find_home_logs(logs)))
         _print_keys(session.keys)
         if session.run(keys):
-            _say_next(logs, marking.scenario)
+            suggest_training(logs, marking.scenario, "what is marked")
     if not marking.scenario:
         _report_accuracy(logs)
 
 
-def _offer(
-    viewer: "Viewer",
-    session: "ReviewSession",
-    keys: "SimpleQueue[str]",
-    clips: "Sequence[SoundClip] | None",
-) -> None:
-    """Show the keys in the page; with clips, the page plays them."""
+def _playable(session: "ReviewSession", clips: "Sequence[SoundClip]") -> bytes:
+    """Return the sound that the page plays."""
     from hearthlog.analyzer.review.session import sound_file
 
-    def sound() -> bytes:
-        return sound_file(clips or (), *session.span_to_play())
-
-    viewer.offer(session.keys, keys.put, None if clips is None else sound)
+    return sound_file(clips, *session.span_to_play())
 
 
 def _print_keys(keys: "Sequence[Key]") -> None:
@@ -325,15 +314,6 @@ def _print_keys(keys: "Sequence[Key]") -> None:
     Console(highlight=False).print(Columns(cells, equal=True, column_first=True, padding=(0, 3)))
 
 
-def _say_next(logs: list[Path], scenario: str) -> None:
-    words = [word for log in logs for word in ("--home", str(log))]
-    words += ["--scenario", scenario] if scenario else []
-    what = f"scenario {scenario}" if scenario else "this home"
-    judged = "" if scenario else f" ({JUDGED_BY})"
-    train = f"hearthlog train {shlex.join(words)}"
-    print_notice(f"next: a model of {what}, from what is marked{judged}: {train}")
-
-
 def _report_accuracy(logs: list[Path]) -> None:
     """Print the accuracy from the randomly drawn minutes so far."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
@@ -341,8 +321,7 @@ def _report_accuracy(logs: list[Path]) -> None:
 
     accuracy = Accuracy(find_home_logs(logs))
     if len(accuracy.minutes):
-        for line in accuracy.lines():
-            print(printable(line))
+        print(*map(printable, accuracy.lines()), sep="\n")
 
 
 def _work(
@@ -407,8 +386,8 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
         wrong_use(f"--save {path}: of a queue it is a label file, {PATTERNS}")
     if len(logs) > 1:
         wrong_use("--save --queue: name one log or folder, as `hearthlog annotate import` takes it")
-    asked, folder = queue_file(path), sounds_folder(path)
-    for new in (path, asked, folder):
+    queue, folder = queue_file(path), sounds_folder(path)
+    for new in (path, queue, folder):
         check_new(new)
     zone = zone_of(logs, timezone)
     sources = find_labellings(*logs)
@@ -428,7 +407,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
             temporary.write_text(text, "utf-8")
     else:
         write_labels(path, marks, find_coverage(logs[0]))
-    write_list(asked, spans)
+    write_list(queue, spans)
     clock = [datetime.fromtimestamp(one.start // NANOSECONDS, zone) for one in marks]
     minutes = {one.first: f"a minute, to {one.last}" for one in drawn_minutes(spans, marks)}
     print_table(
@@ -457,14 +436,14 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
 
 
 def _report_sounds(files: "Sequence[SoundFile]", folder: Path, lines: int) -> None:
-    heard = sum(file.first == file.last for file in files)
     if not files:
         print_notice(
             "no sound of these lines is kept; `hearthlog record --keep-audio unsure` keeps some"
         )
         return
-    others = "" if heard == lines else "; the others have no sound"
-    print_notice(f"{folder}: the sound of {heard} of {lines} lines, numbered as they are{others}")
+    kept = sum(file.first == file.last for file in files)
+    others = "" if kept == lines else "; the others have no sound"
+    print_notice(f"{folder}: the sound of {kept} of {lines} lines, numbered as they are{others}")
 
 
 def _queue_spans(
@@ -494,6 +473,6 @@ def _microphone(timeline: "Timeline", name: str | None) -> str:
     if name is not None and name not in timeline.microphones:
         wrong_use(f"--microphone {name}: there is {names}")
     if name is None and len(timeline.microphones) > 1:
-        line = f"marks are for the first microphone of {names}; --microphone chooses another"
-        print(printable(line))
+        others = f"marks are for the first microphone of {names}; --microphone chooses another"
+        print(printable(others))
     return name or next(iter(timeline.microphones))

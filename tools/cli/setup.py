@@ -289,8 +289,7 @@ def _check_configuration(installation: Installation, answers: "Answers") -> None
         raise ConfigurationError(*map(str, errors), *problems)
     if installation.account is not None and answers.has_bridge():  # before the recorder starts
         unit.checked_bridge(installation.config, installation.account)
-    for line in warnings:
-        print_notice(line)
+    print_notice(*warnings)
 
 
 def _install(installation: Installation, answers: "Answers") -> bool:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.tools.cli.terminal import NAME_WIDTH, moment, print_confusion, print_table
+from hearthlog.tools.cli.terminal import GAP, NAME_WIDTH, moment, print_table, terminal_width
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.evaluation.event_scores import Amounts, Detections, LabellingDifference
@@ -71,11 +71,16 @@ def print_counts(classes: Sequence[str], confusion: Sequence[Sequence[int]]) -> 
 
 
 def _print_confusion(classes: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
+    """Print a confusion matrix, unless it is too wide."""
     from hearthlog.models.classes import ordered
 
+    widths = [max(map(len, column)) + GAP for column in zip(*rows, strict=True)]
+    if NAME_WIDTH + sum(widths) > terminal_width():
+        print("confusion: too many classes for a table; --json has it")
+        return
+    print(title)
     places = [classes.index(name) for name in ordered(classes)]
-    cells = [[rows[row][column] for column in places] for row in places]
-    print_confusion([_words(classes[place]) for place in places], cells, title)
+    print_table((), [(_words(classes[row]), *(rows[row][i] for i in places)) for row in places])
 
 
 def _words(name: str, width: int = NAME_WIDTH) -> str:

@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import stat
 import sys
 import textwrap
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import typer
 
-from hearthlog.schemas.errors import HearthlogError, Progress, printable, shortened
+from hearthlog.schemas.errors import HearthlogError, Progress, printable
 from hearthlog.schemas.frames import millisecond_text
 
 if TYPE_CHECKING:
@@ -42,9 +43,10 @@ def print_json(result: dict[str, Any]) -> None:
     print(json.dumps(result, allow_nan=False))
 
 
-def print_notice(text: str) -> None:
-    """Write a line to standard error, for anything but results."""
-    print(wrapped(f"hearthlog: {printable(text)}", sys.stderr), file=sys.stderr)
+def print_notice(*texts: str) -> None:
+    """Write a line for each text to standard error, for anything but results."""
+    for text in texts:
+        print(wrapped(f"hearthlog: {printable(text)}", sys.stderr), file=sys.stderr)
 
 
 _WORD = re.compile(r"\s*(?:`[^`]*`\S*|\S+)")  # a command in backticks is never broken
@@ -111,6 +113,14 @@ def terminal_width() -> int:
     return shutil.get_terminal_size((_PLAIN_WIDTH, 24)).columns
 
 
+def stopped_by(*numbers: int) -> threading.Event:
+    """Return an event that signals set from now on."""
+    stop = threading.Event()
+    for number in numbers:
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
 class ReportOnce:
     """Writes repeated messages once per text."""
 
@@ -141,8 +151,7 @@ def unfinished_lines(paths: Sequence[Path]) -> list[str]:
 
 def end_with_warnings(lines: Sequence[str]) -> None:
     """Write each line to standard error; end with exit status 3 if there are any."""
-    for line in lines:
-        print_notice(line)
+    print_notice(*lines)
     if lines:
         raise typer.Exit(3)
 
@@ -150,6 +159,16 @@ def end_with_warnings(lines: Sequence[str]) -> None:
 def number(count: int, what: str) -> str:
     """Format a count with its noun."""
     return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
+def suggest_training(logs: Sequence[Path], scenario: str, marks: str) -> None:
+    """Print how to train a model on marks of logs, for a scenario, or else for the home."""
+    what = f"scenario {scenario}" if scenario else "this home"
+    judged = "" if scenario else f" ({JUDGED_BY})"
+    words = [word for log in logs for word in ("--home", str(log))]
+    words += ["--scenario", scenario] if scenario else []
+    train = f"hearthlog train {shlex.join(words)}"
+    print_notice(f"next: a model of {what}, from {marks}{judged}: {train}")
 
 
 def moment(stamp: int | None) -> str | None:
@@ -167,7 +186,7 @@ def first_of(what: str, lines: Sequence[str], hint: str = " (--json lists all)")
 
 NAME_WIDTH = 18  # class column of a table of figures
 _PLAIN_WIDTH = 160
-_GAP = 2
+GAP = 2
 _MANY = 1000  # rows; a Rich table of more takes minutes
 
 
@@ -234,7 +253,7 @@ def _fitted(
         widths.append(max(widest, cell_len(title), 1))
         kept = widest if place >= words else min(longest_word(column), _LONGEST_WORD)
         least.append(max(kept, longest_word([title])))
-    for gap in (_GAP, 1):
+    for gap in (GAP, 1):
         room = terminal_width() - gap * (len(widths) - 1)
         if sum(least) <= room or not head:
             break
@@ -272,18 +291,7 @@ def _print_plainly(rows: Sequence[Sequence[str]], words: int) -> None:
         cells = [cell.ljust(width) for cell, width in zip(row[:words], widths, strict=False)]
         figures = zip(row[words:], widths[words:], strict=True)
         cells += [cell.rjust(width) for cell, width in figures]
-        print((" " * _GAP).join(cells).rstrip())
-
-
-def print_confusion(classes: Sequence[str], rows: Sequence[Sequence[str]], title: str) -> None:
-    """Print a confusion matrix, unless it is too wide."""
-    widths = [max(map(len, column)) + _GAP for column in zip(*rows, strict=True)]
-    if NAME_WIDTH + sum(widths) > terminal_width():
-        print("confusion: too many classes for a table; --json has it")
-        return
-    print(title)
-    named = zip(classes, rows, strict=True)
-    print_table((), [(shortened(name, NAME_WIDTH), *row) for name, row in named])
+        print((" " * GAP).join(cells).rstrip())
 
 
 class OutputClosedError(Exception):

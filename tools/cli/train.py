@@ -40,9 +40,10 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.collections.manifest_writer import ManifestSummary
     from hearthlog.analyzer.promotion.promotion_check import Verdict
     from hearthlog.analyzer.training.dataset import Dataset
-    from hearthlog.analyzer.training.manifest import SkippedClip
+    from hearthlog.analyzer.training.manifest import Scenario, SkippedClip
     from hearthlog.analyzer.training.method import Method
     from hearthlog.models.classifiers.model import Amount, Model
+    from hearthlog.schemas.arrays import Float32, Indices
 
 
 _FEW_SOURCES = 5
@@ -148,11 +149,7 @@ def train(
         _print(saved, segments)
         print(f"\n{output}: {output.stat().st_size / 1e6:.2f} MB, sha256 {saved.sha256}")
         if verdict is not None:
-            own = output.parent == models_folder()
-            from hearthlog.tools.cli.promotion import print_verdict
-
-            print_verdict(verdict, home or [], output.stem if own else str(output))
-            _print_next(verdict, output)
+            _print_verdict(verdict, home or [], output)
         elif scenario and not (data or speakers):
             print(
                 f"\nto use it, replace the model file of scenario {scenario}, or run `hearthlog "
@@ -193,12 +190,14 @@ def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
         return None
 
 
-def _print_next(verdict: "Verdict", output: Path) -> None:
-    if not verdict.judgement.may_label:
-        from hearthlog.tools.cli.promotion import refusal
+def _print_verdict(verdict: "Verdict", home: list[Path], output: Path) -> None:
+    from hearthlog.tools.cli.promotion import print_verdict, refusal
 
+    own = output.parent == models_folder()
+    print_verdict(verdict, home, output.stem if own else str(output))
+    if not verdict.judgement.may_label:
         print(f"\n{refusal(verdict.judgement, verdict.model)}")
-    elif output.parent == models_folder():
+    elif own:
         print(
             f"\nthe check found no harm: `hearthlog models promote {output.stem}` makes it "
             "champion, and a recorder without --model uses it within about a second"
@@ -251,18 +250,45 @@ def _learned(
     smoothing: str,
     left_out: "list[SkippedClip]",
 ) -> tuple["Model", "Dataset"]:
+    """Train a model of a scenario, or of the enrolled speakers."""
+    from hearthlog.analyzer.training.manifest import left_out_lines
+    from hearthlog.analyzer.training.train import train_model
+    from hearthlog.models.classifiers.model import SmoothingMethod
+
+    if smoothing not in get_args(SmoothingMethod):
+        choices = ", ".join(get_args(SmoothingMethod))
+        wrong_use(f"--smoothing {smoothing}: choose one of {choices}")
+    others = None
+    if scenario == _SPEAKERS:
+        segments, chosen, others = _cut_voices(data, home, method, left_out)
+    else:
+        segments, chosen = _cut_clips(data, scenario, home, method, left_out)
+    print_notice(*left_out_lines(segments.left_out))
+    left_out += segments.left_out
+    if scenario != _SPEAKERS:
+        _warn_of_few(segments)
+    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
+        model = train_model(segments, chosen, report, method, smoothing, others)
+    return model, segments
+
+
+def _cut_clips(
+    data: list[Path],
+    scenario: str,
+    home: list[Path],
+    method: "Method",
+    left_out: "list[SkippedClip]",
+) -> "tuple[Dataset, Scenario]":
+    """Cut the clips of a scenario, and the marks of homes, into segments."""
     from hearthlog.analyzer.training.dataset import build_dataset
     from hearthlog.analyzer.training.home_recordings import lesson_recordings
-    from hearthlog.analyzer.training.manifest import load_scenario
-    from hearthlog.analyzer.training.train import clip_embedder, train_model
+    from hearthlog.analyzer.training.manifest import left_out_lines, load_scenario
+    from hearthlog.analyzer.training.train import clip_embedder
     from hearthlog.models.classes import UNKNOWN
 
-    _check_smoothing(smoothing)
-    if scenario == _SPEAKERS:
-        return _learned_voices(data, home, method, smoothing, left_out)
     chosen = load_scenario(scenario)
     clips = labelled_clips(data, chosen.labels, left_out)
-    _report_skipped(left_out)
+    print_notice(*left_out_lines(left_out))
     chosen = chosen.with_unknown((clip.label, clip.source_group) for clip in clips)
     if UNKNOWN not in chosen.classes:
         print_notice(
@@ -287,12 +313,7 @@ def _learned(
         segments = build_dataset(
             clips, chosen, report, recordings, method.features, method.rooms, embedder, method.seed
         )
-    _report_skipped(segments.left_out)
-    left_out += segments.left_out
-    _warn_of_few(segments)
-    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-        model = train_model(segments, chosen, report, method, smoothing)
-    return model, segments
+    return segments, chosen
 
 
 def _check_use(
@@ -309,45 +330,26 @@ def _check_use(
         wrong_use("--data goes with --scenario and --output, and without --base")
 
 
-def _report_skipped(left_out: "Sequence[SkippedClip]") -> None:
-    from hearthlog.analyzer.training.manifest import left_out_lines
-
-    for line in left_out_lines(left_out):
-        print_notice(line)
-
-
-def _check_smoothing(name: str) -> None:
-    from hearthlog.models.classifiers.model import SmoothingMethod
-
-    if name not in get_args(SmoothingMethod):
-        wrong_use(f"--smoothing {name}: choose one of {', '.join(get_args(SmoothingMethod))}")
-
-
-def _learned_voices(
-    data: list[Path],
-    home: list[Path],
-    method: "Method",
-    smoothing: str,
-    left_out: "list[SkippedClip]",
-) -> tuple["Model", "Dataset"]:
-    """Train a model of the enrolled speakers."""
+def _cut_voices(
+    data: list[Path], home: list[Path], method: "Method", left_out: "list[SkippedClip]"
+) -> "tuple[Dataset, Scenario, tuple[Float32, Indices]]":
+    """Cut the voices of enrolled speakers, and clips of other sounds, into segments."""
     from hearthlog.analyzer.discover.speech import check_voices
     from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
+    from hearthlog.analyzer.training.manifest import left_out_lines
     from hearthlog.analyzer.training.speakers import (
         others_of,
         speaker_recordings,
         speakers_scenario,
     )
-    from hearthlog.analyzer.training.train import train_model
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.starter import GENERAL, starter_file
 
-    _check_smoothing(smoothing)
     enrolled = list(speaker_recordings(home, method.features))
     scenario = speakers_scenario(enrolled)
     check_voices(enrolled, method.features)
     clips = labelled_clips(data, scenario.labels, left_out)
-    _report_skipped(left_out)
+    print_notice(*left_out_lines(left_out))
     others = others_of(load_model(starter_file(GENERAL)), method, scenario)
     with share_done(f"listening to {len(clips)} clips", announce=bool(clips)) as report:
         more = list(
@@ -355,12 +357,7 @@ def _learned_voices(
                 clips, scenario, report, method.features, method.rooms, seed=method.seed
             )
         )
-    segments = cut_recordings([*enrolled, *more], scenario, method.features)
-    _report_skipped(segments.left_out)
-    left_out += segments.left_out
-    with share_done(f"learning from {len(segments)} segments", announce=True) as report:
-        model = train_model(segments, scenario, report, method, smoothing, others)
-    return model, segments
+    return cut_recordings([*enrolled, *more], scenario, method.features), scenario, others
 
 
 def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dataset"]:
@@ -371,8 +368,7 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
 
     model = load_model(base)
     segments, notes, nothing = home_lessons(home, model, scenario)
-    for note in notes:
-        print_notice(note)
+    print_notice(*notes)
     if not len(segments):
         reasons = [f"{count} recordings: {why}" for why, count in segments.skipped.items()]
         why = "; ".join(reasons) or nothing

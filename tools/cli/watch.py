@@ -16,7 +16,7 @@ import typer
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.new_files import check_new, new_file
 from hearthlog.tools.cli.options import LogsFolder, Timezone, parse_span
-from hearthlog.tools.cli.terminal import ReportOnce, print_notice, show_page, wrong_use
+from hearthlog.tools.cli.terminal import ReportOnce, print_notice, show_page, stopped_by, wrong_use
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.foxglove.server import Admission
@@ -80,19 +80,21 @@ def _reported_address(admission: "Admission", port: int) -> Iterator[None]:
             address = f"ws://{place}/; its full address is in {file}"
         print_notice(f"open in Foxglove or Lichtblick: {address}")
         print_notice("panels with the names of this home: `hearthlog watch --layout home.json`")
-        _report_reach(admission, place)
+        exposed = (
+            f"listening on {admission.bind}: everything shown, and the access token, crosses the "
+            "network unencrypted; without --bind only this machine is reachable"
+        )
+        _report_reach(place, "" if ip_address(admission.bind).is_loopback else exposed)
         yield
 
 
-def _report_reach(admission: "Admission", place: str) -> None:
-    if ip_address(admission.bind).is_loopback:
-        print_notice(
-            f"from another machine, first: ssh -L {place}:{place} and the name of this one"
-        )
+def _report_reach(place: str, exposed: str) -> None:
+    """Print how another machine reaches a loopback address, or who reaches another one."""
+    if exposed:
+        print_notice(exposed)
     else:
         print_notice(
-            f"listening on {admission.bind}: everything shown, and the access token, crosses the "
-            "network unencrypted; without --bind only this machine is reachable"
+            f"from another machine, first: ssh -L {place}:{place} and the name of this one"
         )
 
 
@@ -184,9 +186,7 @@ def watch(
         _write_layout(logs, layout, serves=foxglove)
         if not foxglove:
             return
-    stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stopped_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
     from hearthlog.analyzer.review.live_timeline import last_time
     from hearthlog.schemas.logs.files import check_allowed
@@ -321,21 +321,14 @@ def _open(url: str, port: int | None, *, web: bool) -> "Viewer":
 
 
 def _report_address(url: str, bind: str | None) -> None:
-    from urllib.parse import urlsplit
-
     from hearthlog.analyzer.review.viewer.process import hidden_options
 
-    place = urlsplit(url).netloc
     print_notice(f"open with: rerun {hidden_options()} --connect {url}")
-    if bind is None:
-        print_notice(
-            f"from another machine, first: ssh -L {place}:{place} and the name of this one"
-        )
-    else:
-        print_notice(
-            f"listening on {bind}: anybody who reaches this port, even a web page in a browser, "
-            "sees everything shown; without --bind only users of this machine can"
-        )
+    exposed = (
+        f"listening on {bind}: anybody who reaches this port, even a web page in a browser, sees "
+        "everything shown; without --bind only users of this machine can"
+    )
+    _report_reach(urlsplit(url).netloc, exposed if bind is not None else "")
 
 
 def _wait_until_closed(viewer: "Viewer", stop: Event) -> None:
