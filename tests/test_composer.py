@@ -13,6 +13,9 @@ from threading import Event as Flag
 
 import numpy as np
 import pytest
+
+pytest.importorskip("hearthlog.tools.lab.home", reason="the wheel leaves the lab out")
+
 import soundfile
 from mcap.reader import make_reader
 
@@ -30,14 +33,14 @@ from hearthlog.tools.home.clips import SHIPPED, ClipLibrary, frame_powers
 from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, Rooms
 from hearthlog.tools.home.routine import (
     DAY_FRAMES,
-    Habits,
     HomePlan,
     PlannedNoise,
     PlannedSound,
-    plan_days,
     plan_short_day,
 )
-from hearthlog.tools.home.simulate import record_composition, truth_of, write_sound
+from hearthlog.tools.home.simulate import truth_of, write_sound
+from hearthlog.tools.lab.home.days import Habits, plan_days
+from hearthlog.tools.lab.home.recording import FeatureStream, record_composition
 
 HOUR = DAY_FRAMES // 24
 START = 1_772_323_200_000_000_000
@@ -199,7 +202,7 @@ def test_features_without_most_of_the_sound_are_those_of_the_sound(evening, feat
     busy = evening.busy(0, frames)
     assert 0.2 < busy.mean() < 0.9
     for size in (frames, 5000, 777):
-        stream = evening.features(features)
+        stream = FeatureStream(evening, features)
         blocks = [stream(first, min(size, frames - first)) for first in range(0, frames, size)]
         assert np.array_equal(np.concatenate(blocks), expected)
 
@@ -207,7 +210,7 @@ def test_features_without_most_of_the_sound_are_those_of_the_sound(evening, feat
 def test_steady_noise_repeats_itself_and_its_features_do_too(library, rooms):
     steady = [PlannedNoise("fridge", 500, 3 * PERIOD_FRAMES + 100)]
     quiet = Composition(HomePlan(4 * PERIOD_FRAMES, (), steady), library, rooms)
-    values = quiet.features(DEFAULT)(0, quiet.plan.frames)
+    values = FeatureStream(quiet, DEFAULT)(0, quiet.plan.frames)
     on = values[PERIOD_FRAMES : 2 * PERIOD_FRAMES]
     assert np.array_equal(on, values[2 * PERIOD_FRAMES : 3 * PERIOD_FRAMES])
     assert not np.array_equal(on[600:], values[3 * PERIOD_FRAMES + 600 :])
@@ -337,7 +340,6 @@ def test_clips_that_cannot_be_used_are_named_in_one_line(tmp_path, rows, output)
 
 
 def simulate(*arguments):
-    pytest.importorskip("hearthlog.tools.lab.home", reason="the wheel leaves the lab out")
     command = [sys.executable, "-m", "hearthlog.tools.lab.home", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 

@@ -11,9 +11,10 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import plan_short_day
-from hearthlog.tools.home.simulate import record_composition, truth_of
+from hearthlog.tools.home.simulate import truth_of
 from hearthlog.tools.lab.adaptation import Outcome, adaptation, line_of, wrong_sounds
 from hearthlog.tools.lab.home.person import true_labelling
+from hearthlog.tools.lab.home.recording import record_composition
 
 START = 1_772_323_200  # midnight
 

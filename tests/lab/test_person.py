@@ -15,8 +15,9 @@ from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import plan_short_day
-from hearthlog.tools.home.simulate import record_composition, truth_of
+from hearthlog.tools.home.simulate import truth_of
 from hearthlog.tools.lab.home.person import Person, true_labelling
+from hearthlog.tools.lab.home.recording import record_composition
 
 START = 1_772_323_200_000_000_000
 SUNDAY = START + 86_400 * NANOSECONDS

@@ -13,8 +13,9 @@ from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.frames import FRAME_SAMPLES, NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Rooms
-from hearthlog.tools.home.routine import Habits, plan_days, plan_short_day
+from hearthlog.tools.home.routine import plan_short_day
 from hearthlog.tools.lab import quarter
+from hearthlog.tools.lab.home.days import Habits, plan_days
 from hearthlog.tools.lab.home.microphones import NarrowRooms
 from hearthlog.tools.lab.quarter_picture import line_of, quarter_figure, save_picture
 from hearthlog.tools.lab.quarter_scores import Week, scored

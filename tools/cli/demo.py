@@ -58,11 +58,11 @@ def demo(
     model = load_model(starter)
     day, logs, timeline = output / "day.flac", output / "logs", output / "day.rrd"
 
-    _say(f"1. Composing a day of a home, {minutes:g} minutes long")
+    _announce(f"1. Composing a day of a home, {minutes:g} minutes long")
     truth = write_day(day, minutes, seed=_SEED)
     print(_composed_of(truth))
 
-    _say(f"2. hearthlog record {day} --model {starter} --output {logs} --start {_START}")
+    _announce(f"2. hearthlog record {day} --model {starter} --output {logs} --start {_START}")
     settings = load_settings(None, {"output": logs, "model": starter}, {})
     start = parse_time(_START, "--start")
     began = time.perf_counter()
@@ -77,7 +77,7 @@ def demo(
         "(none of these recordings were used for training; for any other sound, unknown is correct)"
     )
 
-    _say(f"3. hearthlog info {logs}")
+    _announce(f"3. hearthlog info {logs}")
     info(logs)
     if minutes < _DENSE_MINUTES:
         print(
@@ -85,10 +85,10 @@ def demo(
             "counted as that; a real day is not)"
         )
 
-    _say(f"4. hearthlog review {logs} --save {timeline}")
+    _announce(f"4. hearthlog review {logs} --save {timeline}")
     save_timeline(read_timeline([logs]), timeline)
 
-    _say(f"Look at it:           {_command('rerun')} {hidden_options()} {timeline}")
+    _announce(f"Look at it:           {_command('rerun')} {hidden_options()} {timeline}")
     print("                      (with these options no web page can find the viewer)")
     print(f"What is true:         {day.with_suffix('.txt')}, a label track for Audacity")
     print(f"Record a microphone:  {_command('hearthlog')} record")
@@ -139,5 +139,5 @@ def _command(name: str) -> str:
     return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
 
 
-def _say(text: str) -> None:
+def _announce(text: str) -> None:
     print(f"\n{text}", flush=True)

@@ -41,17 +41,17 @@ PANELS = {
 }
 VERBS = tuple(verb for panel in PANELS.values() for verb in panel)
 _MODULES = {  # subcommands that share a module
-    **dict.fromkeys(("alerts",), "bridge"),
-    **dict.fromkeys(("catalog",), "info"),
+    "alerts": "bridge",
+    "catalog": "info",
     **dict.fromkeys(("cat", "cut", "merge"), "export"),
     **dict.fromkeys(
         ("config", "devices", "install_service", "pause", "resume", "retain"), "recorder"
     ),
-    **dict.fromkeys(("diff",), "relabel"),
-    **dict.fromkeys(("enrol",), "annotate"),
-    **dict.fromkeys(("manifest",), "train"),
-    **dict.fromkeys(("recover",), "doctor"),
-    **dict.fromkeys(("voices",), "discover"),
+    "diff": "relabel",
+    "enrol": "annotate",
+    "manifest": "train",
+    "recover": "doctor",
+    "voices": "discover",
 }
 _TYPES = {"str": "TEXT", "int": "NUMBER", "float": "NUMBER"}
 _TYPES |= dict.fromkeys(("Path", "path", "file", "directory"), "PATH")

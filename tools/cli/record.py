@@ -131,7 +131,7 @@ def record(
     refused.
     """
     from hearthlog.recorder.config import NO_MODEL, exposed_passwords, load_settings
-    from hearthlog.recorder.recording import record_files
+    from hearthlog.recorder.recording import record_files, record_microphones
 
     given = {
         "output": output,
@@ -175,23 +175,13 @@ def record(
     elif start is not None or realtime or start_pattern is not None:
         wrong_use("--start, --start-pattern and --realtime go with files")
     else:
-        recording = _listen(settings, stop, reload_requests)
+        with ExitStack() as shown:
+            state = shown.enter_context(_living_line(settings)) if sys.stderr.isatty() else None
+            recording = record_microphones(settings, stop, reload_requests, state)
         if reload_requests.restart:
             print_notice("the configuration has changed; restarting")
             os.execv(sys.executable, sys.orig_argv)  # noqa: S606  with the original arguments
     _report(recording, losses)
-
-
-def _listen(
-    settings: "Settings", stop: Flag, reload_requests: "ReloadRequests"
-) -> "RecordingSummary":
-    """Record microphones, with a live status line on a terminal."""
-    from hearthlog.recorder.recording import record_microphones
-
-    if not sys.stderr.isatty():
-        return record_microphones(settings, stop, reload_requests)
-    with _living_line(settings) as state:
-        return record_microphones(settings, stop, reload_requests, state)
 
 
 @contextmanager

@@ -328,35 +328,24 @@ def install_service(
     the unit and restarts the recorder: the log is completed, and the next log records the
     gap.
     """
-    from hearthlog.tools.service.unit import install_for_system, install_for_user
+    from hearthlog.tools.service.unit import install_bridge, install_for_system, install_for_user
 
     if user and (bridge or account is not None):
         wrong_use("--account and --bridge are for the system service; --user runs as you")
     if bridge:
-        _install_bridge(config, account)
-        return
-    if user:
+        if config is None:
+            wrong_use("--bridge needs --config, with a table such as [bridge.mqtt]")
+        installed = install_bridge(config, account)
+    elif user:
         installed = install_for_user(config)
     else:
         installed = install_for_system(account or "hearthlog", config)
     print(installed.unit)
-    manager = "systemctl --user" if user else "systemctl"
     if installed.started:
-        print_notice(f"it is recording: `{manager} status hearthlog` shows its state")
+        what, name = ("running", "hearthlog-bridge") if bridge else ("recording", "hearthlog")
+        manager = "systemctl --user" if user else "systemctl"
+        print_notice(f"it is {what}: `{manager} status {name}` shows its state")
     else:
         print_notice("it is enabled, and starts with systemd")
     if user and not (_LINGER / getpass.getuser()).exists():
         print_notice("it ends when you log out; to keep it running: loginctl enable-linger")
-
-
-def _install_bridge(config: Path | None, account: str | None) -> None:
-    from hearthlog.tools.service.unit import install_bridge
-
-    if config is None:
-        wrong_use("--bridge needs --config, with a table such as [bridge.mqtt]")
-    installed = install_bridge(config, account)
-    print(installed.unit)
-    if installed.started:
-        print_notice("it is running: `systemctl status hearthlog-bridge` shows its state")
-    else:
-        print_notice("it is enabled, and starts with systemd")

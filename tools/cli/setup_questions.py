@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 
 NONE = "none"
 NETWORK = "yamnet"
+# Questions, and the options that answer them.
+_BROKER = "Publish to Home Assistant or another MQTT broker", "--mqtt HOST or --mqtt none"
+_ALERTS = (
+    "Send alerts, first of all when the recorder falls silent",
+    "--alerts FILE or --alerts none",
+)
 _Value = TypeVar("_Value")
 
 
@@ -41,11 +47,16 @@ class Asker:
         return not self.yes
 
     def text(
-        self, question: str, option: str, default: str, check: Callable[[str], _Value]
+        self,
+        question: str,
+        option: str,
+        default: str,
+        check: Callable[[str], _Value],
+        given: str | None = None,
     ) -> _Value:
-        """Ask until the answer passes a check that raises HearthlogError."""
-        if not self.asks(question, option):
-            return _checked(option, default, check)
+        """Check the given answer, or ask until one passes a check that raises HearthlogError."""
+        if given is not None or not self.asks(question, option):
+            return _checked(option, default if given is None else given, check)
         while True:
             answer = typer.prompt(question, default=default, err=True)
             try:
@@ -82,7 +93,7 @@ class Installation:
 
         if self.account is None:
             return unit.user_units() / name
-        return unit.packaged_unit(name) if unit.is_packaged(name) else unit.SYSTEM_UNITS / name
+        return unit.system_unit_path(name)
 
     def is_running(self, name: str) -> bool:
         """Return whether a service runs now."""
@@ -206,18 +217,15 @@ def _check_level(device: str) -> None:
 def node_of(asker: Asker, given: str | None, present: Present) -> str:
     from hearthlog.schemas.logs.files import check_node_name
 
-    if given is not None:
-        return _checked("--node", given, check_node_name)
-    return asker.text("Name of the home", "--node", present.settings.node, check_node_name)
+    default = present.settings.node
+    return asker.text("Name of the home", "--node", default, check_node_name, given)
 
 
 def timezone_of(asker: Asker, given: str | None, present: Present) -> str:
     from hearthlog.recorder.pause_schedule import check_time_zone
 
-    if given is not None:
-        return _checked("--timezone", given, check_time_zone)
     default = present.settings.timezone
-    return asker.text("Time zone of the home", "--timezone", default, check_time_zone)
+    return asker.text("Time zone of the home", "--timezone", default, check_time_zone, given)
 
 
 def keeps_sound(asker: Asker, given: bool | None, present: Present) -> bool:
@@ -314,7 +322,7 @@ def broker_of(
     from hearthlog.tools.service.configuration_file import Broker, secret_file
 
     now: MqttSettings | None = present.bridge.mqtt
-    if given == NONE or (given is None and not _wanted(asker, "mqtt", now is not None)):
+    if given == NONE or (given is None and not asker.confirm(*_BROKER, default=now is not None)):
         return None
     require("paho")
     user, password_file = login
@@ -343,17 +351,6 @@ def broker_of(
         secrets[file] = f"{password}\n"
         old = file
     return Broker(host, user, old)
-
-
-def _wanted(asker: Asker, option: str, default: bool) -> bool:
-    questions = {
-        "mqtt": ("Publish to Home Assistant or another MQTT broker", "--mqtt HOST or --mqtt none"),
-        "alerts": (
-            "Send alerts, first of all when the recorder falls silent",
-            "--alerts FILE or --alerts none",
-        ),
-    }
-    return asker.confirm(*questions[option], default=default)
 
 
 def _host(text: str) -> str:
@@ -389,7 +386,7 @@ def alerts_of(
 
     now = present.bridge.delivery.urls_file
     file = secret_file(installation.config, "alert-urls")
-    if given == NONE or (given is None and not _wanted(asker, "alerts", now is not None)):
+    if given == NONE or (given is None and not asker.confirm(*_ALERTS, default=now is not None)):
         return None
     require("apprise")
     if given is not None:

@@ -7,7 +7,6 @@ import numpy as np
 from scipy.ndimage import grey_closing
 from scipy.signal import lfilter, oaconvolve
 
-from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int16
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.home.clips import ArrayCache, ClipLibrary, frame_powers
@@ -167,7 +166,6 @@ def _noise(
 _CACHE_BYTES = 96 << 20
 _MAX_PEAK = 0.9
 _PAUSE_FRAMES = 11  # shorter pauses belong to the sound
-_FRAMES_AT_ONCE = 384
 _TINY = 1e-9
 
 
@@ -203,10 +201,6 @@ class Composition:
             wet = self._wet(sound)[begin - sound.start : end - sound.start]
             mix[begin - first : end - first] += wet * np.float32(self._gain(sound))
         return _quantised(mix)
-
-    def features(self, features: FeatureSet) -> "FeatureStream":
-        """Begin a stream of the features of the composed sound."""
-        return FeatureStream(self, features)
 
     def audible(self, first: int, count: int) -> Iterator[AudibleSound]:
         """Yield the sounds that begin in some frames, at their received level."""
@@ -297,53 +291,6 @@ class Composition:
         return float(min(10.0 ** (sound.level / 20.0), _MAX_PEAK / max(peak, _TINY)))
 
 
-class FeatureStream:
-    """The features of a composition, in the order of the frames.
-
-    Features are looked up if a frame and its predecessor contain only steady noise, whose features
-    are periodic. Other frames are composed and their features computed. A frame's features must
-    depend only on the frame and its predecessor.
-    """
-
-    def __init__(self, composition: Composition, features: FeatureSet) -> None:
-        self._composition = composition
-        self._features = features
-        self._extractor = features.extractor()
-        self._tables: dict[tuple[str, ...], Float32] = {}
-
-    def __call__(self, first: int, count: int) -> Float32:
-        """Return features [shape=(count, d)], bit-identical to the features of the samples."""
-        before = 1 if first else 0
-        busy = self._composition.busy(first - before, count + before)
-        computed = busy[before:].copy()
-        computed |= busy[:-1] if before else np.concatenate([[True], busy[:-1]])
-        values = np.empty((count, self._features.width), np.float32)
-        for begin, end in _runs(computed):
-            values[begin:end] = self._compute(first + begin, first + end)
-        for begin, end in _runs(~computed):
-            table = self._table(self._composition.state(first + begin))
-            values[begin:end] = table[np.arange(first + begin, first + end) % PERIOD_FRAMES]
-        return values
-
-    def _compute(self, begin: int, end: int) -> Float32:
-        self._extractor.restart()
-        blocks = []
-        before = 1 if begin else 0
-        for start in range(begin - before, end, _FRAMES_AT_ONCE):
-            count = min(_FRAMES_AT_ONCE, end - start)
-            blocks.append(self._extractor(full_scale(self._composition.samples(start, count))))
-        return np.concatenate(blocks)[before:]
-
-    def _table(self, state: tuple[str, ...]) -> Float32:
-        """Return the features of one period of steady noise, each frame after its predecessor."""
-        if state not in self._tables:
-            noise = full_scale(self._composition.steady(state))
-            extractor = self._features.extractor()
-            extractor(noise[-1:])
-            self._tables[state] = extractor(noise)
-        return self._tables[state]
-
-
 def _audible_until(sound: PlannedSound) -> int:
     return sound.end + TAIL_FRAMES
 
@@ -355,9 +302,3 @@ def _quantised(mix: Float32) -> Int16:
 def full_scale(samples: Int16) -> Float32:
     """Convert samples to floats as an audio file reader does."""
     return samples.astype(np.float32) / np.float32(32768.0)
-
-
-def _runs(flags: Bool) -> list[tuple[int, int]]:
-    """Return the starts and ends of runs of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.view(np.int8), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

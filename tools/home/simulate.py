@@ -11,72 +11,16 @@ import numpy as np
 import soundfile
 
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.model import SIMULATED, Model
-from hearthlog.models.embedding.networks import Embedder, load_embedder
-from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.recorder.config import Settings
-from hearthlog.recorder.events import OK, Frames, SourceHealth
-from hearthlog.recorder.labelling.embedder_probe import network_path
-from hearthlog.recorder.log.description import describe_log
-from hearthlog.recorder.log.rolling_log import RollingLog
-from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
-from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.models.classifiers.model import SIMULATED
 from hearthlog.schemas.arrays import Float64, Int16, Int64
 from hearthlog.schemas.errors import Progress, ignore_progress
-from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, SAMPLE_RATE
+from hearthlog.schemas.frames import FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
-from hearthlog.tools.home.composition import AudibleSound, Composition, Rooms, full_scale
+from hearthlog.tools.home.composition import AudibleSound, Composition, Rooms
 from hearthlog.tools.home.routine import DAY_FRAMES, LIVING_ROOM, PlannedSound, plan_short_day
 from hearthlog.tools.home.sounds import LABELS, SimulationError, generator, synthesize
 
-_PUSHED_FRAMES = 200  # as from `FileSource`, after a health report
-_COMPUTED_FRAMES = 12_000  # 10 minutes
-
-
-def record_composition(
-    composition: Composition,
-    settings: Settings,
-    start: int,
-    device: str = "simulated home",
-    progress: Progress = ignore_progress,
-) -> list[Path]:
-    """Write the logs of a simulated home as a recorder would, from a time in nanoseconds of UTC.
-
-    The complete sound is composed only for a model that uses embeddings; for other models most of
-    it is not. The model of the settings labels the sound; clips are not kept. Raise `ModelError` if
-    the model cannot be used, or its embedding network is missing, `LogError` if a log exists, or
-    cannot be written.
-    """
-    model = None if settings.model is None else load_model(settings.model)
-    classifier = None if model is None else Classifier(model)
-    features = DEFAULT if classifier is None else classifier.feature_set
-    microphone = settings.microphone[0].name
-    embedder = embedder_of(model)
-    pipeline = Pipeline(
-        microphone, features, classifier, settings.statistics_every, embedder=embedder
-    )
-    info = stream_info(microphone, device, features, model)
-    log = RollingLog(
-        describe_log(settings, info, features, model, embedding=pipeline.embedding),
-        settings.max_bag_duration,
-        settings.flush_seconds,
-        settings.sync_seconds,
-    )
-    for messages in _messages(composition, pipeline, start, device, progress):
-        log.write(messages)
-    log.finish(pipeline.finish())
-    return log.finished
-
-
-def embedder_of(model: Model | None) -> Embedder | None:
-    """Load the embedding network of a model; None if the model uses none.
-
-    Raise `ModelError` if the network is missing or cannot be used.
-    """
-    space = None if model is None else model.description.embedding_space
-    return None if space is None else load_embedder(space.network, network_path(space.network))
+BLOCK_FRAMES = 200  # as from `FileSource`, after a health report
 
 
 def write_sound(
@@ -95,37 +39,15 @@ def write_sound(
         path.open("xb") as file,
         soundfile.SoundFile(file, "w", SAMPLE_RATE, 1, "PCM_16", format="FLAC") as audio,
     ):
-        for number, samples in _blocks(composition, first, frames):
+        for number, samples in blocks_of(composition, first, frames):
             audio.write(samples.ravel())
             progress((number - first + len(samples)) / frames)
 
 
-def _blocks(composition: Composition, first: int, frames: int) -> Iterator[tuple[int, Int16]]:
-    for number in range(first, first + frames, _PUSHED_FRAMES):
-        yield number, composition.samples(number, min(_PUSHED_FRAMES, first + frames - number))
-
-
-def _messages(
-    composition: Composition, pipeline: Pipeline, start: int, device: str, progress: Progress
-) -> Iterator[list[EncodedMessage]]:
-    """Yield the pipeline's messages for the sound, and the health of its source."""
-    frames = composition.plan.frames
-    if pipeline.embedding is not None:
-        for first, samples in _blocks(composition, 0, frames):
-            stamps = start + np.arange(first, first + len(samples)) * FRAME_NANOSECONDS
-            yield pipeline.push(SourceHealth(int(stamps[0]), OK, "reading", {"device": device}))
-            yield pipeline.push(Frames(first, full_scale(samples), stamps))
-            progress((first + len(samples)) / frames)
-        return
-    stream = composition.features(pipeline.feature_set)
-    for block in range(0, frames, _COMPUTED_FRAMES):
-        values = stream(block, min(_COMPUTED_FRAMES, frames - block))
-        for offset in range(0, len(values), _PUSHED_FRAMES):
-            part, first = values[offset : offset + _PUSHED_FRAMES], block + offset
-            stamps = start + np.arange(first, first + len(part)) * FRAME_NANOSECONDS
-            yield pipeline.push(SourceHealth(int(stamps[0]), OK, "reading", {"device": device}))
-            yield pipeline.push_features(part, first, stamps)
-        progress((block + len(values)) / frames)
+def blocks_of(composition: Composition, first: int, frames: int) -> Iterator[tuple[int, Int16]]:
+    """Compose frames block by block: the number of the first one, and samples."""
+    for number in range(first, first + frames, BLOCK_FRAMES):
+        yield number, composition.samples(number, min(BLOCK_FRAMES, first + frames - number))
 
 
 LabelledSpan = tuple[float, float, str]  # start and end in seconds, and the label

@@ -34,10 +34,11 @@ from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import LEVELS, LIVING_ROOM, RESIDENT, HomePlan, PlannedSound
-from hearthlog.tools.home.simulate import record_composition, truth_of
+from hearthlog.tools.home.simulate import truth_of
 from hearthlog.tools.lab.adaptation import wrong_sounds
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.home.person import true_labelling, write_review
+from hearthlog.tools.lab.home.recording import record_composition
 from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_scores import scored
 

@@ -26,13 +26,15 @@ from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
-from hearthlog.tools.home.routine import DAY_FRAMES, LIVING_ROOM, Habits, HomePlan, plan_days
-from hearthlog.tools.home.simulate import record_composition, truth_of
+from hearthlog.tools.home.routine import DAY_FRAMES, LIVING_ROOM, HomePlan
+from hearthlog.tools.home.simulate import truth_of
 from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.lab.bench.timing import HEARTHLOG
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.home.days import Habits, plan_days
 from hearthlog.tools.lab.home.microphones import NarrowRooms
 from hearthlog.tools.lab.home.person import Person, true_labelling
+from hearthlog.tools.lab.home.recording import record_composition
 from hearthlog.tools.lab.labelling import label_logs
 from hearthlog.tools.lab.quarter_picture import line_of, save_picture
 from hearthlog.tools.lab.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Week, scored

@@ -25,7 +25,8 @@ from hearthlog.models.classes import (
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
-from hearthlog.tools.home.routine import BATHROOM, LIVING_ROOM, RADIO, TELEVISION, Habits, plan_days
+from hearthlog.tools.home.routine import BATHROOM, LIVING_ROOM, RADIO, TELEVISION
+from hearthlog.tools.lab.home.days import Habits, plan_days
 from hearthlog.tools.lab.routine_hearing import Hearing, Names
 
 FIRST = date(2026, 1, 5)  # a Monday

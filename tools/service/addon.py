@@ -81,9 +81,9 @@ class Service:
             self._due = now + _AGAIN_SECONDS
             if status not in {0, _GAPS}:
                 how = f"signal {-status}" if status < 0 else f"status {status}"
-                _say(f"the {self._name} ended with {how}; starting it again")
+                _announce(f"the {self._name} ended with {how}; starting it again")
         elif self._reported is not None and now - self._reported > _HANG_SECONDS:
-            _say(f"the {self._name} hangs; ending it")
+            _announce(f"the {self._name} hangs; ending it")
             self._process.kill()
 
     def take_report(self) -> None:
@@ -187,7 +187,7 @@ class Addon:
     def _report(self, problem: str) -> None:
         """Print a problem of the broker when it is new."""
         if problem and problem != self._broker_problem:
-            _say(f"{problem}; the recorder and the page run without it")
+            _announce(f"{problem}; the recorder and the page run without it")
         self._broker_problem = problem
 
     def _take_broker(self) -> None:
@@ -202,7 +202,7 @@ class Addon:
             self._report(str(error))
             return
         self._broker = broker
-        _say(f"the MQTT broker is {broker.host}")
+        _announce(f"the MQTT broker is {broker.host}")
         self._bridge.restart()
 
 
@@ -218,7 +218,7 @@ def _make_folders(options: AddonOptions, folders: AddonFolders, account: str | N
                 os.chown(path, owner.pw_uid, owner.pw_gid, follow_symlinks=False)
 
 
-def _say(text: str) -> None:
+def _announce(text: str) -> None:
     print(f"hearthlog: {text}", file=sys.stderr, flush=True)
 
 
@@ -237,10 +237,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         Addon(options, folders, given.account, given.supervisor).run()
     except ConfigurationError as error:
         for line in error.lines:
-            _say(line)
+            _announce(line)
         sys.exit(error.status)
     except (HearthlogError, OSError) as error:
-        _say(str(error))
+        _announce(str(error))
         sys.exit(1)
 
 

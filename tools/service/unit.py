@@ -222,7 +222,7 @@ def check_unit(unit: Path, verb: str, config: Path, folder: Path | None) -> None
 
 def check_no_other_recorder() -> None:
     """Raise `ServiceError` if the service of the machine records: a user's would be a second."""
-    unit = packaged_unit(NAME) if is_packaged(NAME) else SYSTEM_UNITS / NAME
+    unit = system_unit_path(NAME)
     if not unit.exists() or not is_systemd_running():
         return
     command = ["systemctl", "is-active", "--quiet", NAME]
@@ -233,9 +233,9 @@ def check_no_other_recorder() -> None:
         )
 
 
-def packaged_unit(name: str) -> Path:
-    """Return the path of a unit of the distribution."""
-    return _PACKAGED_UNITS / name
+def system_unit_path(name: str) -> Path:
+    """Return the path of a unit, of the distribution if nothing replaces it."""
+    return (_PACKAGED_UNITS if is_packaged(name) else SYSTEM_UNITS) / name
 
 
 def make_account(account: str) -> bool:

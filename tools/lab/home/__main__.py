@@ -12,17 +12,12 @@ from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
-from hearthlog.tools.home.routine import LIVING_ROOM, ROOMS, Habits, plan_days
-from hearthlog.tools.home.simulate import (
-    embedder_of,
-    record_composition,
-    reported,
-    truth_of,
-    write_sound,
-    write_truth,
-)
+from hearthlog.tools.home.routine import LIVING_ROOM, ROOMS
+from hearthlog.tools.home.simulate import reported, truth_of, write_sound, write_truth
 from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.home.days import Habits, plan_days
+from hearthlog.tools.lab.home.recording import embedder_of, record_composition
 
 _HOUR_FRAMES = round(3600 / FRAME_SECONDS)
 

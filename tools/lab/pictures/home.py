@@ -18,9 +18,11 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
-from hearthlog.tools.home.routine import LIVING_ROOM, Habits, plan_days
-from hearthlog.tools.home.simulate import record_composition, truth_of, write_sound
+from hearthlog.tools.home.routine import LIVING_ROOM
+from hearthlog.tools.home.simulate import truth_of, write_sound
+from hearthlog.tools.lab.home.days import Habits, plan_days
 from hearthlog.tools.lab.home.person import Person, true_labelling
+from hearthlog.tools.lab.home.recording import record_composition
 
 SEED = 41
 ZONE = ZoneInfo("Europe/Vienna")
