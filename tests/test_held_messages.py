@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hearthlog.recorder.log.description import LogDescription
-from hearthlog.recorder.log.held_messages import HeldMessages
+from hearthlog.recorder.log.rolling_log import HeldMessages
 from hearthlog.recorder.stream.messages import EncodedMessage
 
 MESSAGES = st.builds(

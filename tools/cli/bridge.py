@@ -190,11 +190,8 @@ def replay(
     microphones = {source_microphone(name) for name in activity.coverage}
     for rule in own.alert:
         unrecorded = unknown_microphone(rule, microphones, recorded=True)
-        if (
-            text := hidden_class(rule, hidden)
-            or unrecorded
-            or unknown_class(rule, activity.classes)
-        ):
+        problem = hidden_class(rule, hidden) or unrecorded
+        if text := problem or unknown_class(rule, activity.classes):
             print_notice(text)
     if as_json:
         print_json(_as_json(found, (first, last), zone))

@@ -18,6 +18,7 @@ from hearthlog.tools.cli.options import (
     Start,
     Timezone,
     check_output,
+    home_and_zone,
     parse_span,
     reviewer_name,
 )
@@ -88,8 +89,6 @@ def discover(
     from hearthlog.analyzer.discover.groups import GROUPS
     from hearthlog.analyzer.discover.sounds import CHOICES, Looked
     from hearthlog.analyzer.extras import require
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.logs.local_time import home_zone
     from hearthlog.models.classes import SILENCE
 
     if of not in CHOICES:
@@ -98,8 +97,7 @@ def discover(
         require("sklearn", "scipy")
     looked = Looked(of, *parse_span(start, end))
     names, who = _names(GROUPS, name or [], "a class", {SILENCE}), reviewer_name(reviewer)
-    home = find_home_logs(logs)
-    zone = home_zone(timezone, home.records())
+    home, zone = home_and_zone(logs, timezone)
     file = groups or _default_file(GROUPS, logs, "the groups")
     with locked_file(file):
         if names or undo:
@@ -328,17 +326,13 @@ def voices(
     from hearthlog.analyzer.discover.speech import find_voices, read_speech
     from hearthlog.analyzer.discover.summary import summarise_voices
     from hearthlog.analyzer.discover.voices import VOICES, load_voices, save_voices
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.logs.local_time import home_zone
 
-    if output is not None:
-        check_output("--output", output, ".csv", "a table")
+    check_output("--output", output, ".csv", "a table")
     names = _voice_names(name or [])
     if home is not None and not names:
         wrong_use("--home goes with --name")
     span = parse_span(start, end)
-    found = find_home_logs(logs)
-    zone = home_zone(timezone, found.records())
+    found, zone = home_and_zone(logs, timezone)
     path = file or _default_file(VOICES, logs, "voices")
     with locked_file(path):
         known = load_voices(path)

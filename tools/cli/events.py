@@ -17,6 +17,7 @@ from hearthlog.tools.cli.options import (
     Logs,
     Start,
     Timezone,
+    home_and_zone,
     parse_span,
     read_day,
 )
@@ -82,11 +83,9 @@ def events(
     from hearthlog.analyzer.activity.daily_metrics import whole_home
     from hearthlog.analyzer.activity.home_data import read_home
     from hearthlog.analyzer.activity.home_events import event_totals, home_events, marked_classes
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.logs.local_time import home_zone, midnight
+    from hearthlog.analyzer.logs.local_time import midnight
 
-    home_logs = find_home_logs(logs)
-    zone = home_zone(timezone, home_logs.records())
+    home_logs, zone = home_and_zone(logs, timezone)
     span = _chosen_span(home_logs, zone, day, limits, night=night)
     before = midnight(_date(span.start, zone) - timedelta(days=1), zone)  # of an event that goes on
     with share_done("reading the labels") as progress:

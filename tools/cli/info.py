@@ -279,16 +279,13 @@ _BAR_WIDTH = 24
 
 def _print_amounts(overview: "Overview") -> None:
     """Print a bar for each class, by microphone."""
-    from hearthlog.tools.cli.info_summary import amount_text
-
     for microphone, amounts in overview.bars():
-        texts = [amount_text(one) for one in amounts]
-        width = max(map(len, texts), default=0)
+        width = max((len(one.time) for one in amounts), default=0)
         name = max((len(one.words) for one in amounts), default=0)
         print(printable(f"{microphone}: time labelled as each sound, also that of a television"))
-        for one, minutes in zip(amounts, texts, strict=True):
+        for one in amounts:
             bar = long_bar(one.share, _BAR_WIDTH)
-            print(printable(f"  {one.words:{name}}  {bar:{_BAR_WIDTH}}  {minutes:>{width}}"))
+            print(printable(f"  {one.words:{name}}  {bar:{_BAR_WIDTH}}  {one.time:>{width}}"))
     print_lines(overview.doubts())
 
 

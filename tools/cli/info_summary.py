@@ -41,7 +41,7 @@ class ClassAmount(NamedTuple):
     """Time of a class; `share` is relative to the longest, 0 for silence."""
 
     words: str
-    minutes: float
+    time: str
     share: float
 
 
@@ -83,7 +83,7 @@ class Overview:
                 [
                     ClassAmount(
                         in_words(name),
-                        seconds[name] / 60,
+                        _minutes(seconds[name] / 60),
                         seconds[name] / longest if name in sounds and longest else 0.0,
                     )
                     for name in ordered(seconds)
@@ -203,11 +203,6 @@ def _minutes(minutes: float) -> str:
     if minutes < 1:
         return f"{60 * minutes:.0f} s"
     return f"{minutes:.1f} min" if minutes < _HOUR else Duration.show(minutes)
-
-
-def amount_text(one: ClassAmount) -> str:
-    """Format the time of a class."""
-    return _minutes(one.minutes)
 
 
 def day_line(day: date, totals: Mapping[str, EventTotal]) -> str:

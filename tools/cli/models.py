@@ -247,30 +247,24 @@ def compare(
     left_out: list[SkippedClip] = []
     with_embedding = next((one for one in (first, second) if one.description.embedding), first)
     recordings = _recordings(data, logs, chosen, with_embedding, left_out)
-    if logs is not None and not recordings:
-        print_notice("there are no marks: the differences are shown, not which model is better")
-        shares = _minutes_in_logs(first, second, logs)
-        if not shares:
-            print_notice(
-                "there are no recent logs that neither was trained on: record for some hours"
-            )
-        if as_json:
-            print(json.dumps({"said": _shares_json(shares)}, indent=2))
-        else:
-            _print_shares(first.name, second.name, shares, None)
-        return
-    comparison = compare_models(first, second, recordings, chosen)
-    if logs is None:
-        shares = _shares_of_segments(comparison)
+    comparison = None
+    if logs is None or recordings:
+        comparison = compare_models(first, second, recordings, chosen)
     else:
-        shares = _minutes_in_logs(first, second, logs)
+        print_notice("there are no marks: the differences are shown, not which model is better")
+    shares = _shares(first, second, comparison, logs)
+    if not (shares or comparison):
+        print_notice("there are no recent logs that neither was trained on: record for some hours")
     if as_json:
-        more = {"clear": comparison.clear, "said": _shares_json(shares)}
-        print(json.dumps(asdict(comparison) | more, indent=2))
+        result = {} if comparison is None else asdict(comparison) | {"clear": comparison.clear}
+        result["said"] = {one.name: [one.a, one.b] for one in shares}
+        print(json.dumps(result, indent=2))
+    elif comparison is None:
+        _print_shares(first.name, second.name, shares, None)
     else:
         _print_comparison(comparison, shares)
     warnings = left_out_lines(left_out)
-    if not comparison.held_out:
+    if comparison is not None and not comparison.held_out:
         warnings.append(
             "the models were trained on every source: this does not show how good they are on "
             "other recordings"
@@ -440,8 +434,13 @@ def _after(before: str | None) -> str:
     return "" if before is None else f", after {before}"
 
 
-def _shares_of_segments(comparison: "Comparison") -> list["_ClassShare"]:
-    """Return the share of segments that each model assigns to each class."""
+def _shares(
+    first: "Model", second: "Model", comparison: "Comparison | None", logs: Path | None
+) -> list["_ClassShare"]:
+    """Return what two models assign to each class: minutes of a day in logs, or segments."""
+    if logs is not None:
+        return _minutes_in_logs(first, second, logs)
+    assert comparison is not None
     sides = (comparison.a, comparison.b)
     both = [[sum(column) for column in zip(*one.scores.confusion, strict=True)] for one in sides]
     total = max(comparison.a.scores.segments, 1)
@@ -467,10 +466,6 @@ def _minutes_in_logs(a: "Model", b: "Model", logs: Path) -> list["_ClassShare"]:
         _ClassShare(name, before, after, time_words(before), time_words(after))
         for name, before, after in times
     ]
-
-
-def _shares_json(shares: list["_ClassShare"]) -> dict[str, list[float]]:
-    return {one.name: [one.a, one.b] for one in shares}
 
 
 def _print_comparison(comparison: "Comparison", shares: list["_ClassShare"]) -> None:

@@ -16,6 +16,7 @@ from hearthlog.tools.cli.terminal import wrong_use
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
+    from hearthlog.analyzer.logs.home_logs import HomeLogs
     from hearthlog.analyzer.training.manifest import LabelledClip, SkippedClip
     from hearthlog.analyzer.training.method import Method
 
@@ -153,6 +154,15 @@ def labelled_clips(
 
     paths = map(manifest_path, data)
     return [clip for path in paths for clip in read_manifest(path, labels, left_out)]
+
+
+def home_and_zone(logs: "Sequence[Path]", timezone: str | None) -> "tuple[HomeLogs, tzinfo]":
+    """Find the logs of a home, and its time zone: the given one, else that in the logs."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.logs.local_time import home_zone
+
+    home = find_home_logs(logs)
+    return home, home_zone(timezone, home.records())
 
 
 def models_folder(given: Path | None = None) -> Path:

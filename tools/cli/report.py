@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hearthlog.tools.cli.options import NEAR, Day, Labels, Logs, Timezone, read_date, read_day
+from hearthlog.tools.cli.options import (
+    NEAR,
+    Day,
+    Labels,
+    Logs,
+    Timezone,
+    home_and_zone,
+    read_date,
+    read_day,
+)
 from hearthlog.tools.cli.terminal import end_with_warnings, share_done, wrong_use
 
 if TYPE_CHECKING:
@@ -47,14 +56,12 @@ def report(
     from hearthlog.analyzer.extras import require
 
     require("jinja2", *[] if no_picture else ["matplotlib"])
+    first = None
     if week is not None:
-        first: date | None = read_date("--week", week)
-        assert first is not None
-        first -= timedelta(days=first.weekday())
-    else:
-        first = None if day in {None, *NEAR} else read_date("--day", day or "")
-    from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.analyzer.logs.local_time import home_zone
+        monday = read_date("--week", week)
+        first = monday - timedelta(days=monday.weekday())
+    elif day is not None and day not in NEAR:
+        first = read_date("--day", day)
     from hearthlog.analyzer.report.report import WEEK, Period, make_report
 
     draw = None
@@ -62,8 +69,7 @@ def report(
         from hearthlog.analyzer.report.timeline_plot import save_timelines
 
         draw = save_timelines
-    home_logs = find_home_logs(logs)
-    zone = home_zone(timezone, home_logs.records())
+    home_logs, zone = home_and_zone(logs, timezone)
     if first is None:
         first = home_logs.last_complete_day(zone) if day is None else read_day("--day", day, zone)
     count = 1 if week is None else WEEK
