@@ -125,17 +125,15 @@ def join_descriptions(descriptions: Sequence[LogDescription]) -> LogDescription:
     """Join the descriptions of several microphones."""
     first = descriptions[0]
     attachments = {each.name: each for each in first.attachments}
+    features: dict[str, str] = {}
     for other in descriptions[1:]:
         (info,) = other.infos
         for each in other.attachments:
             if each not in attachments.values():
                 name = attachment_of(each.name, info.header.frame_id)
                 attachments[name] = replace(each, name=name)
-    topics = {topic.name: topic for each in descriptions for topic in each.topics}
-    features: dict[str, str] = {}
-    for other in descriptions[1:]:
-        (info,) = other.infos
         features |= other_features(first.metadata, other.metadata, info.header.frame_id)
+    topics = {topic.name: topic for each in descriptions for topic in each.topics}
     scenarios = {
         key: text
         for each in descriptions

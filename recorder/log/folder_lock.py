@@ -8,7 +8,6 @@ import stat
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self
 
 from hearthlog.schemas.errors import LogError
@@ -42,15 +41,13 @@ class FolderLock:
         self._hold()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._release()
         if self._is_new:
-            self._remove_unused()
+            with suppress(OSError):  # the folder or its disk is gone
+                if list(self._folder.iterdir()) == [self._path]:  # nothing was recorded
+                    self._path.unlink()
+                    self._folder.rmdir()
 
     def renew(self) -> None:
         """Acquire the lock again if its folder was deleted, moved away or mounted since.
@@ -88,12 +85,6 @@ class FolderLock:
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
-
-    def _remove_unused(self) -> None:
-        with suppress(OSError):  # the folder or its disk is gone
-            if list(self._folder.iterdir()) == [self._path]:  # nothing was recorded
-                self._path.unlink()
-                self._folder.rmdir()
 
 
 def _lock(descriptor: int, folder: Path, node: str) -> None:

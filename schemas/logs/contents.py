@@ -98,8 +98,11 @@ class LogContents:
         """Add messages; raise `LogError` if one does not match the type of its channel."""
         for raw in batch:
             self._add_topic(raw)
-        for columns in _decoded(batch, readable or is_readable):
-            self._add(columns)
+        fits = readable or is_readable
+        for type_, paths in FIELDS.items():
+            same = [raw for raw in batch if fits(raw.channel, raw.schema, type_, paths)]
+            for columns in decode(same, paths):
+                self._add(columns)
 
     def differing(self, other: "LogContents") -> list[str]:
         """List the names of counts that differ from another summary, ignoring the order of gaps."""
@@ -175,12 +178,6 @@ def has_contents(
 ) -> bool:
     """Return whether `LogContents` reads the messages of a channel."""
     return any(readable(channel, schema, *kind) for kind in FIELDS.items())
-
-
-def _decoded(batch: Sequence[RawMessages], readable: IsReadable) -> Iterator[Columns]:
-    for type_, paths in FIELDS.items():
-        same = [raw for raw in batch if readable(raw.channel, raw.schema, type_, paths)]
-        yield from decode(same, paths)
 
 
 def _counter(counters: dict[str, Counter[str]], name: str) -> Counter[str]:

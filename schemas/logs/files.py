@@ -227,7 +227,7 @@ def _warn_of_compressed(folder: Path, names: Sequence[str]) -> None:
 
 def _others_in(folder: Path) -> str:
     """Return the name of a log in another format in a folder without logs."""
-    entries = (entry for entry in islice(folder.rglob("*"), _LOOKED_AT))
+    entries = islice(folder.rglob("*"), _LOOKED_AT)
     for other in sorted(entry for entry in entries if entry.suffix in OTHER_SUFFIXES):
         with suppress(OSError), os.fdopen(open_regular(other), "rb") as stream:
             return f": {other.name} {not_mcap(stream.read(16))}"
@@ -277,12 +277,9 @@ def look_into(folder: str) -> Inside:
         is_all = not any(entry.is_symlink() for entry in named)
     except OSError:  # ignored, as by Path.rglob
         is_all = False
-    logs = [entry for entry in named if _may_be_log(entry)]
+    exists = os.path.exists
+    logs = [entry for entry in named if entry.is_file() or not exists(entry)]
     return Inside(folders, logs, compressed, is_all)
-
-
-def _may_be_log(entry: "os.DirEntry[str]") -> bool:
-    return entry.is_file() or not os.path.exists(entry)  # noqa: PTH110  avoids a Path per file
 
 
 def _find_stored(path: Any) -> list[Path]:

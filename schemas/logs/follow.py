@@ -296,7 +296,12 @@ class _Growing:
         messages: list[RawMessages] = []
         try:
             with _open(self.file.path) as file:
-                messages = _read_infos(file)
+                chunks = file.scan_new()
+                read_definitions(file)
+                topics = {number: channel.topic for number, channel in file.channels.items()}
+                infos = {n: name for n, name in topics.items() if name.endswith("/info")}
+                chunks = file.with_channels(chunks, infos.keys())
+                messages = read_chunks(file, chunks, infos.values())
         except LogError as error:
             if not _has_vanished(error):
                 damaged(error)
@@ -316,14 +321,6 @@ class _Growing:
             return not is_there and self.file.path.parent.is_dir()
         except OSError:  # unreadable at the moment
             return False
-
-
-def _read_infos(file: LogFile) -> list[RawMessages]:
-    chunks = file.scan_new()
-    read_definitions(file)
-    topics = {number: channel.topic for number, channel in file.channels.items()}
-    of_infos = {number: name for number, name in topics.items() if name.endswith("/info")}
-    return read_chunks(file, file.with_channels(chunks, of_infos.keys()), of_infos.values())
 
 
 def _names(path: Path) -> tuple[Path, Path]:

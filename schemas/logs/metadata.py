@@ -245,11 +245,8 @@ def feature_entries(name: str, version: int, digest: str, distribution: str) -> 
     The distribution has a version; it is empty for hearthlog itself.
     """
     entries = {FEATURE_SET: name, FEATURE_SET_VERSION: str(version)}
-    return entries | {
-        k: v
-        for k, v in ((FEATURE_SET_DIGEST, digest), (FEATURE_SET_DISTRIBUTION, distribution))
-        if v
-    }
+    origin = {FEATURE_SET_DIGEST: digest, FEATURE_SET_DISTRIBUTION: distribution}
+    return entries | {key: text for key, text in origin.items() if text}
 
 
 def other_features(

@@ -181,11 +181,8 @@ class Index:
             first += int(np.searchsorted(same, value))
         rows = self._order[first:last]
         following = rows[np.searchsorted(rows, self._row, side="right") :][:1]
-        unmet = (row for row in [*following.tolist(), *rows[:1].tolist()] if self._is_unmet(row))
-        return next(unmet, -1)
-
-    def _is_unmet(self, row: int) -> bool:
-        return bool(self._places[row] == _UNMET)
+        near = [*following.tolist(), *rows[:1].tolist()]
+        return next((row for row in near if self._places[row] == _UNMET), -1)
 
 
 def read_index(reader: RecordVerifier, limit: int) -> Index | None:

@@ -184,7 +184,9 @@ class _FrameFollower:
         lost: list[LostFrames] = []
         has_frames = False
         for mark in marks:
-            if mark.kind not in {self._kind, _GAP, _INFO} or self._is_repeated(mark):
+            # A damaged file may hold a piece twice.
+            is_repeated = self._place is not None and mark.end <= self._place.time
+            if mark.kind not in {self._kind, _GAP, _INFO} or is_repeated:
                 continue
             count = 0 if has_frames else self._missing(mark)  # a piece has no internal losses
             if count:
@@ -203,10 +205,6 @@ class _FrameFollower:
         if not count and self._kind == _FEATURES:  # labels end before the sound
             count = (recorded_until - start) // FRAME_NANOSECONDS
         return self._lost(start, max(start + count * FRAME_NANOSECONDS, last), count)
-
-    def _is_repeated(self, mark: FramePosition) -> bool:
-        """Return whether a mark is repeated: a damaged file may hold a piece twice."""
-        return self._place is not None and mark.end <= self._place.time
 
     def _missing(self, mark: FramePosition) -> int:
         """Count the frames missing before a mark."""

@@ -401,10 +401,8 @@ def recover_log(
             attempt.write(name, progress)
         if not attempt.could_be_better():
             break
-        definitions = [
-            *salvage.definitions.schemas.values(),
-            *salvage.definitions.channels.values(),
-        ]
+        found = salvage.definitions
+        definitions = [*found.schemas.values(), *found.channels.values()]
         profile = attempt.profile()
     recovery = attempt.recovery()
     if not attempt.pieces and (recovery.damages or not recovery.complete):

@@ -212,11 +212,8 @@ def _confirm(
 
     broker = answers.broker
     what = "is unchanged" if present.text == text else "is changed" if present.text else "is new"
-    who = (
-        "a user service"
-        if installation.account is None
-        else f"of the machine, by {installation.account}"
-    )
+    account = installation.account
+    who = "a user service" if account is None else f"of the machine, by {account}"
     parts = [] if answers.page is None else [f"a page at port {answers.page}"]
     parts += [] if broker is None else [f"MQTT at {broker.host}"]
     parts += [] if answers.alerts is None else ["alerts"]

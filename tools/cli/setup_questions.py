@@ -97,15 +97,10 @@ class Installation:
 
     def is_running(self, name: str) -> bool:
         """Return whether a service runs now."""
-        import subprocess
+        from hearthlog.tools.service import unit
 
-        if not self.has_service or not self.unit(name).exists():
-            return False
-        manager = ["systemctl", *(["--user"] if self.account is None else [])]
-        done = subprocess.run(  # noqa: S603
-            [*manager, "is-active", "--quiet", name], stderr=subprocess.DEVNULL, check=False
-        )
-        return done.returncode == 0
+        options = ["--user"] if self.account is None else []
+        return self.has_service and self.unit(name).exists() and unit.is_active(name, *options)
 
 
 class Present:

@@ -5,7 +5,7 @@ import sys
 import termios
 from collections import deque
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from datetime import datetime, tzinfo
 from threading import Event as Flag
 from threading import Thread
@@ -44,8 +44,7 @@ def living_line(state: "RecorderState", settings: "Settings") -> Iterator[None]:
     closed = Flag()
     zone = time_zone(settings.timezone)
     thread = Thread(target=_write, args=(state, lines, zone, closed), daemon=True)
-    with ExitStack() as stack:
-        stack.enter_context(lines_to(lines.append))
+    with lines_to(lines.append):
         thread.start()
         try:
             yield

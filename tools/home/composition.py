@@ -104,7 +104,8 @@ class Rooms:
         response[0] = 1.0
         response /= np.sqrt(np.square(response).sum())
         lost = attenuation(room, self._microphone)
-        return _dulled(response, lost) * 10.0 ** (-lost / 20.0)
+        pole = _pole(lost)  # walls attenuate high frequencies
+        return lfilter([1.0 - pole], [1.0, -pole], response) * 10.0 ** (-lost / 20.0)
 
     def _steadily_audible(self, name: str, rng: np.random.Generator) -> Float32:
         room, level = _STEADY[name]
@@ -114,19 +115,11 @@ class Rooms:
         return _noise(rng, level - lost, slope, hum, lambda sound: _low_passed(sound, lost))
 
 
-def _dulled(sound: Float64, lost: float) -> Float64:
-    """Attenuate high frequencies, as walls do."""
-    pole = _pole(lost)
-    dulled: Float64 = lfilter([1.0 - pole], [1.0, -pole], sound)
-    return dulled
-
-
 def _low_passed(spectrum: Float64, lost: float) -> Float64:
     """Attenuate high frequencies in the spectrum of periodic noise."""
     pole = _pole(lost)
     turn = np.exp(-1j * np.pi * np.linspace(0.0, 1.0, len(spectrum)))
-    passed: Float64 = spectrum * np.abs((1.0 - pole) / (1.0 - pole * turn))
-    return passed
+    return spectrum * np.abs((1.0 - pole) / (1.0 - pole * turn))
 
 
 def _pole(lost: float) -> float:
@@ -297,8 +290,3 @@ def _audible_until(sound: PlannedSound) -> int:
 
 def _quantised(mix: Float32) -> Int16:
     return np.clip(np.rint(mix * 32768.0), -32768, 32767).astype(np.int16)
-
-
-def full_scale(samples: Int16) -> Float32:
-    """Convert samples to floats as an audio file reader does."""
-    return samples.astype(np.float32) / np.float32(32768.0)

@@ -54,7 +54,7 @@ LabelledSpan = tuple[float, float, str]  # start and end in seconds, and the lab
 
 _AUDIBLE_DB = 0.0  # dB over the steady noise
 _PLANNED = ("start", "end", "label", "from", "room", "activity", "clip", "source_group", "made_up")
-_HEARD = ("level_dbfs", "heard_seconds")
+_RECEIVED = ("level_dbfs", "heard_seconds")
 _TINY = 1e-30
 
 
@@ -84,7 +84,9 @@ def truth_of(composition: Composition) -> Truth:
         count = min(DAY_FRAMES, composition.plan.frames - first)
         begun = enumerate(composition.audible(first, count), start=len(events))
         here = [*held, *begun]
-        events += [_event(sound) for _, sound in here[len(held) :]]
+        for _, sound in here[len(held) :]:
+            level = float(10.0 * np.log10(sound.power.max() + _TINY))
+            events.append(TrueEvent(sound.plan, level, 0))
         loudest = _loudest(here, composition.floor_power(first, count), first)
         for number, frames in zip(*np.unique(loudest, return_counts=True), strict=True):
             if number >= 0:
@@ -103,7 +105,7 @@ def write_truth(truth: Truth, spans: Path, events: Path) -> None:
         file.writelines(f"{start:.6f}\t{end:.6f}\t{label}\n" for start, end, label in truth.spans)
     with events.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow((*_PLANNED, *_HEARD))
+        writer.writerow((*_PLANNED, *_RECEIVED))
         writer.writerows(_row(event) for event in truth.events)
 
 
@@ -122,10 +124,6 @@ def _row(event: TrueEvent) -> tuple[object, ...]:
         f"{event.level:.1f}",
         f"{event.audible_frames * FRAME_SECONDS:.2f}",
     )
-
-
-def _event(sound: AudibleSound) -> TrueEvent:
-    return TrueEvent(sound.plan, float(10.0 * np.log10(sound.power.max() + _TINY)), 0)
 
 
 def _loudest(sounds: list[tuple[int, AudibleSound]], floor: Float64, first: int) -> Int64:

@@ -126,16 +126,12 @@ def _set_bridge(content: Any, answers: Answers) -> None:
             return
         content["bridge"] = tomlkit.table(is_super_table=True)
         bridge = content["bridge"]
-    page = None if answers.page is None else {"port": answers.page}
-    _set_table(bridge, "page", page)
-    broker = answers.broker
-    if broker is None:
-        _set_table(bridge, "mqtt", None)
-    else:
-        password = broker.password_file
-        keys = {"host": broker.host, "user": broker.user or None}
-        keys["password_file"] = None if password is None else str(password)
-        _set_table(bridge, "mqtt", keys)
+    _set_table(bridge, "page", None if answers.page is None else {"port": answers.page})
+    mqtt, broker = None, answers.broker
+    if broker is not None:
+        password = None if broker.password_file is None else str(broker.password_file)
+        mqtt = {"host": broker.host, "user": broker.user or None, "password_file": password}
+    _set_table(bridge, "mqtt", mqtt)
     if answers.alerts is None:
         _set_table(bridge, "delivery", None)
         bridge.pop("alert", None)
@@ -144,8 +140,7 @@ def _set_bridge(content: Any, answers: Answers) -> None:
         if "alert" not in bridge:
             rule = tomlkit.table()
             rule.comment("further rules: docs/alerts.md")
-            for key, value in _RULE.items():
-                rule[key] = value
+            rule.update(_RULE)
             bridge["alert"] = tomlkit.aot()
             bridge["alert"].append(rule)
 

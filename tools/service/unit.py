@@ -220,13 +220,16 @@ def check_unit(unit: Path, verb: str, config: Path, folder: Path | None) -> None
         raise ServiceError(f"{unit}: reads {own}; give that: --config {own}")
 
 
+def is_active(name: str, *options: str) -> bool:
+    """Return whether a service runs now."""
+    command = ["systemctl", *options, "is-active", "--quiet", name]
+    return not subprocess.run(command, stderr=subprocess.DEVNULL, check=False).returncode  # noqa: S603
+
+
 def check_no_other_recorder() -> None:
     """Raise `ServiceError` if the service of the machine records: a user's would be a second."""
     unit = system_unit_path(NAME)
-    if not unit.exists() or not is_systemd_running():
-        return
-    command = ["systemctl", "is-active", "--quiet", NAME]
-    if subprocess.run(command, check=False).returncode == 0:  # noqa: S603
+    if unit.exists() and is_systemd_running() and is_active(NAME):
         raise ServiceError(
             f"{unit} records on this machine: change it with `sudo hearthlog setup`, or first end "
             f"it: sudo systemctl disable --now {NAME.partition('.')[0]}"
@@ -246,16 +249,13 @@ def make_account(account: str) -> bool:
     with suppress(KeyError):
         pwd.getpwnam(account)
         return False
-    _account_command("useradd", *_ACCOUNT, str(STATE), account)
+    _account_command("useradd", "--system", "--user-group", "--home-dir", str(STATE), account)
     return True
 
 
 def remove_account(account: str) -> None:
     """Remove an account that was just made; raise `ServiceError` if it cannot be removed."""
     _account_command("userdel", account)
-
-
-_ACCOUNT = ("--system", "--user-group", "--home-dir")
 
 
 def _account_command(*command: str) -> None:

@@ -18,10 +18,10 @@ from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.arrays import Bool, Float32
+from hearthlog.schemas.arrays import Bool, Float32, Int16
 from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, full_scale
+from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition
 from hearthlog.tools.home.simulate import BLOCK_FRAMES, blocks_of
 
 _COMPUTED_FRAMES = 12_000  # 10 minutes
@@ -140,6 +140,11 @@ class FeatureStream:
             extractor(noise[-1:])
             self._tables[state] = extractor(noise)
         return self._tables[state]
+
+
+def full_scale(samples: Int16) -> Float32:
+    """Convert samples to floats as an audio file reader does."""
+    return samples.astype(np.float32) / np.float32(32768.0)
 
 
 def _runs(flags: Bool) -> list[tuple[int, int]]:
