@@ -180,9 +180,9 @@ def follow_messages(  # noqa: PLR0913
                     has_news = True
                     yield log.file.path, messages
             growing = [log for log in growing if log.is_open()]
-            known = len(growing)
+            count = len(growing)
             growing.extend(watch.open(watch.new_logs()))
-            late = [log for log in growing[known:] if _name(log.file.path) in before]
+            late = [log for log in growing[count:] if _name(log.file.path) in before]
             yield from _begin(late, start, damaged, infos=infos)
             news.expect(growing, has_news=has_news)
             is_due = has_news

@@ -125,8 +125,8 @@ class DamageList:
                     chunks.start, chunks.end, _MORE_IN_INDEX, {}, chunks.exact, chunks.times
                 )
                 more.append((damage, dict(lost)))
-        known = Counter(name for damage, _ in self._damages for name in damage.others)
-        others = tuple((Counter(names) - known).elements())
+        reported = Counter(name for damage, _ in self._damages for name in damage.others)
+        others = tuple((Counter(names) - reported).elements())
         if others:
             more.append((Damage(0, 0, _MORE_IN_INDEX, others=others), {}))
         self._insert(more)

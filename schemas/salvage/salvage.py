@@ -327,8 +327,8 @@ class Salvage:
         if chunk.unopened:
             why = f"{chunk.unopened}, and is copied unopened,"
             self._damages.add(Damage(intact.offset, intact.end, why, sound=True))
-            known = {n: e for n, e in chunk.stored.entries.items() if self.definitions.defines(n)}
-            yield chunk._replace(stored=chunk.stored._replace(entries=known))
+            entries = {n: e for n, e in chunk.stored.entries.items() if self.definitions.defines(n)}
+            yield chunk._replace(stored=chunk.stored._replace(entries=entries))
             return
         late: Counter[int] = Counter()
         unknown = 0

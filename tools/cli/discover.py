@@ -169,12 +169,12 @@ def _group(
         summary_path,
     )
 
-    known = load_groups(file)
+    earlier = load_groups(file)
     with (
         share_done("reading the labels") as progress,
-        read_sounds(home, *looked, progress, known) as sounds,
+        read_sounds(home, *looked, progress, earlier) as sounds,
     ):
-        groups, rows, points = find_groups(sounds, known, least)
+        groups, rows, points = find_groups(sounds, earlier, least)
         summary = GroupsSummary(
             id=groups.id,
             sounds=len(rows),
@@ -335,10 +335,10 @@ def voices(
     found, zone = home_and_zone(logs, timezone)
     path = file or _default_file(VOICES, logs, "voices")
     with locked_file(path):
-        known = load_voices(path)
+        earlier = load_voices(path)
         with share_done("reading the speech") as progress:
             speech = read_speech(found, *span, progress)
-        separated, of = find_voices(speech, known)
+        separated, of = find_voices(speech, earlier)
         _check_numbers(VOICES, separated, [*(undo or []), *names])
         separated = separated.named(dict.fromkeys(undo or [], "") | names)
         if home is not None:
@@ -453,13 +453,13 @@ def add_voices(timeline: "Timeline", logs: list[Path], file: Path) -> None:
     from hearthlog.analyzer.discover.voices import VOICES, load_voices
     from hearthlog.analyzer.logs.home_logs import find_home_logs
 
-    known = load_voices(file)
-    if known is None:
+    earlier = load_voices(file)
+    if earlier is None:
         raise _missing(VOICES, file)
     with share_done("telling voices apart") as progress:
         span = timeline.grid.start, timeline.grid.end
         speech = read_speech(find_home_logs(logs), *span, progress)
-    spans = spoken_spans(speech, *find_voices(speech, known))
+    spans = spoken_spans(speech, *find_voices(speech, earlier))
     for microphone, labelled in _lanes(timeline, spans, speech.losses):
         microphone.spoken = labelled
 
@@ -477,5 +477,5 @@ def _lanes(
     from hearthlog.analyzer.review.timeline import LabelledSpans
 
     timeline.losses += [text for text in losses if text not in timeline.losses]
-    known = timeline.microphones
-    return [(known[name], LabelledSpans(*each)) for name, each in spans.items() if name in known]
+    lanes = timeline.microphones
+    return [(lanes[name], LabelledSpans(*each)) for name, each in spans.items() if name in lanes]

@@ -181,13 +181,13 @@ def _first(logs: "HomeLogs") -> int:
 
 
 def _chosen_classes(
-    known: Sequence[str], labels: Sequence[str], hidden: Collection[str]
+    classes: Sequence[str], labels: Sequence[str], hidden: Collection[str]
 ) -> list[str]:
     """Return the classes of labels; all sounds without labels."""
     from hearthlog.analyzer.errors import DataError
     from hearthlog.models.classes import SILENCE, class_name, in_words, meant_by
 
-    sounds = [name for name in known if name != SILENCE]
+    sounds = [name for name in classes if name != SILENCE]
     if not labels:
         return sounds
     chosen = []

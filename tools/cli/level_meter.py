@@ -30,7 +30,7 @@ _LATENCY = 0.1  # seconds: the bar follows a clap at once
 _FIRST_SECONDS = 5.0  # until a device must have delivered something
 _CLOSE_SECONDS = 5.0
 _POLL_SECONDS = 0.1
-_MOST = 8  # devices that are heard at once: ALSA's lists are long, and a process is for each
+_MOST = 8  # devices with a bar: ALSA's lists are long, and each takes a process
 _QUIETEST, _LOUDEST = -70.0, 0.0  # dB of full scale at the ends of a bar
 _BAR, _NAME = 24, 40  # columns
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from hearthlog.tools.service.configuration_file import Answers
 
 _ACCOUNT = "hearthlog"
-_LEAST_FREE = 100_000_000  # bytes beside what the configuration keeps free: ten hours of logs
+_LEAST_FREE = 100_000_000  # bytes more than the configuration keeps free: ten hours of logs
 _LABEL_SECONDS = 120.0
 
 

@@ -106,9 +106,9 @@ def _set_microphones(content: Any, microphones: list[tuple[str, str]]) -> None:
     for place in reversed(range(len(present))):
         if present[place].get("device", "") not in devices:
             del present[place]
-    known = {table.get("device", ""): table for table in present}
+    tables = {table.get("device", ""): table for table in present}
     for device, room in microphones:
-        table = known.get(device)
+        table = tables.get(device)
         if table is None:
             table = tomlkit.table()
             table["name"] = room

@@ -119,11 +119,11 @@ def extract_features(
     if count == 0:
         raise SourceError("the sound is shorter than one frame of 50 ms")
     frames = samples[: count * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
-    heard = np.flatnonzero(np.isfinite(frames).all(axis=1))
-    if not len(heard):
+    valid = np.flatnonzero(np.isfinite(frames).all(axis=1))
+    if not len(valid):
         raise SourceError("the samples are not finite (NaN or infinity)")
-    values = [described.extractor()(InfrasoundFilter()(frames[run])) for run in _runs(heard)]
-    times = start + heard * FRAME_NANOSECONDS
+    values = [described.extractor()(InfrasoundFilter()(frames[run])) for run in _runs(valid)]
+    times = start + valid * FRAME_NANOSECONDS
     return SoundFeatures(described.feature_names, described.units, times, np.concatenate(values))
 
 

@@ -121,8 +121,8 @@ def compare(a: Model, b: Model, manifest: Path | str) -> Comparison:
     left_out: list[SkippedClip] = []
     clips = read_manifest(Path(manifest), scenario.labels, left_out)
     features = feature_set(a.description.feature_set)
-    heard = model_embedder(a) or model_embedder(b)
-    recordings = list(clip_recordings(clips, scenario, ignore_progress, features, embedder=heard))
+    network = model_embedder(a) or model_embedder(b)
+    recordings = list(clip_recordings(clips, scenario, ignore_progress, features, embedder=network))
     left_out += [SkippedClip(UNREADABLE, each.fault) for each in recordings if each.fault]
     for line in left_out_lines(left_out):
         warnings.warn(line, stacklevel=2)
