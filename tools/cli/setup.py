@@ -8,22 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from hearthlog.tools.cli.setup_questions import (
-    NETWORK,
-    NONE,
-    Asker,
-    Installation,
-    Present,
-    SetupError,
-    alerts_of,
-    broker_of,
-    keeps_sound,
-    microphones_of,
-    network_of,
-    node_of,
-    page_of,
-    timezone_of,
-)
+from hearthlog.tools.cli.setup_questions import NETWORK, NONE, Installation, Questions, SetupError
 from hearthlog.tools.cli.terminal import print_lines, print_notice, share_done, wrong_use
 
 if TYPE_CHECKING:
@@ -103,29 +88,25 @@ def setup(
         wrong_use("--page-port needs --page")
     for name in [name for name in os.environ if name.startswith("HEARTHLOG_")]:
         del os.environ[name]  # a service does not have these variables
-    asker = Asker(yes=yes)
     try:
         installation = _installation(config, service=not no_service)
-        present = Present(installation)
+        questions = Questions(installation, yes=yes)
         from hearthlog.tools.service.configuration_file import Answers
 
-        _check_disk(installation, present)
-        secrets: dict[Path, str] = {}
+        _check_disk(questions)
         answers = Answers(
-            microphones=microphones_of(asker, microphone, present, installation),
-            node=node_of(asker, node, present),
-            timezone=timezone_of(asker, timezone, present),
-            keep_sound=keeps_sound(asker, keep_sound, present),
-            network=network_of(asker, network, present),
-            page=page_of(asker, page, page_port, present, installation),
-            broker=broker_of(
-                asker, mqtt, (mqtt_user, mqtt_password_file), present, installation, secrets
-            ),
-            alerts=alerts_of(asker, alerts, present, installation, secrets),
-            secrets=secrets,
+            microphones=questions.microphones(microphone),
+            node=questions.node(node),
+            timezone=questions.timezone(timezone),
+            keep_sound=questions.keep_sound(keep_sound),
+            network=questions.network(network),
+            page=questions.page(page, page_port),
+            broker=questions.broker(mqtt, mqtt_user, mqtt_password_file),
+            alerts=questions.alerts(alerts),
+            secrets=questions.secrets,
         )
-        text = _text(installation, present, answers)
-        _confirm(asker, installation, present, answers, text)
+        text = _text(questions, answers)
+        _confirm(questions, answers, text)
     except (KeyboardInterrupt, EOFError, typer.Abort):
         _end_interrupted("nothing was changed")
     try:
@@ -171,21 +152,22 @@ def _installation(config: Path | None, *, service: bool) -> Installation:
     return installation
 
 
-def _check_disk(installation: Installation, present: Present) -> None:
+def _check_disk(questions: Questions) -> None:
     from hearthlog.recorder.host import disk_of
     from hearthlog.recorder.retention import size_text
 
-    logs = installation.folder / present.settings.output
-    least = int(present.settings.min_free_space) + _LEAST_FREE
+    logs = questions.installation.folder / questions.settings.output
+    kept = int(questions.settings.min_free_space)
+    least = kept + _LEAST_FREE
     free = disk_of(logs).free
     if free < least:
         raise SetupError(
             f"{logs}: {size_text(free)} of the disk are free, and the recorder keeps "
-            f"{size_text(int(present.settings.min_free_space))} free: make room, {size_text(least)}"
+            f"{size_text(kept)} free: make room, {size_text(least)}"
         )
 
 
-def _text(installation: Installation, present: Present, answers: "Answers") -> str:
+def _text(questions: Questions, answers: "Answers") -> str:
     from hearthlog.recorder.addresses import public_name
     from hearthlog.recorder.errors import ConfigurationError
     from hearthlog.tools.service.configuration_file import configuration_text
@@ -197,21 +179,19 @@ def _text(installation: Installation, present: Present, answers: "Answers") -> s
             shown = repr(public_name(twice[0])) if twice[0] else "of the default"
             raise SetupError(f"two microphones have the {key} {shown}: give each its own")
     try:
-        return configuration_text(present.text, answers)
+        return configuration_text(questions.present, answers)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{installation.config}: {error}") from error
+        raise ConfigurationError(f"{questions.installation.config}: {error}") from error
 
 
-def _confirm(
-    asker: Asker, installation: Installation, present: Present, answers: "Answers", text: str
-) -> None:
+def _confirm(questions: Questions, answers: "Answers", text: str) -> None:
     """Show what will be changed, and ask for it."""
     import difflib
 
     from hearthlog.recorder.addresses import public_name
 
-    broker = answers.broker
-    what = "is unchanged" if present.text == text else "is changed" if present.text else "is new"
+    installation, present, broker = questions.installation, questions.present, answers.broker
+    what = "is unchanged" if present == text else "is changed" if present else "is new"
     account = installation.account
     who = "a user service" if account is None else f"of the machine, by {account}"
     parts = [] if answers.page is None else [f"a page at port {answers.page}"]
@@ -228,18 +208,18 @@ def _confirm(
         "Bridge": ", ".join(parts) or "none",
         "Configuration": f"{installation.config} {what}",
         "Secrets": ", ".join(map(str, answers.secrets)),
-        "Logs": str(installation.folder / present.settings.output),
+        "Logs": str(installation.folder / questions.settings.output),
         "Service": who if installation.has_service else "none",
     }
     print(file=sys.stderr)
     for name, value in rows.items():
         if value:
             print(f"{name:<15}{value}", file=sys.stderr)
-    if present.text is not None and present.text != text:
-        old, new = (each.splitlines() for each in (present.text, text))
+    if present is not None and present != text:
+        old, new = (each.splitlines() for each in (present, text))
         changes = difflib.unified_diff(old, new, "before", "after", n=0, lineterm="")
         print(*list(changes)[2:], sep="\n", file=sys.stderr)
-    if not asker.confirm("Do this", "--yes", default=True):
+    if not questions.confirm("Do this", "--yes", default=True):
         raise typer.Abort
 
 
