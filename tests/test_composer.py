@@ -40,7 +40,7 @@ from hearthlog.tools.home.routine import (
 )
 from hearthlog.tools.home.simulate import truth_of, write_sound
 from hearthlog.tools.lab.home.days import Habits, plan_days
-from hearthlog.tools.lab.home.recording import FeatureStream, record_composition
+from hearthlog.tools.lab.home.recording import FeatureStream, busy_frames, record_composition
 
 HOUR = DAY_FRAMES // 24
 START = 1_772_323_200_000_000_000
@@ -199,7 +199,7 @@ def test_walls_take_level_and_the_high_frequencies_first(library):
 def test_features_without_most_of_the_sound_are_those_of_the_sound(evening, features):
     frames = evening.plan.frames
     expected = features.extractor()(full_scale(evening.samples(0, frames)))
-    busy = evening.busy(0, frames)
+    busy = busy_frames(evening, 0, frames)
     assert 0.2 < busy.mean() < 0.9
     for size in (frames, 5000, 777):
         stream = FeatureStream(evening, features)
@@ -216,7 +216,7 @@ def test_steady_noise_repeats_itself_and_its_features_do_too(library, rooms):
     assert not np.array_equal(on[600:], values[3 * PERIOD_FRAMES + 600 :])
     sound = full_scale(quiet.samples(0, quiet.plan.frames))
     assert np.array_equal(values, DEFAULT.extractor()(sound))
-    assert quiet.busy(0, quiet.plan.frames).sum() == 40
+    assert busy_frames(quiet, 0, quiet.plan.frames).sum() == 40
 
 
 def recorded_and_composed(composition, model, folder):

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import grey_closing
 from scipy.signal import lfilter, oaconvolve
 
-from hearthlog.schemas.arrays import Bool, Float32, Float64, Int16
+from hearthlog.schemas.arrays import Float32, Float64, Int16
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.home.clips import ArrayCache, ClipLibrary, frame_powers
 from hearthlog.tools.home.routine import (
@@ -175,7 +175,7 @@ class Composition:
     def __init__(self, plan: HomePlan, library: ClipLibrary, rooms: Rooms) -> None:
         self.plan = plan
         self._library = library
-        self._rooms = rooms
+        self.rooms = rooms
         self._starts = np.array([sound.start for sound in plan.sounds], np.int64)
         longest = max((sound.frames for sound in plan.sounds), default=0)
         self._reach = longest + TAIL_FRAMES
@@ -189,11 +189,11 @@ class Composition:
     def samples(self, first: int, count: int) -> Int16:
         """Compose frames [shape=(count, FRAME_SAMPLES)], the same in blocks of any size."""
         mix = self._background(first, count)
-        for sound in self._sounds(first, first + count):
-            begin, end = max(sound.start, first), min(_audible_until(sound), first + count)
+        for sound in self.sounds(first, first + count):
+            begin, end = max(sound.start, first), min(audible_until(sound), first + count)
             wet = self._wet(sound)[begin - sound.start : end - sound.start]
             mix[begin - first : end - first] += wet * np.float32(self._gain(sound))
-        return _quantised(mix)
+        return quantised(mix)
 
     def audible(self, first: int, count: int) -> Iterator[AudibleSound]:
         """Yield the sounds that begin in some frames, at their received level."""
@@ -204,66 +204,46 @@ class Composition:
     def floor_power(self, first: int, count: int) -> Float64:
         """Return the mean square of the steady noise [shape=(count,)]."""
         power = np.full(count, self._steady_powers[""])
-        for name, gains in self._gains(first, count).items():
+        for name, gains in self.gains(first, count).items():
             power += self._steady_powers[name] * gains[1:] ** 2
         return power
 
-    def busy(self, first: int, count: int) -> Bool:
-        """Return which frames contain more than periodic noise [shape=(count,)]."""
-        busy = np.zeros(count, bool)
-        for sound in self._sounds(first, first + count):
-            busy[max(sound.start - first, 0) : max(_audible_until(sound) - first, 0)] = True
-        for gains in self._gains(first, count).values():
-            busy |= (gains[:-1] != gains[1:]) | ~np.isin(gains[1:], (0.0, 1.0))
-        return busy
-
-    def state(self, frame: int) -> tuple[str, ...]:
-        """Return the names of the active steady noises in a frame."""
-        return tuple(name for name, gains in self._gains(frame, 1).items() if gains[1] > 0.0)
-
-    def steady(self, state: tuple[str, ...]) -> Int16:
-        """Compose a period of steady noise alone [shape=(PERIOD_FRAMES, FRAME_SAMPLES)]."""
-        mix = self._rooms.floor.copy()
-        for name in state:
-            mix += self._rooms.steady[name]
-        return _quantised(mix)
-
     def _background(self, first: int, count: int) -> Float32:
         phase = np.arange(first, first + count) % PERIOD_FRAMES
-        mix = self._rooms.floor[phase]
+        mix = self.rooms.floor[phase]
         within = np.arange(1, FRAME_SAMPLES + 1, dtype=np.float32) / FRAME_SAMPLES
-        for name, gains in self._gains(first, count).items():
+        for name, gains in self.gains(first, count).items():
             if not gains.any():
                 continue
-            noise = self._rooms.steady[name][phase]
+            noise = self.rooms.steady[name][phase]
             if not (gains == 1.0).all():
                 steps = np.diff(gains)[:, np.newaxis].astype(np.float32)
                 noise *= gains[:-1, np.newaxis].astype(np.float32) + steps * within
             mix += noise
         return mix
 
-    def _gains(self, first: int, count: int) -> dict[str, Float64]:
+    def gains(self, first: int, count: int) -> dict[str, Float64]:
         """Return the gain of each steady noise at the edges of frames, in a fixed order."""
         edges = np.arange(first, first + count + 1)
-        gains = {name: np.zeros(count + 1) for name in self._rooms.steady}
+        gains = {name: np.zeros(count + 1) for name in self.rooms.steady}
         for noise in self.plan.steady:
             if noise.start < first + count and noise.end > first:
                 rising = np.minimum(edges - noise.start, noise.end - edges) / STEADY_FRAMES
                 gains[noise.name] += np.clip(rising, 0.0, 1.0)
         return gains
 
-    def _sounds(self, first: int, end: int) -> list[PlannedSound]:
+    def sounds(self, first: int, end: int) -> list[PlannedSound]:
         """Find the audible sounds in some frames, in the order of the plan."""
         places = np.searchsorted(self._starts, (first - self._reach, end))
         near = self.plan.sounds[places[0] : places[1]]
-        return [sound for sound in near if _audible_until(sound) > first]
+        return [sound for sound in near if audible_until(sound) > first]
 
     def _wet(self, sound: PlannedSound) -> Float32:
         """Return a sound as received, shape (frames, FRAME_SAMPLES), for a level of 0 dBFS."""
 
         def make() -> Float32:
             dry = self._library.sound(sound.clip, sound.frames)
-            return self._rooms.received(dry, sound.room).reshape(-1, FRAME_SAMPLES)
+            return self.rooms.received(dry, sound.room).reshape(-1, FRAME_SAMPLES)
 
         return self._cache((sound.clip.name, sound.frames, sound.room), make)
 
@@ -284,9 +264,11 @@ class Composition:
         return float(min(10.0 ** (sound.level / 20.0), _MAX_PEAK / max(peak, _TINY)))
 
 
-def _audible_until(sound: PlannedSound) -> int:
+def audible_until(sound: PlannedSound) -> int:
+    """Return the frame after the reverberation of a sound."""
     return sound.end + TAIL_FRAMES
 
 
-def _quantised(mix: Float32) -> Int16:
+def quantised(mix: Float32) -> Int16:
+    """Convert samples in full scale to integers."""
     return np.clip(np.rint(mix * 32768.0), -32768, 32767).astype(np.int16)

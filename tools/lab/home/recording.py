@@ -21,7 +21,7 @@ from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Bool, Float32, Int16
 from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition
+from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, audible_until, quantised
 from hearthlog.tools.home.simulate import BLOCK_FRAMES, blocks_of
 
 _COMPUTED_FRAMES = 12_000  # 10 minutes
@@ -112,14 +112,14 @@ class FeatureStream:
     def __call__(self, first: int, count: int) -> Float32:
         """Return features [shape=(count, d)], bit-identical to the features of the samples."""
         before = 1 if first else 0
-        busy = self._composition.busy(first - before, count + before)
+        busy = busy_frames(self._composition, first - before, count + before)
         computed = busy[before:].copy()
         computed |= busy[:-1] if before else np.concatenate([[True], busy[:-1]])
         values = np.empty((count, self._features.width), np.float32)
         for begin, end in _runs(computed):
             values[begin:end] = self._compute(first + begin, first + end)
         for begin, end in _runs(~computed):
-            table = self._table(self._composition.state(first + begin))
+            table = self._table(_state(self._composition, first + begin))
             values[begin:end] = table[np.arange(first + begin, first + end) % PERIOD_FRAMES]
         return values
 
@@ -135,7 +135,7 @@ class FeatureStream:
     def _table(self, state: tuple[str, ...]) -> Float32:
         """Return the features of one period of steady noise, each frame after its predecessor."""
         if state not in self._tables:
-            noise = full_scale(self._composition.steady(state))
+            noise = full_scale(_steady(self._composition, state))
             extractor = self._features.extractor()
             extractor(noise[-1:])
             self._tables[state] = extractor(noise)
@@ -151,3 +151,26 @@ def _runs(flags: Bool) -> list[tuple[int, int]]:
     """Return the starts and ends of runs of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.view(np.int8), [0]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def busy_frames(composition: Composition, first: int, count: int) -> Bool:
+    """Return which frames contain more than periodic noise [shape=(count,)]."""
+    busy = np.zeros(count, bool)
+    for sound in composition.sounds(first, first + count):
+        busy[max(sound.start - first, 0) : max(audible_until(sound) - first, 0)] = True
+    for gains in composition.gains(first, count).values():
+        busy |= (gains[:-1] != gains[1:]) | ~np.isin(gains[1:], (0.0, 1.0))
+    return busy
+
+
+def _state(composition: Composition, frame: int) -> tuple[str, ...]:
+    """Return the names of the active steady noises in a frame."""
+    return tuple(name for name, gains in composition.gains(frame, 1).items() if gains[1] > 0.0)
+
+
+def _steady(composition: Composition, state: tuple[str, ...]) -> Int16:
+    """Compose a period of steady noise alone [shape=(PERIOD_FRAMES, FRAME_SAMPLES)]."""
+    mix = composition.rooms.floor.copy()
+    for name in state:
+        mix += composition.rooms.steady[name]
+    return quantised(mix)
