@@ -121,13 +121,12 @@ def _examine_live(
 
 
 def _print(files: "list[Findings]") -> None:
-    errors, warnings = _count(files, "error"), _count(files, "warning")
     for findings in files:
         for finding in findings.shown:
             print(finding)
         for (level, rule), count in findings.more().items():
             print(printable(f"{level}: {findings.path}: {count} more of this kind [{rule}]"))
-    counts = number(errors, "error"), number(warnings, "warning")
+    counts = [number(_count(files, level), level) for level in ("error", "warning")]
     print(f"{number(len(files), 'file')}: {', '.join(counts)}")
 
 

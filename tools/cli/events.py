@@ -83,7 +83,7 @@ def events(
     from hearthlog.analyzer.activity.daily_metrics import whole_home
     from hearthlog.analyzer.activity.home_data import read_home
     from hearthlog.analyzer.activity.home_events import event_totals, home_events, marked_classes
-    from hearthlog.analyzer.logs.local_time import midnight
+    from hearthlog.analyzer.logs.local_time import iso_time, midnight
 
     home_logs, zone = home_and_zone(logs, timezone)
     span = _chosen_span(home_logs, zone, day, limits, night=night)
@@ -99,12 +99,12 @@ def events(
     if as_json:
         print_json(
             {
-                "start": _time(span.start, zone),
-                "end": _time(span.end, zone),
+                "start": iso_time(span.start, zone),
+                "end": iso_time(span.end, zone),
                 "labelling": labels,
                 "listened": round(1 - missing.length / (span.end - span.start), 4),
                 "not_listened": [
-                    {"start": _time(start, zone), "end": _time(end, zone)}
+                    {"start": iso_time(start, zone), "end": iso_time(end, zone)}
                     for start, end in zip(missing.starts, missing.ends, strict=True)
                 ],
                 "events": [_fields(event, labels, zone) for event in found],
@@ -217,14 +217,10 @@ def _not_listened(
     return without(own, reduce(common if every else union, listened) if listened else NONE)
 
 
-def _time(time: int, zone: tzinfo) -> str:
+def _fields(event: "HomeEvent", labelling: str, zone: tzinfo) -> dict[str, object]:
     from hearthlog.analyzer.logs.local_time import iso_time
 
-    return iso_time(time, zone)
-
-
-def _fields(event: "HomeEvent", labelling: str, zone: tzinfo) -> dict[str, object]:
-    times = {"start": _time(event.start, zone), "end": _time(event.end, zone)}
+    times = {"start": iso_time(event.start, zone), "end": iso_time(event.end, zone)}
     values = {"seconds": round(event.seconds, 2), "confidence": round(event.confidence, 3)}
     return event._asdict() | times | values | {"labelling": labelling}
 

@@ -74,17 +74,15 @@ def info(
     zone, hidden = _zone_and_hidden(logs)
     day = _last_day(summary, logs, zone)
     if as_json:
-        checked = None if accuracy is None else accuracy.as_json()
+        counts = None
+        if day is not None:
+            totals = {name: total._asdict() for name, total in day[1].items()}
+            counts = {"date": day[0].isoformat(), "counts": totals}
         more = {
             "scenarios": [one._asdict() for one in scenarios],
-            "checked": checked,
+            "checked": None if accuracy is None else accuracy.as_json(),
             "next": following,
-            "day": None
-            if day is None
-            else {
-                "date": day[0].isoformat(),
-                "counts": {name: total._asdict() for name, total in day[1].items()},
-            },
+            "day": counts,
         }
         print(json.dumps(_as_json(summary) | more, indent=2))
     else:

@@ -214,10 +214,7 @@ def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _
 
 
 def _queue(
-    sources: "Labellings",
-    microphone: str,
-    sides: "list[NamedLabelling]",
-    count: int,
+    sources: "Labellings", microphone: str, sides: "list[NamedLabelling]", count: int
 ) -> _Result:
     from hearthlog.analyzer.review.candidates import reviewed_time
     from hearthlog.analyzer.review.ranking import make_queue

@@ -172,8 +172,7 @@ class _Models:
             self.are_recorded = False
             recorded = "recorded without a model"
             if info.model_sha256:
-                short = info.model_sha256[:12]
-                recorded = f"recorded with model {info.model!r} (sha256 {short})"
+                recorded = f"recorded with model {info.model!r} (sha256 {info.model_sha256[:12]})"
             if model is None:
                 self.are_lacking = True
                 what = (
@@ -245,8 +244,7 @@ def _figures(result: "Replay", took: float) -> list[str]:
         agreement = _agreement(same.same_labels, same.identical_labels, same.labels)
         lines.append(f"{result.labels} labels, {agreement}")
     if result.segments:
-        identical = same.identical_segments
-        agreement = _agreement(identical, identical, same.segments)
+        agreement = _agreement(same.identical_segments, same.identical_segments, same.segments)
         lines.append(f"{result.segments} segments, {agreement}")
     if result.gaps:
         lines.append(f"{result.gaps} gaps")
@@ -262,11 +260,9 @@ def _agreement(same: int, identical: int, recorded: int) -> str:
 
 
 def _warnings(result: "Replay") -> list[str]:
-    lines = [
-        f"unfinished, replayed up to the last whole chunk: {path}" for path in result.unfinished
-    ]
-    if result.missing:
-        count = len(result.missing)
+    unfinished = "unfinished, replayed up to the last whole chunk"
+    lines = [f"{unfinished}: {path}" for path in result.unfinished]
+    if count := len(result.missing):
         more = f" (and {count - 1} more times)" if count > 1 else ""
         lines.append(
             f"sound before {moment(result.missing[0])}{more} is not in these logs: its first "

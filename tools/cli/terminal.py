@@ -176,12 +176,12 @@ def moment(stamp: int | None) -> str | None:
     return None if stamp is None else millisecond_text(stamp)
 
 
-def first_of(what: str, lines: Sequence[str], hint: str = " (--json lists all)") -> Iterator[str]:
+def first_of(what: str, lines: Sequence[str]) -> Iterator[str]:
     """Yield the first lines of a list, and the number of the rest."""
     for line in lines[:_SHOWN]:
         yield f"{what}: {line}"
     if len(lines) > _SHOWN:
-        yield f"{what}: and {len(lines) - _SHOWN} more{hint}"
+        yield f"{what}: and {len(lines) - _SHOWN} more (--json lists all)"
 
 
 NAME_WIDTH = 18  # class column of a table of figures
