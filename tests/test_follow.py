@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 import subprocess
+from contextlib import closing
 from itertools import count
 from threading import Event, Thread
 from time import monotonic, sleep
@@ -356,7 +357,7 @@ def test_the_folder_may_go_away_and_come_back(tmp_path):
 
 def test_a_folder_of_the_same_name_is_watched_anew(tmp_path):
     logs = tmp_path / "logs"
-    with FolderChanges() as changes:
+    with closing(FolderChanges()) as changes:
         for number in range(3):
             logs.mkdir()
             changes.watch([logs])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from threading import Event
-from typing import Any, Self
+from typing import Any
 
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS, read_time
@@ -75,12 +75,6 @@ class FolderChanges:
         """Stop watching."""
         if self._inotify is not None:
             self._inotify.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 _POLL_SECONDS = 0.2

@@ -111,7 +111,10 @@ def train(
     left_out: list[SkippedClip] = []
     speakers = scenario == _SPEAKERS
     if speakers or data:
-        _check_use(speakers=speakers, home=home, output=output, scenario=scenario, base=base)
+        fits = output is not None and scenario is not None and base is None
+        if not fits or (speakers and not home):
+            own = "scenario speakers goes with --home" if speakers else "data goes with --scenario"
+            wrong_use(f"--{own} and --output, and without --base")
     elif not home or scheduler or (cost, gamma, seed) != (None, None, 0):
         wrong_use(
             "name the training data: `hearthlog train --home logs` for a model of this home, or "
@@ -132,8 +135,8 @@ def train(
         from hearthlog.analyzer.training.train import DEFAULT
         from hearthlog.analyzer.workers.workers import fits_on
 
-        if speakers and method is None:
-            method = DEFAULT.name  # speakers are separated by features alone
+        # Speakers are separated by features alone.
+        method = DEFAULT.name if speakers and method is None else method
         chosen = replace(chosen_method(method, cost=cost, gamma=gamma), seed=seed)
         with fits_on(scheduler):
             words = scenario, home or [], chosen, smoothing
@@ -314,20 +317,6 @@ def _cut_clips(
             clips, chosen, report, recordings, method.features, method.rooms, embedder, method.seed
         )
     return segments, chosen
-
-
-def _check_use(
-    *,
-    speakers: bool,
-    home: list[Path] | None,
-    output: Path | None,
-    scenario: str | None,
-    base: Path | None,
-) -> None:
-    if speakers and (not home or output is None or base is not None):
-        wrong_use("--scenario speakers goes with --home and --output, and without --base")
-    if not speakers and (output is None or scenario is None or base is not None):
-        wrong_use("--data goes with --scenario and --output, and without --base")
 
 
 def _cut_voices(
