@@ -224,7 +224,9 @@ def _loss_by_neighbours(
         is_sound = 0 < times[0] <= times[1] < 1 << 63
         return Loss(messages, exact, span or (times if is_sound else None))
     if opcode in _NAME_AFTER and is_record:
-        name = _name(reader, start + HEAD.size + _NAME_AFTER[Opcode(opcode)])
+        place = start + HEAD.size + _NAME_AFTER[Opcode(opcode)]
+        length = int.from_bytes(reader.read(place, 4), "little")
+        name = reader.read(place + 4, min(length, 100)).decode(errors="replace")
         kind = "the metadata" if opcode == Opcode.METADATA else "the attachment"
         return Loss({}, True, None, () if name == ROSBAG2_METADATA else (f"{kind} {name!r}",))
     is_message = opcode == Opcode.MESSAGE or SHORTEST[opcode] > LIMIT
@@ -243,8 +245,3 @@ def _count(
             if len(entries):
                 times += [int(entries["time"].min()), int(entries["time"].max())]
     return offset, (min(times), max(times)) if times else None
-
-
-def _name(reader: RecordVerifier, offset: int) -> str:
-    length = int.from_bytes(reader.read(offset, 4), "little")
-    return reader.read(offset + 4, min(length, 100)).decode(errors="replace")

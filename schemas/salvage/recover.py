@@ -438,7 +438,10 @@ def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[P
             recovery = recover_log(log, copy, path.name, progress)
             hand_over(copy, 0o600 | readers_of(log))
             sync_file(copy)
-            _keep(log, kept)
+            try:
+                kept.hardlink_to(log)  # keeps a file at the name of the log at any time
+            except OSError:  # FAT has no links
+                log.rename(kept)
             copy.replace(path)
             if path != log:
                 log.unlink(missing_ok=True)
@@ -448,13 +451,6 @@ def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[P
         finally:
             copy.unlink(missing_ok=True)
     return path, recovery
-
-
-def _keep(log: Path, name: Path) -> None:
-    try:
-        name.hardlink_to(log)  # keeps a file at the name of the log at any time
-    except OSError:  # FAT has no links
-        log.rename(name)
 
 
 def check_copy(path: Path, topics: dict[str, TopicRecovery]) -> None:

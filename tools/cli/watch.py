@@ -432,7 +432,8 @@ class _SoundLines:
         sounds = self._sounds.microphones
         width = max(len(self._name(one)) for one in sounds.values())
         lines = {name: self._line(one, zone, width) for name, one in sorted(sounds.items())}
-        states = {name: self._state(one) for name, one in sounds.items()}
+        words = self._sounds.words
+        states = {name: words(one) if one.is_listening() else "" for name, one in sounds.items()}
         changed = [name for name in lines if self._states.get(name) != states[name]]
         if sys.stdout.isatty():
             ended = [self._shown[name] for name in changed if name in self._shown]
@@ -452,9 +453,6 @@ class _SoundLines:
         from hearthlog.analyzer.review.current_sounds import microphone_words
 
         return microphone_words(sound.microphone)
-
-    def _state(self, sound: "CurrentSound") -> str:
-        return self._sounds.words(sound) if sound.is_listening() else ""
 
     def _line(self, sound: "CurrentSound", zone: tzinfo, width: int) -> str:
         from hearthlog.analyzer.logs.local_time import local_time

@@ -474,7 +474,11 @@ def checked_bridge(config: Path, account: str | None) -> str:
             f'readable_by = "group", or give it the user of the recorder: --account {RECORDER}'
         )
     _check_files(bridge)
-    _check_person(account or RECORDER)
+    name = account or RECORDER
+    try:
+        pwd.getpwnam(name)
+    except KeyError as error:
+        raise ServiceError(f"there is no user {name[:64]!r}") from error
     figures = None if bridge.prometheus is None else bridge.prometheus.text_file
     written = [] if figures is None else [figures.absolute().parent]
     written += [] if bridge.state is None else [bridge.state.absolute()]
@@ -488,10 +492,3 @@ def _check_files(bridge: BridgeSettings) -> None:
         for key, path in table:
             if isinstance(path, Path) and path.is_absolute() and key != "text_file":  # an output
                 check_seen(key, path)
-
-
-def _check_person(account: str) -> None:
-    try:
-        pwd.getpwnam(account)
-    except KeyError as error:
-        raise ServiceError(f"there is no user {account[:64]!r}") from error
