@@ -112,6 +112,10 @@ class Service:
             self._process.kill()
             self._process.wait()
 
+    def close(self) -> None:
+        """Stop listening to the process."""
+        self.reports.close()
+
     def _start(self) -> None:
         self._reported = None
         person = None if self._account is None else pwd.getpwnam(self._account)
@@ -167,7 +171,7 @@ class Addon:
             service.end()
         for service in services:
             service.wait(until - time.monotonic())
-            service.reports.close()
+            service.close()
 
     def _end(self, _number: int, _frame: FrameType | None) -> None:
         self._is_ended = True
