@@ -253,7 +253,7 @@ def compare(
     else:
         print_notice("there are no marks: the differences are shown, not which model is better")
     shares = _shares(first, second, comparison, logs)
-    if not (shares or comparison):
+    if comparison is None and not shares:
         print_notice("there are no recent logs that neither was trained on: record for some hours")
     if as_json:
         result = {} if comparison is None else asdict(comparison) | {"clear": comparison.clear}
