@@ -348,9 +348,7 @@ def _work(
             edges = np.array([(one.start, one.end) for one in clips], np.int64).reshape(-1, 2)
             audible = Spans(edges[:, 0], edges[:, 1])
             of = microphone, labelling
-            items = review_items(
-                _queue_spans(choice.queue, sources, of, choice, audible if clips else None)
-            )
+            items = review_items(_queue_spans(sources, of, choice, audible if clips else None))
             _report_fewer(len(items), choice)
     marking = Marking(
         microphone,
@@ -393,9 +391,8 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
     sources = find_labellings(*logs)
     microphone = sources.microphone(choice.microphone)
     labelling = sources.find(microphone, choice.labels)
-    assert choice.queue is not None
     kept = find_kept_sound(logs[0], microphone, choice.limits, sources.losses)
-    spans = _queue_spans(choice.queue, sources, (microphone, labelling), choice, kept.time)
+    spans = _queue_spans(sources, (microphone, labelling), choice, kept.time)
     segments = sources.read(microphone, labelling, *choice.limits).labelling
     marks = sorted(mark for span in spans for mark in labels_of(span, segments))
     files = sound_files(marks, spans, kept)
@@ -447,18 +444,15 @@ def _report_sounds(files: "Sequence[SoundFile]", folder: Path, lines: int) -> No
 
 
 def _queue_spans(
-    queue: str,
-    sources: "Labellings",
-    labelled: tuple[str, str],
-    choice: _Choice,
-    audible: "Spans | None" = None,
+    sources: "Labellings", labelled: tuple[str, str], choice: _Choice, audible: "Spans | None"
 ) -> "list[ReviewSpan]":
     from hearthlog.analyzer.review.review_queue import queue_spans
 
+    assert choice.queue is not None
+    limits, count, folder = choice.limits, choice.spans, models_folder()
     with share_done("choosing spans") as progress:
-        folder = models_folder()
         return queue_spans(
-            queue, sources, labelled, choice.limits, choice.spans, folder, progress, audible
+            choice.queue, sources, labelled, limits, count, folder, progress, audible
         )
 
 
