@@ -317,7 +317,7 @@ def test_the_gate_knows_the_sounds_of_the_events_that_the_accuracy_counts(logs):
             sounds.setdefault(sound.label, []).append((sound.start, sound.end))
         events = {name: len(spans_of(own, EVENT_PAUSE).starts) for name, own in sounds.items()}
         del events[SILENCE]
-        counted = {name: int(own.sum()) for name, own in checked.true.items()}
+        counted = {name: int(own[2].sum()) for name, own in checked.events.items()}
         assert events == {name: count for name, count in counted.items() if count}
         assert events["crying"] == 2
         assert len(sounds["crying"]) == 3

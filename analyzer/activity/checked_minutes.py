@@ -26,7 +26,7 @@ from hearthlog.analyzer.logs.confused_classes import common_names_of, renamed
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overlaid, unified
 from hearthlog.analyzer.logs.recorder_info import model_of
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, lengths, overlay, without
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, lengths, overlay, without
 from hearthlog.analyzer.marks.marks import (
     CHOICES,
     RANDOM,
@@ -130,35 +130,29 @@ def _is_one(before: ReviewedSpan, after: ReviewedSpan) -> bool:
 def _reviewed_labels(
     logs: HomeLogs, log: Path, spans: list[ReviewedSpan], labelling: str
 ) -> Iterator[ReviewedLabels]:
-    near = _logs_around(logs, spans[0].start, max(span.end for span in spans))
+    start, end = spans[0].start, max(span.end for span in spans)
+    around = [*logs.between(start - AROUND * MINUTE, end), *logs.between(start)[:_FOLLOWING]]
+    near = [path for path in dict.fromkeys(entry.path for entry in around) if path.exists()]
     sources = find_labellings(*near)
     name = labelling if labelling == LIVE else relabelling(labelling)
     models = {name: model_of(log, name) for name in {span.microphone for span in spans}}
     marks = [mark for path in near for mark in _marks(path)]
     for span in spans:
         with suppress(LogError):  # no labels there
-            around = span.start - AROUND * MINUTE, span.end + AROUND * MINUTE
-            labels = unified(sources.read(span.microphone, name, *around).labelling)
-            own = [mark for mark in marks if mark.microphone == span.microphone]
-            names = common_names_of(log, [*labels.labels, *(class_name(m.label) for m in own)])
+            first, last = span.start - AROUND * MINUTE, span.end + AROUND * MINUTE
+            labels = unified(sources.read(span.microphone, name, first, last).labelling)
+            own = labelling_of_marks(mark for mark in marks if mark.microphone == span.microphone)
+            names = common_names_of(log, [*labels.labels, *own.labels])
             labels = renamed(labels, names)
-            decided = labelling_of_marks(one for one in own if class_name(one.label) != UNKNOWN)
-            decided = renamed(decided, names)
-            rest = labelling_of_marks(one for one in own if class_name(one.label) == UNKNOWN)
+            decided = renamed(own.rows(own.labels != UNKNOWN), names)
+            rest = own.rows(own.labels == UNKNOWN)
             yield ReviewedLabels(
                 span,
                 labels,
                 overlaid(labels, decided),
                 models[span.microphone].model_sha256,
-                joined(rest.starts, rest.ends),
+                rest.spans(),
             )
-
-
-def _logs_around(logs: HomeLogs, start: int, end: int) -> list[Path]:
-    near = logs.between(start - AROUND * MINUTE, end)
-    later = logs.between(start)[:_FOLLOWING]
-    paths = dict.fromkeys(entry.path for entry in [*near, *later])
-    return [path for path in paths if path.exists()]
 
 
 def _marks(log: Path) -> list[Mark]:
@@ -219,10 +213,9 @@ def _interval(some: float, total: float) -> tuple[float, float] | None:
 class CheckedMinutes:
     """Events of each class in reviewed minutes drawn at random."""
 
-    labelled: dict[str, Int64]  # [shape=(n,)], by class: events that start in each minute
-    right: dict[str, Int64]  # [shape=(n,)]; labelled events that are true in part
-    true: dict[str, Int64]  # [shape=(n,)]
-    missed: dict[str, Int64]  # [shape=(n,)]; true events without any labelled part
+    # [shape=(4, n)], by class: events that start in each minute: labelled; labelled, and true in
+    # part; true; true, without any labelled part
+    events: dict[str, Int64]
     sounding: Bool  # [shape=(n,)]; whether the labels show any sound
     television: Bool  # [shape=(n,)]; whether the labels resemble a television
     models: list[str]  # SHA-256 of the model that labelled each minute; empty if unknown
@@ -235,15 +228,8 @@ class CheckedMinutes:
         rows = np.flatnonzero([each == model for each in self.models])
         if len(rows) < FEWEST:
             return self
-        columns = (self.labelled, self.right, self.true, self.missed)
-        labelled, right, true, missed = (
-            {name: counts[rows] for name, counts in column.items()} for column in columns
-        )
         return CheckedMinutes(
-            labelled,
-            right,
-            true,
-            missed,
+            {name: counts[:, rows] for name, counts in self.events.items()},
             self.sounding[rows],
             self.television[rows],
             [self.models[row] for row in rows.tolist()],
@@ -251,25 +237,23 @@ class CheckedMinutes:
 
     def check(self, name: str) -> ClassCheck:
         """Return the counts of correct and missed events of a class."""
-        kept = self._kept(name)
-        columns = (self.labelled, self.right, self.true, self.missed)
-        none = np.zeros(len(self), np.int64)
-        labelled, right, true, missed = (column.get(name, none)[kept] for column in columns)
-        sums = (labelled, right, true, missed, missed[~self.sounding[kept]])
-        return ClassCheck(*(int(counts.sum()) for counts in sums))
+        events, sounding = self._counted(name)
+        in_quiet = events[3, ~sounding]
+        return ClassCheck(*(int(counts.sum()) for counts in (*events, in_quiet)))
 
     def rates(self, name: str, share: float) -> CheckedRates | None:
         """Return the rates of a class of a share, 0 to 1, of all labelled events.
 
         None if too few minutes were checked.
         """
-        kept = self._kept(name)
-        none = np.zeros(len(self), np.int64)
-        labelled, true = self.labelled.get(name, none), self.true.get(name, none)
-        return checked_rates(labelled[kept], true[kept], self.sounding[kept], share)
+        (labelled, _, true, _), sounding = self._counted(name)
+        return checked_rates(labelled, true, sounding, share)
 
-    def _kept(self, name: str) -> Bool:
-        return ~self.television if name in SET_APART else np.ones(len(self), bool)
+    def _counted(self, name: str) -> tuple[Int64, Bool]:
+        """Return the events of a class, and what sounds, in the minutes that count for it."""
+        events = self.events.get(name, np.zeros((4, len(self)), np.int64))
+        kept = ~self.television if name in SET_APART else np.ones(len(self), bool)
+        return events[:, kept], self.sounding[kept]
 
 
 def read_checked_minutes(
@@ -293,16 +277,10 @@ def checked_minutes(reviewed: Iterable[ReviewedLabels]) -> CheckedMinutes:
         name: np.array([_events(minute, name) for minute in minutes], np.int64).T
         for name in sorted(names - {SILENCE, TELEVISION})
     }
-    labelled, right, true, missed = (
-        {name: rows[i] for name, rows in counts.items()} for i in range(4)
-    )
     edges = [np.array([one.span.start, one.span.end]) for one in minutes]
     sounding = [bool(sounding_minutes(m.labels, e)[0]) for m, e in zip(minutes, edges, strict=True)]
     return CheckedMinutes(
-        labelled,
-        right,
-        true,
-        missed,
+        counts,
         np.array(sounding, bool),
         np.array([_like_television(minute) for minute in minutes], bool),
         [minute.model for minute in minutes],
@@ -379,5 +357,5 @@ def _sounding(logs: HomeLogs, start: int, microphone: str, labelling: str) -> It
         labels = find_labellings(*paths).read(microphone, name, start, start + _DAY).labelling
     except (DataError, LogError):
         return
-    labelled = lengths(joined(labels.starts, labels.ends), edges) > 0
+    labelled = lengths(labels.spans(), edges) > 0
     yield sounding_minutes(unified(labels), edges)[labelled]

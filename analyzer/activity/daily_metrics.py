@@ -1,6 +1,6 @@
 """Metrics of a home and its days: coverage, durations, events, and counts with ranges."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta, tzinfo
 from functools import reduce
@@ -23,14 +23,13 @@ from hearthlog.analyzer.activity.event_counts import (
 )
 from hearthlog.analyzer.activity.home_data import HomeData
 from hearthlog.analyzer.activity.values import Clock, Count, Duration, exactly
-from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import (
     NONE,
     Spans,
     common,
     cut,
-    joined,
     lengths,
     one,
     rows_at,
@@ -49,10 +48,9 @@ class HomeMinutes:
     television: Bool  # [shape=(n,)]; whether they have a television-like sound
     gone_through: Bool  # [shape=(n,)]; whether a person reviewed the complete minute
     reviewed: Spans  # by a person, at all microphones
-    # [shape=(n,)]; events that begin in each minute, outside of reviewed spans
-    labelled: dict[str, Int64]
-    corrected: dict[str, Int64]  # [shape=(n,)]; all events after corrections
-    certain: dict[str, Int64]  # [shape=(n,)]; corrected events that begin in reviewed spans
+    # [shape=(3, n)]; events that begin in each minute: labelled ones outside of reviewed spans, all
+    # after corrections, and those of them that begin in reviewed spans
+    events: dict[str, Int64]
 
     def between(self, spans: Spans) -> "HomeMinutes":
         """Return the minutes that begin in some spans."""
@@ -65,16 +63,13 @@ class HomeMinutes:
         `SET_APART` classes count in minutes without a television, and where a person reviewed.
         """
         own = self.rows(~self.television) if name in SET_APART else self
-        if name not in own.labelled:
+        if name not in own.events:
             return Count(rates=rates)
+        labelled, corrected, certain = own.events[name]
+        beside = int(self.events[name][2].sum() - certain.sum())
         rest = ~own.gone_through
-        beside = int(self.certain[name].sum() - own.certain[name].sum())
-        return Count(
-            int(own.corrected[name].sum()) + beside,
-            int(own.certain[name].sum()) + beside,
-            strata_of(own.labelled[name][rest], own.sounding[rest]),
-            rates,
-        )
+        strata = strata_of(labelled[rest], own.sounding[rest])
+        return Count(int(corrected.sum()) + beside, int(certain.sum()) + beside, strata, rates)
 
     def counted(self, name: str, starts: Int64) -> Int64:
         """Return the events of a class, by starts within these minutes, that `count` counts."""
@@ -85,9 +80,10 @@ class HomeMinutes:
 
     def beside_television(self, name: str) -> int:
         """Count the events of a `SET_APART` class that `count` leaves out; 0 for other classes."""
-        if name not in SET_APART or name not in self.labelled:
+        if name not in SET_APART or name not in self.events:
             return 0
-        return int((self.corrected[name] - self.certain[name])[self.television].sum())
+        _, corrected, certain = self.events[name]
+        return int((corrected - certain)[self.television].sum())
 
     def rows(self, rows: Bool) -> "HomeMinutes":
         """Select rows."""
@@ -97,9 +93,7 @@ class HomeMinutes:
             self.television[rows],
             self.gone_through[rows],
             self.reviewed,
-            {name: counts[rows] for name, counts in self.labelled.items()},
-            {name: counts[rows] for name, counts in self.corrected.items()},
-            {name: counts[rows] for name, counts in self.certain.items()},
+            {name: counts[:, rows] for name, counts in self.events.items()},
         )
 
 
@@ -112,24 +106,20 @@ def home_minutes(
     """
     first, last = int(coverage.starts[0]) // MINUTE, -(-int(coverage.ends[-1]) // MINUTE)
     edges = np.arange(first, last + 1) * MINUTE
-    known = reduce(common, gone_through)
-
-    def begun(starts: Int64) -> Int64:
-        return np.diff(np.searchsorted(starts, edges))
-
-    def unknown(name: str) -> Int64:
-        starts = events_of(labels, name).starts
-        return starts[rows_at(known, starts) < 0]
-
+    reviewed = reduce(common, gone_through)
+    begun = {}
+    for name, starts in events.items():
+        labelled = events_of(labels, name).starts
+        unreviewed = labelled[rows_at(reviewed, labelled) < 0]
+        kinds = unreviewed, starts, starts[rows_at(reviewed, starts) >= 0]
+        begun[name] = np.array([np.diff(np.searchsorted(kind, edges)) for kind in kinds])
     minutes = HomeMinutes(
         edges[:-1],
         sounding_minutes(labels, edges),
         television_minutes(labels, edges),
-        lengths(known, edges) == MINUTE,
-        known,
-        {name: begun(unknown(name)) for name in events},
-        {name: begun(starts) for name, starts in events.items()},
-        {name: begun(starts[rows_at(known, starts) >= 0]) for name, starts in events.items()},
+        lengths(reviewed, edges) == MINUTE,
+        reviewed,
+        begun,
     )
     return minutes.rows(lengths(coverage, edges) > 0)
 
@@ -137,8 +127,8 @@ def home_minutes(
 def checked_rates_of(minutes: HomeMinutes, checks: CheckedMinutes) -> dict[str, CheckedRates]:
     """Return the rates of the classes with enough checked minutes."""
     amounts = {
-        name: int(counts.sum()) + 1
-        for name, counts in minutes.labelled.items()
+        name: int(counts[0].sum()) + 1
+        for name, counts in minutes.events.items()
         if class_name(name) != UNKNOWN  # no sound is truly `unknown`
     }
     total = sum(amounts.values())
@@ -190,23 +180,21 @@ def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetr
     apart, from any microphones, are one event. `checks` are randomly drawn, checked minutes of the
     home.
     """
-    labels = _together(data.segments.values())
-    everything = joined(labels.starts, labels.ends)
-    loud = labels.labels != SILENCE
-    sound = joined(labels.starts[loud], labels.ends[loud])
+    labels = in_order(data.segments.values())
+    everything = labels.spans()
+    sound = labels.spans(labels.labels != SILENCE)
     classes = ordered(chain.from_iterable(data.classes.values()))
     listened, spans, events = {}, {}, {}
     for name in classes:
-        own = labels.labels == name
         knowing = [part for source, part in data.segments.items() if name in data.classes[source]]
-        listened[name] = _spans(_together(knowing))
-        spans[name] = joined(labels.starts[own], labels.ends[own])
+        listened[name] = in_order(knowing).spans()
+        spans[name] = labels.spans(labels.labels == name)
         events[name] = events_of(labels, name).starts
     if SILENCE in spans:
         spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone has a sound
         del events[SILENCE]
     gone_through = [data.gone_through.get(source, NONE) for source in data.segments]
-    labelled = _together(data.labelled.values())
+    labelled = in_order(data.labelled.values())
     minutes = home_minutes(labelled, gone_through, everything, events)
     rates = {} if checks is None else checked_rates_of(minutes, checks)
     return HomeMetrics(classes, everything, listened, sound, spans, events, minutes, rates)
@@ -214,22 +202,7 @@ def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetr
 
 def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSegments:
     """Return the input of the routine: the labels of all microphones."""
-    return HomeSegments(_together(data.segments.values()), metrics.listened)
-
-
-def _together(parts: Iterable[Labelling]) -> Labelling:
-    """Join labels of microphones in time order; they may overlap."""
-    parts = list(parts)
-    starts, ends, labels = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in ("starts", "ends", "labels")
-    )
-    order = np.argsort(starts, kind="stable")
-    return Labelling(starts[order], ends[order], labels[order])
-
-
-def _spans(labels: Labelling) -> Spans:
-    return joined(labels.starts, labels.ends)
+    return HomeSegments(in_order(data.segments.values()), metrics.listened)
 
 
 _RISING = 4  # local hour; earlier sound belongs to the night

@@ -126,17 +126,17 @@ class Profiles:
         self.figures = list(_figures(names))
         self.classes = [name for name in names if name not in APART_IN_LENGTH]
         self._listened = dict(home.listened)
-        self._coverage = joined(labels.starts, labels.ends)
-        loud = labels.labels != SILENCE
-        self._sound = joined(labels.starts[loud], labels.ends[loud])
+        self._coverage = labels.spans()
+        self._sound = labels.spans(labels.labels != SILENCE)
         self._starts = joined(*self._sound, EVENT_PAUSE).starts
         television = television_spans(labels) if set(names) & set(APART_IN_LENGTH) else NONE
         self._spans, self._events = dict[str, Spans](), dict[str, Spans]()
         for name in names:
-            own = labels.labels == name
-            spans, events = joined(labels.starts[own], labels.ends[own]), events_of(labels, name)
+            spans, events = labels.spans(labels.labels == name), events_of(labels, name)
             if name in APART_IN_LENGTH:
-                spans, events = without(spans, television), _outside(events, television)
+                spans = without(spans, television)
+                apart = rows_at(television, events.starts) < 0
+                events = Spans(events.starts[apart], events.ends[apart])
             self._spans[name], self._events[name] = spans, events
 
     def of(self, day: date) -> DayProfile:
@@ -223,12 +223,6 @@ def television_spans(labels: Labelling) -> Spans:
     edges = np.arange(first, last + 1) * MINUTE
     minutes = edges[:-1][television_minutes(labels, edges)]
     return joined(minutes, minutes + MINUTE)
-
-
-def _outside(events: Spans, spans: Spans) -> Spans:
-    """Return the events that do not start in some spans."""
-    apart = rows_at(spans, events.starts) < 0
-    return Spans(events.starts[apart], events.ends[apart])
 
 
 def _half_hours(day: date, zone: tzinfo) -> Int64:

@@ -1,6 +1,6 @@
 """Doubtful sounds: those that a model is not sure of, and that are loud or may be of a person."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from math import inf
 from pathlib import Path
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.activity.event_counts import events_of
-from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.models.classes import (
@@ -89,20 +89,7 @@ def doubtful_events(labels: Labelling) -> Labelling:
         rows = [is_doubtful(name, confidence) for confidence in highest.tolist()]
         names = np.full(sum(rows), name, object)
         parts.append(Labelling(events.starts[rows], events.ends[rows], names, highest[rows]))
-    return _in_order(parts)
-
-
-def _in_order(parts: Sequence[Labelling]) -> Labelling:
-    empty = np.empty(0, np.int64)
-    every = [Labelling(empty, empty, empty.astype(object)), *parts]
-    starts = np.concatenate([part.starts for part in every])
-    order = np.argsort(starts, kind="stable")
-    return Labelling(
-        starts[order],
-        np.concatenate([part.ends for part in every])[order],
-        np.concatenate([part.labels for part in every])[order],
-        np.concatenate([part.confidences for part in every])[order],
-    )
+    return in_order([labels.rows(np.zeros(len(labels), bool)), *parts])
 
 
 def read_doubtful_sounds(

@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined, lengths
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, lengths
 from hearthlog.models.classes import (
     COUGHING,
     CRYING,
@@ -35,14 +35,12 @@ _VOICED = 0.4  # of the minutes
 
 def events_of(labels: Labelling, name: str) -> Spans:
     """Return the events of a class: its spans, merged across pauses of at most ten seconds."""
-    own = labels.labels == name
-    return joined(labels.starts[own], labels.ends[own], EVENT_PAUSE)
+    return labels.spans(labels.labels == name, EVENT_PAUSE)
 
 
 def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:
     """Return which of the minutes between n + 1 edges have any sound."""
-    loud = labels.labels != SILENCE
-    return lengths(joined(labels.starts[loud], labels.ends[loud]), edges) > 0
+    return lengths(labels.spans(labels.labels != SILENCE), edges) > 0
 
 
 def television_minutes(labels: Labelling, edges: Int64) -> Bool:
@@ -56,7 +54,7 @@ def television_minutes(labels: Labelling, edges: Int64) -> Bool:
     minutes = 2 * AROUND + 1
 
     def sounding(which: Bool) -> Int64:
-        return lengths(joined(labels.starts[which], labels.ends[which]), edges)
+        return lengths(labels.spans(which), edges)
 
     voiced = (sounding(np.isin(labels.labels, _VOICES)) > 0).astype(np.int64)
     begun = np.diff(np.searchsorted(labels.starts[labels.labels != SILENCE], edges))
@@ -72,8 +70,7 @@ def _around(amounts: Int64) -> Int64:
 
 def events_by_minute(events: Spans, edges: Int64) -> Int64:
     """Count the events that start in each of the minutes between n + 1 edges."""
-    places = np.searchsorted(events.starts, edges)
-    return np.diff(places)
+    return np.diff(np.searchsorted(events.starts, edges))
 
 
 def overlapping(events: Spans, others: Spans) -> Bool:

@@ -21,7 +21,7 @@ from hearthlog.analyzer.logs.labelling import (
 )
 from hearthlog.analyzer.logs.recorder_info import Trouble, gaps_of, troubles_of
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.spans import SEGMENT_DELAY, Spans, common, joined, one
+from hearthlog.analyzer.logs.spans import SEGMENT_DELAY, Spans, cut, joined
 from hearthlog.analyzer.marks.label_files import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import CLASS_NAME, OF_EVERY_SCENARIO, OTHER, class_name
@@ -245,8 +245,7 @@ def _reviews(
 
 def _check(home: HomeData, logs: HomeLogs, labelling: str, close: tuple[int, int]) -> None:
     """Raise DataError unless the reported days have labels."""
-    spans = [joined(labels.starts, labels.ends) for labels in home.segments.values()]
-    if any(common(each, one(*close)).length for each in spans):
+    if any(cut(labels.spans(), *close).length for labels in home.segments.values()):
         return
     if labelling != LIVE:
         advice = f"`hearthlog relabel LOGS --model {labelling}.safetensors` makes them"

@@ -10,8 +10,8 @@ from hearthlog.analyzer.activity.segments import SEGMENT_FIELDS, HomeActivity, S
 from hearthlog.analyzer.activity.sources import (
     is_of_activity,
     is_of_scenario,
-    labelling_source,
     source_microphone,
+    source_of_topic,
 )
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import select
@@ -157,8 +157,7 @@ class LiveActivity:
         new = (each.between(self._read.get(each.topic, -1) + 1, None) for each in columns)
         for part in (each for each in new if len(each)):
             self._collector.add_written(part.log_times)
-            name = parse_topic(part.topic)
-            source = None if name is None else labelling_source(name)
+            source = source_of_topic(part.topic)
             if source is None:
                 continue
             if part.type == message_types.SEGMENT:

@@ -315,9 +315,7 @@ def _add_log(
     collector: SegmentCollector, path: Path, start: int, end: int, lose: Callable[[str], None]
 ) -> None:
     with LogFile(path) as file:
-        for first, last in zip(
-            file.chunks["start"].tolist(), file.chunks["end"].tolist(), strict=True
-        ):
+        for first, last in file.chunks[["start", "end"]].tolist():
             collector.add_written_span(first, last)
     selection = select([path])
     if selection.unfinished:
@@ -325,8 +323,7 @@ def _add_log(
     sources = {}
     for topic in selection.topics_of(message_types.SEGMENT, set(SEGMENT_FIELDS)):
         name = parse_topic(topic)
-        source = None if name is None else labelling_source(name)
-        if name is not None and source is not None:
+        if name is not None and (source := labelling_source(name)) is not None:
             sources[topic] = source
             labels = labelling_topic(name.microphone, name.labelling, "label")
             for channel, _ in selection.channels.get(labels, ()):
@@ -338,8 +335,7 @@ def _add_log(
 
 def nodes_of(logs: HomeLogs) -> list[str]:
     """List the recorder names of logs."""
-    entries: Sequence[str] = [entry.node for entry in logs.entries if not entry.layer]
-    return sorted(set(entries))
+    return sorted({entry.node for entry in logs.entries if not entry.layer})
 
 
 def span_of(logs: HomeLogs, node: str) -> tuple[int, int]:
@@ -357,7 +353,6 @@ def span_of(logs: HomeLogs, node: str) -> tuple[int, int]:
 def _first_span(paths: Iterable[Path]) -> tuple[int, int] | None:
     for path in paths:
         with suppress(LogError):
-            span = time_span(path)
-            if span is not None:
+            if (span := time_span(path)) is not None:
                 return span
     return None

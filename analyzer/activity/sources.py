@@ -21,6 +21,12 @@ def labelling_source(topic: TopicName) -> str | None:
     return None
 
 
+def source_of_topic(topic: str) -> str | None:
+    """Return the labelling source of a topic by its name; None as `labelling_source`."""
+    name = parse_topic(topic)
+    return None if name is None else labelling_source(name)
+
+
 def source_name(microphone: str, scenario: str) -> str:
     """Return the labelling source of a scenario: `<microphone>-<scenario>`."""
     return f"{microphone}{_BETWEEN}{scenario}"
@@ -44,10 +50,7 @@ def is_of_scenario(source: str) -> bool:
 
 def is_of_activity(topic: str) -> bool:
     """Whether a topic shows the activity of a home, or the health of its recorder."""
-    if topic == DIAGNOSTICS:
-        return True
     name = parse_topic(topic)
-    if name is None:
-        return False
-    kinds = {"label", "segment", "gap"} if name.labelling == LIVE else {"label", "segment"}
-    return (name.labelling == LIVE or is_scenario(name.labelling)) and name.kind in kinds
+    if name is None or labelling_source(name) is None:
+        return topic == DIAGNOSTICS
+    return name.kind in {"label", "segment"} or (name.kind == "gap" and name.labelling == LIVE)

@@ -9,8 +9,7 @@ import numpy as np
 from hearthlog.analyzer.activity.checked_minutes import ReviewedLabels, read_reviewed_labels
 from hearthlog.analyzer.activity.event_counts import beta_quantile, events_of, overlapping
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, rows_at, without
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, rows_at, without
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.models.classes import SILENCE, TELEVISION, UNKNOWN
 from hearthlog.schemas.arrays import Bool, Float64
@@ -52,7 +51,7 @@ def checked_confidences(reviewed: Iterable[ReviewedLabels]) -> tuple[Float64, Bo
     rights: list[bool] = []
     for one in (each for each in reviewed if each.span.chosen == RANDOM):
         start, end = one.span.start, one.span.end
-        true = {name: _spans_of(one.true, name) for name in set(one.true.labels)}
+        true = {name: one.true.spans(one.true.labels == name) for name in set(one.true.labels)}
         for name in sorted(set(one.labels.labels) - _NO_SOUNDS):
             own = one.labels.labels == name
             segments = Spans(one.labels.starts[own], np.minimum(one.labels.ends[own], end))
@@ -66,11 +65,6 @@ def checked_confidences(reviewed: Iterable[ReviewedLabels]) -> tuple[Float64, Bo
             confidences += highest[begun].tolist()
             rights += right[begun].tolist()
     return np.array(confidences, np.float64), np.array(rights, bool)
-
-
-def _spans_of(labels: Labelling, name: str) -> Spans:
-    own = labels.labels == name
-    return joined(labels.starts[own], labels.ends[own])
 
 
 def measured_sureness(confidences: Float64, right: Bool) -> Sureness:

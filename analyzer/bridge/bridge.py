@@ -30,7 +30,7 @@ from hearthlog.analyzer.bridge.settings import (
     PingSettings,
     RecorderAddress,
 )
-from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report
 from hearthlog.analyzer.extras import missing, remedy
 from hearthlog.analyzer.http import has_password, ip_of, listen, ping, read_ping_address
 from hearthlog.analyzer.logs.local_time import today
@@ -56,12 +56,12 @@ class PingOutput:
     Raise `HearthlogError` if the file with the URL cannot be used.
     """
 
-    def __init__(self, settings: PingSettings, say: Callable[[str], None]) -> None:
+    def __init__(self, settings: PingSettings, report: Report) -> None:
         self._settings = settings
         self._url = settings.url
         if settings.url_file is not None:
             self._url = read_ping_address(secret_path(settings.url_file))
-        self._say = say
+        self._report = report
         self._is_well = False
         self._judged = 0.0  # time of `_is_well`, by CLOCK_MONOTONIC
         self._stop = Flag()
@@ -84,7 +84,7 @@ class PingOutput:
             if time.monotonic() - self._judged <= _JUDGED_SECONDS:
                 problem = ping(self._url, is_well=self._is_well)
                 if problem:
-                    self._say(f"ping: not accepted ({problem}); trying again")
+                    self._report(f"ping: not accepted ({problem}); trying again")
 
 
 _WATCHDOG_SECONDS = 10.0
@@ -100,7 +100,7 @@ class Bridge:
     home: RecorderAddress
     since: int  # log time from which events are read, in nanoseconds of UTC
     outputs: dict[str, Output]
-    say: Callable[[str], None]
+    report: Report
     _watchdog_due: float = 0.0
 
     def run(self, stop: Flag) -> None:
@@ -111,7 +111,7 @@ class Bridge:
         columns: list[Columns] = []
         had_caught_up = False
         try:
-            for state, begun, read in follow_home(self.home, self.since, stop, self.say):
+            for state, begun, read in follow_home(self.home, self.since, stop, self.report):
                 self._live()
                 early += begun
                 columns += (part for part in read if part.type != message_types.LABEL)
@@ -156,7 +156,7 @@ class Bridge:
         try:
             step()
         except Exception as error:  # noqa: BLE001  a failing output must not stop the others
-            self.say(f"{name}: {type(error).__name__}: {error}")
+            self.report(f"{name}: {type(error).__name__}: {error}")
 
 
 _REPEAT_SECONDS = 3600.0
@@ -166,8 +166,8 @@ _MOST_TEXTS = 100  # remembered texts
 class ProblemReporter:
     """Passes on status lines from any thread; repeats a line after an hour at the earliest."""
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
+    def __init__(self, report: Report) -> None:
+        self._report = report
         self._reported: OrderedDict[str, float] = OrderedDict()
         self._lock = Lock()
 
@@ -182,7 +182,7 @@ class ProblemReporter:
             if len(self._reported) > _MOST_TEXTS:
                 self._reported.popitem(last=False)
         with suppress(OSError, ValueError):  # a full disk, or a closed stream
-            self._say(line)
+            self._report(line)
 
 
 _OLDEST = 7 * 24 * 3600 * NANOSECONDS  # longest history read at a start
@@ -193,10 +193,10 @@ _AGAIN_SECONDS = 60.0
 class ReopenedOutput:
     """An output that is retried every minute while it cannot be opened; `output` is None then."""
 
-    def __init__(self, make: Callable[[], Output], say: Callable[[str], None]) -> None:
+    def __init__(self, make: Callable[[], Output], report: Report) -> None:
         self.output: Any = None
         self._make = make
-        self._say = say
+        self._report = report
         self._due = 0.0  # by CLOCK_MONOTONIC
         self._open()
 
@@ -217,15 +217,15 @@ class ReopenedOutput:
         try:
             self.output = self._make()
         except ModuleNotFoundError as error:
-            self._say(f"{error.name} is not installed; {remedy(error.name or '')}; trying again")
+            self._report(f"{error.name} is not installed; {remedy(error.name or '')}; trying again")
         except (HearthlogError, OSError) as error:
-            self._say(f"{error}; trying again")
+            self._report(f"{error}; trying again")
         except Exception as error:  # noqa: BLE001  a failing output must not stop the others
-            self._say(f"{type(error).__name__}: {error}; trying again")
+            self._report(f"{type(error).__name__}: {error}; trying again")
 
 
 def open_outputs(
-    settings: BridgeSettings, home: RecorderAddress, state: BridgeState, say: ProblemReporter
+    settings: BridgeSettings, home: RecorderAddress, state: BridgeState, report: ProblemReporter
 ) -> tuple[dict[str, Output], int]:
     """Open the configured outputs; return also the log time from which they need events.
 
@@ -240,26 +240,26 @@ def open_outputs(
         def publish() -> Output:
             from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher  # noqa: PLC0415
 
-            return MqttPublisher(mqtt, home, state, say)
+            return MqttPublisher(mqtt, home, state, report)
 
-        outputs["mqtt"] = publisher = ReopenedOutput(publish, say)
+        outputs["mqtt"] = publisher = ReopenedOutput(publish, report)
     if (figures := settings.prometheus) is not None:
         first = since
 
         def count() -> Output:
             from hearthlog.analyzer.bridge.prometheus import PrometheusOutput  # noqa: PLC0415
 
-            return PrometheusOutput(figures, home, state, first, say)
+            return PrometheusOutput(figures, home, state, first, report)
 
-        outputs["prometheus"] = ReopenedOutput(count, say)
+        outputs["prometheus"] = ReopenedOutput(count, report)
         kept = Totals(state, since, lambda _: None).time - _EARLIER
         since = min(since, max(kept, moment.now - _OLDEST))
     if (page := settings.page) is not None:
         from hearthlog.analyzer.bridge.page.home_page import HomePage  # noqa: PLC0415
 
-        outputs["page"] = ReopenedOutput(lambda: HomePage(page, home, state.folder, say), say)
+        outputs["page"] = ReopenedOutput(lambda: HomePage(page, home, state.folder, report), report)
     if (watchdog := settings.ping) is not None:
-        outputs["ping"] = ReopenedOutput(lambda: PingOutput(watchdog, say), say)
+        outputs["ping"] = ReopenedOutput(lambda: PingOutput(watchdog, report), report)
     if settings.alert:
         from hearthlog.analyzer.bridge.alerts.output import AlertsOutput  # noqa: PLC0415
 
@@ -269,7 +269,7 @@ def open_outputs(
         rules, delivery = settings.alert, settings.delivery
         on_notification = None if mqtt is None else publish_alert
         outputs["alerts"] = ReopenedOutput(
-            lambda: AlertsOutput(rules, delivery, home, state, say, on_notification), say
+            lambda: AlertsOutput(rules, delivery, home, state, report, on_notification), report
         )
     return outputs, since
 

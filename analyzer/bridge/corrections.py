@@ -4,14 +4,14 @@ import errno
 import threading
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.activity.events import SoundEvent
-from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.models.classes import SILENCE, TELEVISION, UNKNOWN, class_name
@@ -119,7 +119,7 @@ class EventCorrections:
         self._due = 0.0  # by CLOCK_MONOTONIC
         self._reading: threading.Thread | None = None
 
-    def refresh(self, say: Callable[[str], None], wait: float = 0.0) -> None:
+    def refresh(self, report: Report, wait: float = 0.0) -> None:
         """Read marks made elsewhere, such as in a review, in a thread; wait for it up to `wait` s.
 
         A call within a minute of the last reading does nothing.
@@ -133,7 +133,7 @@ class EventCorrections:
             try:
                 self.read_back()
             except (HearthlogError, OSError) as error:
-                say(f"marks of people are not counted: {error}")
+                report(f"marks of people are not counted: {error}")
 
         self._reading = threading.Thread(target=read, daemon=True, name="corrections")
         self._reading.start()

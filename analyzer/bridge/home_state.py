@@ -3,8 +3,9 @@
 import json
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
 from threading import Event as Flag
 from typing import Any, NamedTuple
@@ -19,9 +20,10 @@ from hearthlog.analyzer.activity.event_counts import (
 )
 from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, SoundEvent
 from hearthlog.analyzer.activity.segments import GrowingSpans
-from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, labelling_source
+from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, source_of_topic
 from hearthlog.analyzer.bridge.corrections import EventCorrections
 from hearthlog.analyzer.bridge.settings import RecorderAddress
+from hearthlog.analyzer.bridge.state import Report
 from hearthlog.analyzer.logs.confused_classes import WATER, common_names_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
@@ -38,7 +40,6 @@ from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
 from hearthlog.schemas.messages import message_types
-from hearthlog.schemas.messages.topics import DIAGNOSTICS, TopicName, parse_topic
 
 FIELDS = {
     message_types.LABEL: ("label", "confidence"),
@@ -51,6 +52,7 @@ _DECIDED = EVENT_PAUSE + 5 * NANOSECONDS  # after the end of an event, no segmen
 _MOST_CLASSES = 256
 _MOST_MINUTES = 14 * 1440  # of which a television is looked for
 MOST = 0.75  # least coverage of a night for a count of 0, as in the report
+_START = attrgetter("start")
 
 
 class Health(NamedTuple):
@@ -153,7 +155,7 @@ class LiveMicrophone:
     def _named_events(self, name: str, since: int, names: Mapping[str, str]) -> list[SoundEvent]:
         """Return the events of the classes that share a name."""
         labels = [each for each in self.labels() if names.get(each, each) == name]
-        every = sorted((e for each in labels for e in self.events(each, since)), key=_start_of)
+        every = sorted((e for each in labels for e in self.events(each, since)), key=_START)
         if len(labels) == 1 and labels[0] == name:
             return every
         record = EventRecord(self.name, name)
@@ -246,8 +248,8 @@ class LiveMicrophone:
                 own.events.append(event)
                 own.counted.append(event)
         for own in found.values():
-            own.events.sort(key=_start_of)
-            own.counted.sort(key=_start_of)
+            own.events.sort(key=_START)
+            own.counted.sort(key=_START)
         return found
 
     def counts(
@@ -437,28 +439,23 @@ class HomeState:
             if part.type == message_types.DIAGNOSTICS:
                 self._push_diagnostics(part)
                 continue
-            name = parse_topic(part.topic)
-            assert name is not None
-            microphone = self._state_of(name)
-            if name.kind == "label":
+            microphone = self._state_of(part.topic)
+            if part.type == message_types.LABEL:
                 microphone.push_labels(part)
                 microphone.seen = max(microphone.seen, seen)
-            elif name.kind == "gap":
+            elif part.type == message_types.GAP:
                 microphone.push_gaps(part)
             else:
                 begun += microphone.push_segments(part)
         return begun
 
-    def _state_of(self, topic: TopicName) -> LiveMicrophone:
-        name = labelling_source(topic)
+    def _state_of(self, topic: str) -> LiveMicrophone:
+        name = source_of_topic(topic)
         assert name is not None
-        own, unnamed = (
-            (self.scenarios, OF_EVERY_SCENARIO)
-            if is_of_scenario(name)
-            else (self.microphones, {SILENCE})
-        )
+        is_scenario = is_of_scenario(name)
+        own = self.scenarios if is_scenario else self.microphones
         if name not in own:
-            own[name] = LiveMicrophone(name, unnamed)
+            own[name] = LiveMicrophone(name, OF_EVERY_SCENARIO if is_scenario else {SILENCE})
             own[name].never_tell = self._never_tell
             own[name].common_names = self.common_names
         return own[name]
@@ -485,10 +482,6 @@ class HomeState:
                 microphone.level_dbfs = next(_levels(status), math.nan)
 
 
-def _start_of(event: SoundEvent) -> int:
-    return event.start
-
-
 def _levels(status: Any) -> Iterator[float]:
     for pair in status["values"]:
         if pair["key"] == "level_dbfs":
@@ -513,28 +506,28 @@ _REVIEWS_SECONDS = 10.0  # longest wait for the reviews of the newest logs at th
 
 
 def follow_home(
-    home: RecorderAddress, start: int, stop: Flag, say: Callable[[str], None]
+    home: RecorderAddress, start: int, stop: Flag, report: Report
 ) -> Iterator[tuple[HomeState, list[SoundEvent], list[Columns]]]:
     """Follow the logs of a recorder, and update the state of its home.
 
-    Events are read from log time `start`, in nanoseconds of UTC. `say` is called with a problem: a
-    log that can be read no further, or a missing folder. After each batch of messages, and twice a
+    Events are read from log time `start`, in nanoseconds of UTC. `report` receives problems: a log
+    that can be read no further, or a missing folder. After each batch of messages, and twice a
     second without any, yield the same state, the events that began with the batch, and its
     messages, with the fields of `FIELDS`.
     """
     state, folder = HomeState(), home.folder
     state.corrections = EventCorrections(folder, home.node)
     state.never_tell = home.never_tell
-    _hide(state, home, say)
+    _hide(state, home, report)
     while not folder.is_dir():
-        say(f"{folder}: no such folder yet; waiting for a recorder")
+        report(f"{folder}: no such folder yet; waiting for a recorder")
         state.caught_up = True
         yield state, [], []
         if stop.wait(_WAIT_SECONDS):
             return
     state.caught_up = False
     messages = follow_messages(
-        folder, is_of_activity, start, stop, lambda error: say(str(error)), ticks=True
+        folder, is_of_activity, start, stop, lambda error: report(str(error)), ticks=True
     )
     yielded, current, described = -math.inf, folder, folder
     for path, batch in messages:
@@ -542,7 +535,7 @@ def follow_home(
             if current != described and (names := _labelling_sources(current)) is not None:
                 state.sources, described = names, current
             if not state.caught_up or time.monotonic() - yielded >= _TICK_SECONDS:
-                _renew(state, home, say, has_log=current != folder)
+                _renew(state, home, report, has_log=current != folder)
                 state.caught_up = True
                 yielded = time.monotonic()
                 yield state, [], []
@@ -550,24 +543,22 @@ def follow_home(
             if path != current and not is_layer(path):
                 current = path
                 state.begin_log()
-                _check_version(path, say)
+                _check_version(path, report)
                 state.name_in_common(common_names_of(path, WATER))
             yielded = time.monotonic()
-            yield state, *_push(state, path, batch, say)
+            yield state, *_push(state, path, batch, report)
         if stop.is_set():
             return
 
 
-def _renew(
-    state: HomeState, home: RecorderAddress, say: Callable[[str], None], *, has_log: bool
-) -> None:
+def _renew(state: HomeState, home: RecorderAddress, report: Report, *, has_log: bool) -> None:
     """Read again what people have corrected and hidden; the first counts wait for it."""
     if has_log:
-        state.corrections.refresh(say, 0.0 if state.caught_up else _REVIEWS_SECONDS)
-    _hide(state, home, say)
+        state.corrections.refresh(report, 0.0 if state.caught_up else _REVIEWS_SECONDS)
+    _hide(state, home, report)
 
 
-def _hide(state: HomeState, home: RecorderAddress, say: Callable[[str], None]) -> None:
+def _hide(state: HomeState, home: RecorderAddress, report: Report) -> None:
     """Hide the classes of the configuration and of the list beside the logs.
 
     While the list cannot be read, what it hid last stays hidden.
@@ -575,36 +566,34 @@ def _hide(state: HomeState, home: RecorderAddress, say: Callable[[str], None]) -
     try:
         state.never_tell = home.never_tell | read_list(home.folder)
     except (LogError, OSError) as error:
-        say(f"{error}; until then, classes hidden since the start of the bridge stay hidden")
+        report(f"{error}; until then, classes hidden since the start of the bridge stay hidden")
 
 
 def _push(
-    state: HomeState, log: Path, batch: list[RawMessages], say: Callable[[str], None]
+    state: HomeState, log: Path, batch: list[RawMessages], report: Report
 ) -> tuple[list[SoundEvent], list[Columns]]:
     """Add a batch of messages from a log; return the events that they begin, and the messages."""
     try:
         columns = _decode(batch)
         return state.push(columns), columns
     except LogError as error:
-        say(f"{log}: {error}")
+        report(f"{log}: {error}")
         return [], []
 
 
-def _check_version(log: Path, say: Callable[[str], None]) -> None:
+def _check_version(log: Path, report: Report) -> None:
     """Report a log written by a later version, which is read only in part."""
     with suppress(LogError), LogFile(log) as file:  # the file may be renamed at this moment
         for record in provenance_records(file):
             if text := unknown_version(record):
-                say(f"{log}: {text}")
+                report(f"{log}: {text}")
 
 
 def _labelling_sources(log: Path) -> set[str] | None:
     """Return the labelling sources of a log; None if the log cannot be read at this moment."""
     with suppress(LogError), LogFile(log) as file:
         read_definitions(file)
-        topics = [channel.topic for channel in file.channels.values()]
-        parsed = [parse_topic(topic) for topic in topics if topic != DIAGNOSTICS]
-        names = (labelling_source(name) for name in parsed if name is not None)
+        names = {source_of_topic(channel.topic) for channel in file.channels.values()}
         return {name for name in names if name is not None}
     return None
 
@@ -623,10 +612,9 @@ def decode_fields(
     batch: Sequence[RawMessages], fields: Mapping[str, Sequence[str]]
 ) -> list[Columns]:
     """Decode the given fields, by type, of the messages of these types."""
-    known = [raw for raw in batch if raw.schema is not None and raw.schema.name in fields]
     return [
         columns
-        for raw in known
-        if raw.schema is not None and len(raw)
+        for raw in batch
+        if raw.schema is not None and raw.schema.name in fields and len(raw)
         for columns in decode([raw], fields[raw.schema.name])
     ]

@@ -1,6 +1,6 @@
 """Protocol of the bridge's outputs, their updates, and totals by class."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import tzinfo
 from typing import NamedTuple, Protocol
 
@@ -8,7 +8,7 @@ from pydantic import BaseModel, Field
 
 from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.state import BridgeState, StateEntry
+from hearthlog.analyzer.bridge.state import BridgeState, Report, StateEntry
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import NANOSECONDS
@@ -59,9 +59,9 @@ class Totals:
     saved, the count starts at `time`, in nanoseconds of UTC.
     """
 
-    def __init__(self, state: BridgeState, time: int, say: Callable[[str], None]) -> None:
+    def __init__(self, state: BridgeState, time: int, report: Report) -> None:
         damaged, unsaved = "cannot be read; counts start over", "saved again in ten seconds"
-        self._entry = StateEntry(state, "totals", _Kept, say, damaged, unsaved)
+        self._entry = StateEntry(state, "totals", _Kept, report, damaged, unsaved)
         self._kept = self._entry.load() or _Kept(time=time, totals=[])
 
     @property

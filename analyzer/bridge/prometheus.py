@@ -19,7 +19,7 @@ from hearthlog.analyzer.activity.sources import is_of_scenario, source_parts
 from hearthlog.analyzer.bridge.output import News, Total, Totals
 from hearthlog.analyzer.bridge.secret_files import figures_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, is_numeric_host
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY
 from hearthlog.schemas.errors import LogError
@@ -45,18 +45,18 @@ class PrometheusOutput:
         home: RecorderAddress,
         state: BridgeState,
         since: int,
-        say: Callable[[str], None],
+        report: Report,
     ) -> None:
         settings.check_readers()
         self._settings = settings
         self._home = home
-        self._say = say
-        self.totals = Totals(state, since, say)
+        self._report = report
+        self.totals = Totals(state, since, report)
         self._made = b"", -math.inf  # the metrics, and their time by CLOCK_MONOTONIC
         self._due = 0.0  # by CLOCK_MONOTONIC
         for line in (settings.deprecated_readers(), settings.unread_text_file()):
             if line:
-                say(line)
+                report(line)
         self._server: _Server | None = None
         self._open_port()
 
@@ -84,7 +84,7 @@ class PrometheusOutput:
             try:
                 file.unlink(missing_ok=True)
             except OSError as error:
-                self._say(f"bridge.prometheus: {file}: cannot be removed ({error.strerror})")
+                self._report(f"bridge.prometheus: {file}: cannot be removed ({error.strerror})")
 
     def _write(self, file: Path, text: bytes) -> None:
         rights = _READERS[self._settings.readable_by or "all"]
@@ -92,7 +92,7 @@ class PrometheusOutput:
             with replaced_file(file, readers=rights) as temporary, create_file(temporary) as stream:
                 stream.write(text)
         except (LogError, OSError) as error:
-            self._say(f"bridge.prometheus: text_file: {error}; trying again")
+            self._report(f"bridge.prometheus: text_file: {error}; trying again")
 
     def _open_port(self) -> None:
         """Open the configured port; with a text file, a failure is only reported."""
@@ -109,7 +109,7 @@ class PrometheusOutput:
                 text = f"bridge.prometheus: {text}"
             if file is None:
                 raise BridgeError(text) from error
-            self._say(f"{text}; {file} is written all the same")
+            self._report(f"{text}; {file} is written all the same")
 
     def _current(self) -> bytes | None:
         """Return the metrics; None if they are stale."""

@@ -5,7 +5,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import RLock
@@ -20,6 +20,8 @@ from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.logs.files import log_name, walk_logs
 from hearthlog.schemas.logs.metadata import update_advice
 from hearthlog.schemas.new_files import create_file, open_lock, private_folder
+
+Report = Callable[[str], None]  # receives a line for the person who runs the bridge
 
 
 class BridgeError(HearthlogError):
@@ -73,14 +75,14 @@ class BridgeState:
 
     An entry that was written survives a kill and a power cut. While the file cannot be used, as on
     a full disk, entries are kept in memory, and the file is tried again every minute. Recorders may
-    share a folder. `say` is called with a line about a file that cannot be used.
+    share a folder. `report` is called with a line about a file that cannot be used.
     """
 
-    def __init__(self, folder: Path, node: str, say: Callable[[str], None]) -> None:
+    def __init__(self, folder: Path, node: str, report: Report) -> None:
         self.folder = folder
         self.path = folder / _NAME
         self.node = node
-        self._say = say
+        self._report = report
         self._lock = RLock()
         self._opened: sqlite3.Connection | None = None
         self._is_in_memory = False
@@ -176,9 +178,9 @@ class BridgeState:
                 self._carry_over(self._opened, database)
         except (OSError, sqlite3.Error) as error:
             self._due = time.monotonic() + _AGAIN_SECONDS
-            self._say(
-                f"{self.path}: cannot be used ({_reason(error)}); entries stay in memory until "
-                "it can be"
+            self._report(
+                f"{self.path}: cannot be used ({getattr(error, 'strerror', None) or error}); "
+                "entries stay in memory until it can be"
             )
             if self._opened is None:
                 self._opened, self._is_in_memory = self._copy(), True
@@ -211,7 +213,7 @@ class BridgeState:
             raise
         except sqlite3.DatabaseError as error:
             aside = self._set_aside()
-            self._say(
+            self._report(
                 f"{self.path}: is damaged ({error}) and now called {aside}; the bridge starts "
                 "over: muted classes are published, and alerts may come twice"
             )
@@ -231,12 +233,8 @@ class BridgeState:
         # Without a write-ahead log nothing needs to be created to read the file.
         has_log = self.path.with_name(f"{_NAME}-wal").is_file()
         address = f"{self.path.absolute().as_uri()}?{'mode=ro' if has_log else 'immutable=1'}"
-        with suppress(sqlite3.Error):
-            source = sqlite3.connect(address, uri=True)
-            try:
-                source.backup(memory)
-            finally:
-                source.close()
+        with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True)) as source:
+            source.backup(memory)
         with suppress(sqlite3.OperationalError):  # the table is there
             memory.execute(_TABLE)
         return memory
@@ -257,7 +255,7 @@ class BridgeState:
                     self._opened.execute("INSERT OR REPLACE INTO entries VALUES (?, ?, ?)", row)
                     path.unlink()
                 except (HearthlogError, OSError, ValueError, sqlite3.Error) as error:
-                    self._say(f"{path}: cannot be read ({error}) and is left there; remove it")
+                    self._report(f"{path}: cannot be read ({error}) and is left there; remove it")
         for path in self.folder.glob(".mqtt-*.lock"):
             with suppress(OSError):
                 path.unlink()
@@ -327,13 +325,8 @@ def _written_by(database: sqlite3.Connection) -> object:
 @contextmanager
 def _transaction(database: sqlite3.Connection) -> Iterator[None]:
     database.execute("BEGIN IMMEDIATE")
-    try:
+    with database:
         yield
-        database.execute("COMMIT")
-    except BaseException:
-        if database.in_transaction:
-            database.execute("ROLLBACK")
-        raise
 
 
 def _locked(folder: Path, node: str) -> int | None:
@@ -347,17 +340,13 @@ def _locked(folder: Path, node: str) -> int | None:
     return descriptor
 
 
-def _reason(error: Exception) -> str:
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
-
-
 Content = TypeVar("Content")
 
 
 class StateEntry(Generic[Content]):
     """An entry of the bridge's state, checked by pydantic against `kind` when it is read.
 
-    `damaged` and `unsaved` are the consequence, for `say`, of an entry that cannot be read, or
+    `damaged` and `unsaved` are the consequence, for `report`, of an entry that cannot be read, or
     written.
     """
 
@@ -366,14 +355,14 @@ class StateEntry(Generic[Content]):
         state: BridgeState,
         name: str,
         kind: type[Content],
-        say: Callable[[str], None],
+        report: Report,
         damaged: str,
         unsaved: str,
     ) -> None:
         self._state = state
         self.name = name
         self._kind = TypeAdapter(kind)
-        self._say = say
+        self._report = report
         self._damaged, self._unsaved = damaged, unsaved
 
     def load(self) -> Content | None:
@@ -387,7 +376,7 @@ class StateEntry(Generic[Content]):
 
     def report_damage(self) -> None:
         """Report that the entry is damaged."""
-        self._say(f"{self._state.path}, {self.name}: {self._damaged}")
+        self._report(f"{self._state.path}, {self.name}: {self._damaged}")
 
     def save(self, content: Content, obsolete: Collection[str] = ()) -> bool:
         """Write the content, on disk on return; return False if the failure is reported.
@@ -397,7 +386,7 @@ class StateEntry(Generic[Content]):
         try:
             self._state.write(self.name, self._kind.dump_json(content).decode(), obsolete)
         except sqlite3.Error as error:
-            self._say(f"{self._state.path}: cannot be written ({error}); {self._unsaved}")
+            self._report(f"{self._state.path}: cannot be written ({error}); {self._unsaved}")
             return False
         return True
 

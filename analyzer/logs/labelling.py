@@ -1,7 +1,7 @@
 """Labellings: labelled spans of time by a recorder, a model or a reviewer."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import find_with_layers
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.spans import NEVER, joined, one, pieces, remains
+from hearthlog.analyzer.logs.spans import NEVER, Rows, Spans, joined, one, pieces, remains
 from hearthlog.models.classes import CLASS_NAME, class_name, translation
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -58,11 +58,19 @@ class Labelling:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def rows(self, which: Bool) -> "Labelling":
+    def rows(self, which: Bool | Rows) -> "Labelling":
         """Select spans."""
         return Labelling(
             self.starts[which], self.ends[which], self.labels[which], self.confidences[which]
         )
+
+    def spans(self, which: Bool | None = None, pause: int = 0) -> Spans:
+        """Return the time of all labels, or of the chosen ones, with pauses up to a length closed.
+
+        The pause is in nanoseconds.
+        """
+        own = self if which is None else self.rows(which)
+        return joined(own.starts, own.ends, pause)
 
     def called_as(self, classes: Sequence[str]) -> "Labelling":
         """Rename labels to the equivalent names in a list of classes.
@@ -78,15 +86,16 @@ class Labelling:
 
 def overlaid(labels: Labelling, above: Labelling) -> Labelling:
     """Overlay a labelling on another one; the upper labels replace the lower ones."""
-    left, rows = remains(labels, joined(above.starts, above.ends))
-    starts = np.concatenate([left.starts, above.starts])
-    order = np.argsort(starts, kind="stable")
-    return Labelling(
-        starts[order],
-        np.concatenate([left.ends, above.ends])[order],
-        np.concatenate([labels.labels[rows], above.labels])[order],
-        np.concatenate([labels.confidences[rows], above.confidences])[order],
-    )
+    left, rows = remains(labels, above.spans())
+    return in_order([Labelling(*left, labels.labels[rows], labels.confidences[rows]), above])
+
+
+def in_order(parts: Iterable[Labelling]) -> Labelling:
+    """Join at least one labelling in order of start; the spans may overlap."""
+    parts, names = list(parts), [column.name for column in fields(Labelling)]
+    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    together = Labelling(*columns)
+    return together.rows(np.argsort(together.starts, kind="stable"))
 
 
 def unified(labels: Labelling) -> Labelling:

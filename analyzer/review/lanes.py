@@ -311,7 +311,7 @@ def class_precision(timeline: Timeline, logs: HomeLogs) -> Checked:
     checked: dict[tuple[str, str], ClassCheck] = {}
     for microphone in timeline.microphones:
         minutes = checked_minutes(one for one in reviewed if one.span.microphone == microphone)
-        checks = ((name, minutes.check(name)) for name in minutes.labelled)
+        checks = ((name, minutes.check(name)) for name in minutes.events)
         checked |= {(microphone, in_words(name)): one for name, one in checks if one.labelled}
     return checked
 

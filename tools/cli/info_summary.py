@@ -302,7 +302,7 @@ class Accuracy:
         }
 
     def _checks(self) -> Iterator[tuple[str, ClassCheck]]:
-        for name in self.minutes.labelled:
+        for name in self.minutes.events:
             check = self.minutes.check(name)
             if check.labelled or check.true:
                 yield name, check

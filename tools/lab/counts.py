@@ -159,12 +159,12 @@ def check_counts(home: Home, name: str) -> Iterator[Checked]:
 
 
 def _checks(home: Home, rows: Int64) -> CheckedMinutes:
-    none = {name: np.zeros(len(rows), np.int64) for name in home.labelled}
+    none = np.zeros(len(rows), np.int64)
     return CheckedMinutes(
-        {name: events[rows] for name, events in home.labelled.items()},
-        none,
-        {name: true[rows] for name, true in home.true.items()},
-        none,
+        {
+            name: np.array([events[rows], none, home.true[name][rows], none])
+            for name, events in home.labelled.items()
+        },
         home.sounding[rows],
         home.television[rows],
         [""] * len(rows),

@@ -7,7 +7,7 @@ import logging
 import re
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import tzinfo
 from difflib import SequenceMatcher
 from pathlib import Path
@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from hearthlog.analyzer.bridge.alerts.rules import Notification
 from hearthlog.analyzer.bridge.secret_files import secret_path
-from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, StateEntry
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report, StateEntry
 from hearthlog.analyzer.extras import remedy
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.schemas.files import exposed_secret, read_limited
@@ -57,17 +57,23 @@ class Outbox:
         self,
         state: BridgeState,
         targets: Sequence[str],
-        say: Callable[[str], None],
+        report: Report,
         most: int = MOST,
     ) -> None:
         self._state = state
         self._targets = frozenset(targets)
-        self._say = say
+        self._report = report
         self._most = most
         self._lock = Lock()
         self._waiting: dict[str, Waiting] = {}
         for name in state.names(_OUTBOX):
-            self._load(name.removeprefix(_OUTBOX))
+            entry = self._entry(name.removeprefix(_OUTBOX))
+            if (waiting := entry.load()) is None:
+                continue
+            if f"{_OUTBOX}{waiting.notification.id}" == name:
+                self._waiting[waiting.notification.id] = waiting
+            else:
+                entry.report_damage()
         self._remove([n for n, each in self._waiting.items() if each.told >= self._targets])
         self._early = frozenset(self._waiting)  # these may be evaluated again after a restart
 
@@ -93,12 +99,13 @@ class Outbox:
                     self._write(waiting)
 
     def _remove_done(self, now: int) -> None:
-        self._remove([n for n, each in self._waiting.items() if self._is_done(each, now)])
-
-    def _is_done(self, waiting: Waiting, now: int) -> bool:
-        missing = self._targets - waiting.told
-        is_old = now - waiting.time > _UNREAD_LONGEST
-        return not missing or (is_old and missing == {UNREAD})
+        done = []
+        for name, waiting in self._waiting.items():
+            missing = self._targets - waiting.told
+            is_old = now - waiting.time > _UNREAD_LONGEST
+            if not missing or (is_old and missing == {UNREAD}):
+                done.append(name)
+        self._remove(done)
 
     def put(self, notifications: Iterable[Notification]) -> None:
         """Queue notifications that are not queued yet; they are on disk on return."""
@@ -113,13 +120,12 @@ class Outbox:
     def waiting_for(self, target: str, now: int) -> list[Notification]:
         """Return the notifications due for a target, oldest first."""
         with self._lock:
-            notifications = [
-                each.notification for each in self._waiting.values() if target not in each.told
+            due = [
+                each.notification
+                for each in self._waiting.values()
+                if target not in each.told and each.due <= now
             ]
-        return sorted(
-            (notification for notification in notifications if notification.due <= now),
-            key=lambda notification: notification.time,
-        )
+        return sorted(due, key=lambda notification: notification.time)
 
     def record_delivery(self, target: str, notification: Notification) -> None:
         """Record a delivery; a notification that all targets have is removed."""
@@ -142,7 +148,7 @@ class Outbox:
         number = len(self._waiting) - self._most
         if number > 0:
             self._remove(sorted(self._waiting, key=lambda each: self._waiting[each].time)[:number])
-            self._say(
+            self._report(
                 f"{self._most} alerts are waiting, and the oldest are dropped; see above which "
                 "target fails; repair it, or remove it from urls_file"
             )
@@ -153,7 +159,7 @@ class Outbox:
         try:
             self._state.remove([f"{_OUTBOX}{name}" for name in names])
         except sqlite3.Error as error:
-            self._say(f"{self._state.path}: cannot be written ({error}); alerts may come twice")
+            self._report(f"{self._state.path}: cannot be written ({error}); alerts may come twice")
 
     def _write(self, waiting: Waiting) -> None:
         self._entry(waiting.notification.id).save(waiting)
@@ -163,20 +169,10 @@ class Outbox:
             self._state,
             f"{_OUTBOX}{name}",
             Waiting,
-            self._say,
+            self._report,
             "cannot be read; this alert is not delivered",
             "until it can, alerts are only kept in memory",
         )
-
-    def _load(self, name: str) -> None:
-        entry = self._entry(name)
-        waiting = entry.load()
-        if waiting is None:
-            return
-        if waiting.notification.id != name:
-            entry.report_damage()
-        else:
-            self._waiting[name] = waiting
 
 
 _LIMIT = 1 << 16  # bytes of the file
@@ -237,7 +233,7 @@ class Addresses(NamedTuple):
     lacks_package: bool = False  # whether Apprise, or a package that it needs, is not installed
 
 
-def find_targets(file: Path | None, say: Callable[[str], None]) -> Addresses:
+def find_targets(file: Path | None, report: Report) -> Addresses:
     """Read a file of addresses, one per line, if there is one; `#` begins a comment line."""
     if file is None:
         return Addresses([], [], [])
@@ -253,7 +249,7 @@ def find_targets(file: Path | None, say: Callable[[str], None]) -> Addresses:
         problem = f"{error.name} is not installed; {remedy(error.name or '')}"
         return Addresses([], [problem], [], lacks_package=True)
     if line := exposed_secret(file):
-        say(line)
+        report(line)
     # Keep Apprise from loading plugins from disk and from writing to disk.
     asset = apprise.AppriseAsset(
         plugin_paths=[], storage_mode="memory", secure_logging=True, async_mode=False
@@ -328,7 +324,7 @@ class Delivery:
         targets: Sequence[Target],
         node: str,
         zone: tzinfo,
-        say: Callable[[str], None],
+        report: Report,
         *,
         first_pause: float = 5.0,
         longest_pause: float = 900.0,
@@ -336,7 +332,7 @@ class Delivery:
         self._outbox = outbox
         self._node = node
         self._zone = zone
-        self._say = say
+        self._report = report
         self._pauses = first_pause, longest_pause
         self._threads: dict[str, tuple[Thread, Flag]] = {}  # by name of the target
         self.set_targets(targets)
@@ -367,16 +363,16 @@ class Delivery:
         first, longest = self._pauses
         pause = first
         while not stop.wait(_LOOK_SECONDS):
-            told, failed = self._tell(target, stop)
-            if told:
+            delivered, failed = self._deliver(target, stop)
+            if delivered:
                 pause = first
             if failed:
                 stop.wait(pause)
                 pause = min(2 * pause, longest)
 
-    def _tell(self, target: Target, stop: Flag) -> tuple[int, bool]:
+    def _deliver(self, target: Target, stop: Flag) -> tuple[int, bool]:
         """Deliver all due notifications to a target; return their number and whether one failed."""
-        told = 0
+        delivered = 0
         for notification in self._outbox.waiting_for(target.name, time.time_ns()):
             if stop.is_set():
                 break
@@ -387,14 +383,14 @@ class Delivery:
             except Exception as error:  # noqa: BLE001  many services, each with its own errors
                 reason = type(error).__name__
             if reason:
-                self._say(
+                self._report(
                     f"{target.place}: an alert could not be delivered ({reason}); it is kept and "
                     "retried at least every quarter of an hour"
                 )
-                return told, True
+                return delivered, True
             self._outbox.record_delivery(target.name, notification)
-            told += 1
-        return told, False
+            delivered += 1
+        return delivered, False
 
 
 def message(notification: Notification, zone: tzinfo, now: int | None = None) -> str:

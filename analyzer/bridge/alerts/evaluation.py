@@ -16,10 +16,11 @@ from hearthlog.analyzer.activity.day_profile import (
 )
 from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.events import ANY_SOUND
-from hearthlog.analyzer.activity.segments import HomeActivity, Sounds
+from hearthlog.analyzer.activity.segments import HomeActivity
 from hearthlog.analyzer.activity.sources import is_of_scenario
 from hearthlog.analyzer.activity.values import (
     BASELINE_DAYS,
+    Clock,
     Count,
     Duration,
     UsualRange,
@@ -42,11 +43,12 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     duration_words,
     pause_of,
 )
-from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
 from hearthlog.analyzer.logs.spans import (
-    NONE,
     Spans,
+    Timed,
+    common,
     cut,
     first_of_groups,
     joined,
@@ -73,14 +75,8 @@ class SoundEvents(NamedTuple):
         """Return the heard spans of each event from the time at which the event counts."""
         if self.counted is self.starts:
             return self.coverage
-        parts = [
-            cut(self.coverage, start, end)
-            for start, end in zip(self.counted.tolist(), self.ends.tolist(), strict=True)
-            if start < end
-        ]
-        if not parts:
-            return NONE
-        return Spans(*(np.concatenate(edges) for edges in zip(*parts, strict=True)))
+        begun = self.counted < self.ends
+        return common(self.coverage, Spans(self.counted[begun], self.ends[begun]))
 
 
 def events_of_rule(rule: SoundRule, activity: HomeActivity) -> SoundEvents:
@@ -288,7 +284,7 @@ def none_by_conditions(
         if ((events.counted < last) & (events.ends > first)).any():
             continue
         share = cut(listened, first, last).length / (last - first)
-        hours = f"from {_clock(rule.since)} to {_clock(rule.by)}"
+        hours = f"from {Clock.show(rule.since)} to {Clock.show(rule.by)}"
         is_known = share >= rule.least_share
         text = f"{rule.words}: none {hours}"
         if not is_known:
@@ -306,11 +302,6 @@ def _window(rule: NoneBy, day: date, zone: tzinfo) -> tuple[int, int]:
 
 def _at_once(time: int, text: str, *, is_known: bool = True) -> Condition:
     return Condition(time, time + 1, lambda _: text, is_known)
-
-
-def _clock(minute: int) -> str:
-    hours, minutes = divmod(minute, 60)
-    return f"{hours:02}:{minutes:02}"
 
 
 def unlike_conditions(
@@ -407,18 +398,14 @@ def unusual_conditions(
 def home_sound(activity: HomeActivity) -> HomeSegments:
     """Return the segments and coverage from which routines are fitted."""
     sounds = {name: own for (name, of_scenario), own in activity.sounds.items() if not of_scenario}
-    names = np.array([SILENCE, *sounds], object)
-    parts: list[Spans | Sounds] = [activity.listened(ANY_SOUND, ""), *sounds.values()]
-    starts = np.concatenate([own.starts for own in parts])
-    ends = np.concatenate([own.ends for own in parts])
-    labels = np.repeat(names, [len(own.starts) for own in parts])
-    order = np.argsort(starts, kind="stable")
-    of_home = [own for name, own in activity.classes.items() if not is_of_scenario(name)]
-    known = sorted(set(sounds).union(*of_home))
-    return HomeSegments(
-        Labelling(starts[order], ends[order], labels[order]),
-        {name: activity.listened(name, "") for name in known},
+    parts: dict[str, Timed] = {SILENCE: activity.listened(ANY_SOUND, ""), **sounds}
+    labels = in_order(
+        Labelling(own.starts, own.ends, np.full(len(own.starts), name, object))
+        for name, own in parts.items()
     )
+    of_home = [own for name, own in activity.classes.items() if not is_of_scenario(name)]
+    names = sorted(set(sounds).union(*of_home))
+    return HomeSegments(labels, {name: activity.listened(name, "") for name in names})
 
 
 NEW = RuleState()

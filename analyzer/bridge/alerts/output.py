@@ -39,7 +39,7 @@ from hearthlog.analyzer.bridge.alerts.rules import (
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, StateEntry
+from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report, StateEntry
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -49,10 +49,10 @@ from hearthlog.schemas.logs.columns import Columns
 class RuleProgressStore:
     """Persistent evaluation progress of each rule; a changed rule starts over."""
 
-    def __init__(self, state: BridgeState, say: Callable[[str], None]) -> None:
+    def __init__(self, state: BridgeState, report: Report) -> None:
         damaged = "cannot be read; all rules start over"
         unsaved = "alerts may come twice after the next start"
-        self._entry = StateEntry(state, "rules", dict[str, RuleState], say, damaged, unsaved)
+        self._entry = StateEntry(state, "rules", dict[str, RuleState], report, damaged, unsaved)
 
     def load(self, rules: Sequence[AlertRule]) -> dict[str, RuleState]:
         """Return the states of rules by name."""
@@ -79,14 +79,14 @@ class RuleWatch:
         zone: tzinfo,
         outbox: Outbox,
         memory: RuleProgressStore,
-        say: Callable[[str], None],
+        report: Report,
         now: int,
     ) -> None:
         self._rules = rules
         self._zone = zone
         self._outbox = outbox
         self._memory = memory
-        self._say = say
+        self._report = report
         self._progress = memory.load(rules)
         self._saved = now
         self.never_tell: frozenset[str] = frozenset()  # classes whose rules never notify
@@ -97,7 +97,7 @@ class RuleWatch:
         is_ahead = any(own.until > now + AHEAD for own in self._progress.values())
         self._progress = {name: _as_of(own, now) for name, own in self._progress.items()}
         if is_ahead:
-            self._say("alerts: the clock was set back; the rules start over")
+            self._report("alerts: the clock was set back; the rules start over")
             self._outbox.forget_after(now + AHEAD)
             self.save(now)
 
@@ -186,7 +186,7 @@ class AlertsOutput:
         delivery: DeliverySettings,
         home: RecorderAddress,
         state: BridgeState,
-        say: Callable[[str], None],
+        report: Report,
         on_notification: OnNotification | None = None,
     ) -> None:
         self._file = delivery.urls_file
@@ -194,19 +194,19 @@ class AlertsOutput:
             raise BridgeError(NO_RECIPIENT)
         self._rules = rules
         self._followed = home
-        self._say = say
+        self._report = report
         self._on_notification = on_notification
         self._has_problems = False
         self._read_file, self._looked_at_file = object(), -math.inf  # the second: CLOCK_MONOTONIC
-        self._outbox = Outbox(state, [BROKER, UNREAD], say)
+        self._outbox = Outbox(state, [BROKER, UNREAD], report)
         twice = "targets on edited lines may be notified twice"
         self._lines_entry = StateEntry(
-            state, "addresses", list[str], say, f"cannot be read; {twice}", twice
+            state, "addresses", list[str], report, f"cannot be read; {twice}", twice
         )
         self._lines = self._lines_entry.load() or []  # target names of the file of addresses
-        memory = RuleProgressStore(state, say)
+        memory = RuleProgressStore(state, report)
         now = self._latest = time.time_ns()
-        self._watch = RuleWatch(rules, home.zone, self._outbox, memory, say, now)
+        self._watch = RuleWatch(rules, home.zone, self._outbox, memory, report, now)
         self._activity = LiveActivity(now, _PATIENCE)
         self._began = time.monotonic()
         self._has_news = Flag()  # set by the first update
@@ -214,7 +214,7 @@ class AlertsOutput:
         self._columns: deque[Columns] = deque(maxlen=_COLUMNS)
         self._in_delivery: tuple[Notification, str] | None = None  # being delivered to the broker
         self._stop = Flag()
-        self._delivery = Delivery(self._outbox, [], home.node, home.zone, say)
+        self._delivery = Delivery(self._outbox, [], home.node, home.zone, report)
         self._find_targets()
         self._thread = Thread(target=self._run, daemon=True, name="alerts")
         self._thread.start()
@@ -258,7 +258,7 @@ class AlertsOutput:
             try:
                 self._follow()
             except Exception as error:  # noqa: BLE001  alerts must go on
-                self._say(f"alerts: {type(error).__name__}: {error}; they go on from there")
+                self._report(f"alerts: {type(error).__name__}: {error}; they go on from there")
                 self._stop.wait(_LOOK_SECONDS)
         self._watch.save(time.time_ns())
 
@@ -274,14 +274,14 @@ class AlertsOutput:
         current = None if self._file is None else _state_of(self._file)
         if current == self._read_file:
             return
-        targets, problems, names, lacks_package = find_targets(self._file, self._say)
+        targets, problems, names, lacks_package = find_targets(self._file, self._report)
         self._read_file = object() if lacks_package else current
         for problem in problems:
-            self._say(
+            self._report(
                 f"alerts: {problem}; other targets are notified, this one once it is corrected"
             )
         if self._has_problems and not problems:
-            self._say(f"alerts: {self._file}: every line of it can be read now")
+            self._report(f"alerts: {self._file}: every line of it can be read now")
         self._has_problems = bool(problems)
         if names:
             self._outbox.replace_targets(replaced_names(self._lines, names))
@@ -303,8 +303,9 @@ class AlertsOutput:
         self._watch.set_right(now)
         self._activity = LiveActivity(self._watch.needed_from(now), _PATIENCE)
         with suppress(LogError):  # no log yet
+            logs = find_home_logs([home.folder])
             self._activity.read(
-                find_home_logs([home.folder]), home.node, now + _TO_COME, self._damaged
+                logs, home.node, now + _TO_COME, lambda text: self._report(f"alerts: {text}")
             )
         while not self._stop.wait(_NEWS_SECONDS):
             if self._now() < self._latest - AHEAD:
@@ -322,7 +323,7 @@ class AlertsOutput:
     def _push(self, columns: Columns) -> None:
         known = columns.between(None, self._now() + _TO_COME)
         if len(known) < len(columns):
-            self._say("alerts: was the clock ahead? segments in the future are left out")
+            self._report("alerts: was the clock ahead? segments in the future are left out")
         self._activity.push([known])
 
     def _look(self) -> None:
@@ -339,7 +340,7 @@ class AlertsOutput:
         if time.monotonic() - self._began >= _WAIT_SECONDS:
             unknown = (unknown_class(rule, self._activity.classes) for rule in self._rules)
             for text in filter(None, unknown):
-                self._say(f"alerts: {text}")
+                self._report(f"alerts: {text}")
 
     def _now(self) -> int:
         now = time.time_ns()
@@ -358,9 +359,6 @@ class AlertsOutput:
             return SegmentCollector().activity()
         open_segments = self._activity.open_segments()
         return read_activity(logs, home.node, start, end, lambda _: None, others=open_segments)
-
-    def _damaged(self, error: object) -> None:
-        self._say(f"alerts: {error}")
 
 
 def _state_of(file: Path) -> tuple[int, ...] | None:

@@ -17,7 +17,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import MqttSettings
-from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.schemas.files import read_limited
 
 _KEEPALIVE = 20  # seconds: the broker drops a client that is silent for 1.5 times as long
@@ -34,7 +34,6 @@ _TAKEN_OVER = 0x8E
 _LONGEST_PASSWORD = 4096  # bytes
 _LARGEST_CERTIFICATE = 8 << 20  # bytes; the CA bundle of a machine has half a megabyte
 
-Say = Callable[[str], None]
 Received = Callable[[mqtt.MQTTMessage], None]
 
 
@@ -52,12 +51,12 @@ class Connection:
         settings: MqttSettings,
         client_id: str,
         alive_topic: str,
-        say: Say,
+        report: Report,
         *,
         subscriptions: Sequence[str],
         received: Received,
     ) -> None:
-        self._say = say
+        self._report = report
         self._alive = alive_topic
         self._subscriptions = subscriptions
         self._received = received
@@ -205,7 +204,7 @@ class Connection:
         self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
     ) -> None:
         if reason.is_failure:
-            self._say(f"{self._place}: refused: {reason}; see user, password_file and client_id")
+            self._report(f"{self._place}: refused: {reason}; see user, password_file and client_id")
             self._is_refused = True
             return
         self._is_refused = False
@@ -227,7 +226,7 @@ class Connection:
             what = f"its certificate is refused: {error.verify_message}; see ca_file"
         else:
             what = str(getattr(error, "strerror", None) or error)
-        self._say(f"{self._place}: no broker ({what}); trying again")
+        self._report(f"{self._place}: no broker ({what}); trying again")
 
     def _on_disconnect(
         self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
@@ -236,7 +235,7 @@ class Connection:
         self._ready_at = math.inf
         if since is None:
             if reason.is_failure and not self._is_refused:  # a refusal is reported already
-                self._say(f"{self._place}: no connection: {reason}{self._hint}; trying again")
+                self._report(f"{self._place}: no connection: {reason}{self._hint}; trying again")
             self._is_refused = False
             return
         is_short = reason.is_failure and time.monotonic() - since < _SHORT_SECONDS
@@ -245,18 +244,18 @@ class Connection:
         pause = min(_FIRST_PAUSE << self._short, _LONGEST_PAUSE)
         client.reconnect_delay_set(pause, max(pause, _LONGEST_PAUSE))
         if reason.value == _TAKEN_OVER or self._short > 1:
-            self._say(
+            self._report(
                 f"{self._place}: the broker ends each connection at once: is another client named "
                 f"{self._client_id} running, a second bridge? give one of them another client_id"
             )
         elif reason.is_failure:
-            self._say(f"{self._place}: the connection ended: {reason}; trying again")
+            self._report(f"{self._place}: the connection ended: {reason}; trying again")
 
     def _on_publish(
         self, _client: mqtt.Client, _data: Any, _number: int, reason: ReasonCode, _more: Any
     ) -> None:
         if reason.is_failure:
-            self._say(
+            self._report(
                 f"{self._place}: a message was refused: {reason}; the broker must let this client "
                 f"write below {self._alive.rpartition('/')[0]}, and for Home Assistant below "
                 "its discovery topic"
@@ -270,7 +269,7 @@ class Connection:
             self._wait_for_kept()
         for topic, reason in zip(self._subscriptions, reasons, strict=False):
             if reason.is_failure:
-                self._say(f"{self._place}: may not read {topic}: {reason}")
+                self._report(f"{self._place}: may not read {topic}: {reason}")
 
     def _on_message(self, _client: mqtt.Client, _data: Any, message: mqtt.MQTTMessage) -> None:
         if message.topic == self._alive:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from paho.mqtt.client import MQTTMessage
@@ -21,7 +21,7 @@ from hearthlog.analyzer.bridge.mqtt.home_assistant import (
 from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, RetainedTopics, Topics
 from hearthlog.analyzer.bridge.output import RECENT, News
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeState
+from hearthlog.analyzer.bridge.state import BridgeState, Report
 from hearthlog.analyzer.logs.local_time import iso_time
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.errors import shortened
@@ -51,7 +51,7 @@ class MqttPublisher:
         settings: MqttSettings,
         home: RecorderAddress,
         state: BridgeState,
-        say: Callable[[str], None],
+        report: Report,
     ) -> None:
         self._settings = settings
         self._home = home
@@ -68,8 +68,8 @@ class MqttPublisher:
         subscriptions = [self._birth_topic] if settings.home_assistant else []
         self._received: deque[bytes] = deque(maxlen=_MOST_ASKED)
         self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
-        self._say = say
-        self._announced = RetainedTopics(state, say)
+        self._report = report
+        self._announced = RetainedTopics(state, report)
         self._forgotten: set[str] = set()  # topics being cleared at the broker
         self._has_published_muted = False
         # Earlier versions stored retained topics and muted classes only at the broker.
@@ -89,7 +89,7 @@ class MqttPublisher:
             settings,
             client_id,
             topics.at("bridge"),
-            say,
+            report,
             subscriptions=subscriptions,
             received=self._take,
         )
@@ -221,7 +221,7 @@ class MqttPublisher:
                 else "a command did that, and commands are off now: to change it, start the "
                 f"bridge once with --unmute {muted[0]}"
             )
-            self._say(f"mqtt: not published: {', '.join(muted)}; {remedy}")
+            self._report(f"mqtt: not published: {', '.join(muted)}; {remedy}")
         self._has_published_muted = True
 
     def _topic(self, place: Place) -> str:
@@ -286,19 +286,19 @@ class MqttPublisher:
         return bool(label) and classes is not None and label not in classes
 
     def _publish_state(self, microphone: LiveMicrophone, news: News) -> None:
-        def say(kind: str, value: str) -> None:
+        def keep(kind: str, value: str) -> None:
             self._keep(Place(kind, microphone.name), value)
 
-        say("listening", _ONLINE[microphone.is_listening()])
+        keep("listening", _ONLINE[microphone.is_listening()])
         if not microphone.label:
             return
         confidence = round(microphone.confidence, 3)
         label = microphone.shown_label
         label = label if self._announced.is_published(label) else UNKNOWN
-        say("heard", json.dumps({"label": label, "confidence": confidence}))
-        say("sound", _ON[microphone.active.is_active(ANY_SOUND)])
+        keep("heard", json.dumps({"label": label, "confidence": confidence}))
+        keep("sound", _ON[microphone.active.is_active(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
-            say("level", f"{microphone.level_dbfs:.1f}")
+            keep("level", f"{microphone.level_dbfs:.1f}")
         counts = microphone.counts(news.today, news.state.corrections)
         began = {
             "day_start": iso_time(news.today.midnight, news.zone),

@@ -1,7 +1,7 @@
 """MQTT topics: names, and the record of topics that the broker retains."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from threading import Lock
 from typing import NamedTuple
 from urllib.parse import quote, unquote
@@ -9,7 +9,7 @@ from urllib.parse import quote, unquote
 from pydantic import BaseModel
 
 from hearthlog.analyzer.activity.events import SoundEvent
-from hearthlog.analyzer.bridge.state import RETAINED, BridgeState, StateEntry
+from hearthlog.analyzer.bridge.state import RETAINED, BridgeState, Report, StateEntry
 
 _KEPT = "".join(chr(code) for code in range(33, 127) if chr(code) not in "%+#/$")
 
@@ -90,12 +90,11 @@ class RetainedTopics:
     `is_new`: there was no record.
     """
 
-    def __init__(self, state: BridgeState, say: Callable[[str], None]) -> None:
+    def __init__(self, state: BridgeState, report: Report) -> None:
         def entry(name: str) -> StateEntry[_Content]:
-            return StateEntry(state, name, _Content, report, _DAMAGED, _UNSAVED)
-
-        def report(text: str) -> None:
-            say(f"mqtt: {text}")
+            return StateEntry(
+                state, name, _Content, lambda text: report(f"mqtt: {text}"), _DAMAGED, _UNSAVED
+            )
 
         self._lock = Lock()
         self._entry = entry(RETAINED)
