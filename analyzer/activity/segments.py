@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from hearthlog.analyzer.activity.sources import (
     source_microphone,
 )
 from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.layers import readable_span
 from hearthlog.analyzer.logs.selection import array_names, select
 from hearthlog.analyzer.logs.spans import (
     NEVER,
@@ -33,7 +33,6 @@ from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
-from hearthlog.schemas.logs.files import time_span
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import labelling_topic, parse_topic
@@ -344,15 +343,7 @@ def span_of(logs: HomeLogs, node: str) -> tuple[int, int]:
     Raise `LogError` if no log has a readable message.
     """
     own = [entry.path for entry in logs.entries if entry.node == node and not entry.layer]
-    first, last = _first_span(own), _first_span(reversed(own))
+    first, last = readable_span(own), readable_span(reversed(own))
     if first is None or last is None:
         raise LogError(f"the logs of {node} have no message that can be read")
     return first[0], last[1]
-
-
-def _first_span(paths: Iterable[Path]) -> tuple[int, int] | None:
-    for path in paths:
-        with suppress(LogError):
-            if (span := time_span(path)) is not None:
-                return span
-    return None

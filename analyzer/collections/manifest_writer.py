@@ -76,20 +76,19 @@ class LabelMap:
 
         Raise `DataError` if a name is neither in this map nor a class name.
         """
-        known = self.label_of.keys() | self.broad | self.skip
-        classes = {name: find_class(name) for name in sorted(set(names) - known)}
-        unknown = [
-            repr(name[:64])
-            for name, row in classes.items()
-            if row is None or row.name in {OTHER, UNKNOWN}
-        ]
+        label_of, unknown = dict(self.label_of), []
+        for name in sorted(set(names) - self.label_of.keys() - self.broad - self.skip):
+            row = find_class(name)
+            if row is None or row.name in {OTHER, UNKNOWN}:
+                unknown.append(repr(name[:64]))
+            else:
+                label_of[name] = row.name
         if unknown:
             raise DataError(
                 f"{folder}: {listed(unknown[:10])}: no label is called so; rename the folder, or "
                 "give a --map"
             )
-        named = {name: row.name for name, row in classes.items() if row is not None}
-        return replace(self, label_of={**self.label_of, **named})
+        return replace(self, label_of=label_of)
 
 
 def shipped_map(name: str) -> str:

@@ -205,19 +205,15 @@ def read_fsd50k(folder: Path) -> Iterator[CollectionClip]:
         about = read_json(folder / "FSD50K.metadata" / f"{part}_clips_info_FSD50K.json")
         audio = folder / f"FSD50K.{part}_audio"
         for where, (number, labels) in read_table(truth / f"{part}.csv", ("fname", "labels")):
-            uploader, licence = _fsd50k_about(about.get(number))
+            clip = about.get(number)
+            stated = clip if isinstance(clip, dict) else {}
+            uploader = str(stated.get("uploader") or "").strip()
             yield CollectionClip(
                 path_inside(where, audio, f"{number}.wav"),
                 (CategorySpan(tuple(labels.split(","))),),
                 f"freesound_user_{uploader}" if uploader else f"fs{number}",
-                licence,
+                short_licence(str(stated.get("license"))),
             )
-
-
-def _fsd50k_about(clip: object) -> tuple[str, str]:
-    """Return the uploader and licence of a clip."""
-    known = clip if isinstance(clip, dict) else {}
-    return str(known.get("uploader") or "").strip(), short_licence(str(known.get("license")))
 
 
 def short_licence(address: str) -> str:
@@ -365,7 +361,9 @@ def read_audioset_strong(folder: Path) -> Iterator[CollectionClip]:
 
     Raise `DataError` if a table of the collection cannot be read, or there is none with times.
     """
-    names = _audioset_names(folder / "mid_to_display_name.tsv")
+    listing = folder / "mid_to_display_name.tsv"
+    rows = csv_records(listing, read_text(listing, "table", _AUDIOSET_NAMES_LIMIT), "\t")
+    names = {row[0].strip(): row[1].strip() for _, row in rows if len(row) > 1}
     tables = sorted(folder.glob("*_strong.tsv"))
     if not tables:
         raise DataError(f"{folder}: no audioset_train_strong.tsv or audioset_eval_strong.tsv in it")
@@ -385,12 +383,6 @@ def read_audioset_strong(folder: Path) -> Iterator[CollectionClip]:
             "unstated (sound of YouTube)",
             _AUDIOSET_SECONDS,
         )
-
-
-def _audioset_names(path: Path) -> dict[str, str]:
-    """Read the names of labels."""
-    rows = csv_records(path, read_text(path, "table", _AUDIOSET_NAMES_LIMIT), "\t")
-    return {row[0].strip(): row[1].strip() for _, row in rows if len(row) > 1}
 
 
 def _audioset_audio(folder: Path) -> dict[tuple[str, float | None], Path]:
@@ -467,7 +459,7 @@ def read_voxceleb(folder: Path) -> Iterator[CollectionClip]:
             is_clip = _VOXCELEB_PERSON.fullmatch(person) and _VOXCELEB_VIDEO.fullmatch(video)
             reason = "" if is_clip else "not placed as a clip of the collection"
             if not is_audio(path.name):
-                reason = f"not named as audio that can be read: *{path.suffix}"
+                reason = _no_audio(path)
             yield CollectionClip(
                 path,
                 (CategorySpan((person,)),),
@@ -494,13 +486,14 @@ def read_folder(folder: Path) -> Iterator[CollectionClip]:
         inner = path.relative_to(folder).parts
         if len(inner) > 1:
             source = inner[1] if len(inner) > 2 else _TAKE.sub("", path.stem) or path.stem
-            reason = "" if is_audio(path.name) else _no_audio(path)
+            reason = ""
+            if not is_audio(path.name):
+                is_hidden = path.name.startswith(".")
+                reason = "hidden: its name begins with a dot" if is_hidden else _no_audio(path)
             yield CollectionClip(path, (CategorySpan((inner[0],)),), source, "", left_out=reason)
 
 
 def _no_audio(path: Path) -> str:
-    if path.name.startswith("."):
-        return "hidden: its name begins with a dot"
     return f"not named as audio that can be read: *{path.suffix}"
 
 

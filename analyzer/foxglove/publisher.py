@@ -38,16 +38,16 @@ class Publisher:
 
     def advertise(self, channel: records.Channel, schema: records.Schema | None) -> bool:
         """Advertise a topic to viewers; again if its type grew."""
-        known = self._channels.get(channel.topic)
-        if known is not None:
-            if _is_of(known, channel, schema):
+        advertised = self._channels.get(channel.topic)
+        if advertised is not None:
+            if _is_of(advertised, channel, schema):
                 return False
-            self._descriptions.pop(known.id(), None)
-            known.close()
+            self._descriptions.pop(advertised.id(), None)
+            advertised.close()
         self._channels[channel.topic] = Channel(
             channel.topic,
             message_encoding=channel.message_encoding,
-            schema=None if schema is None else _of_sdk(schema),
+            schema=schema and Schema(name=schema.name, encoding=schema.encoding, data=schema.data),
             metadata=dict(channel.metadata),
             context=self.context,
         )
@@ -72,15 +72,11 @@ class Publisher:
             channel.log(last[0], log_time=last[1])
 
 
-def _is_of(known: Channel, channel: records.Channel, schema: records.Schema | None) -> bool:
+def _is_of(advertised: Channel, channel: records.Channel, schema: records.Schema | None) -> bool:
     """Return whether an advertised channel has messages of this type."""
-    theirs = known.schema()
+    theirs = advertised.schema()
     same = (theirs and (theirs.name, theirs.data)) == (schema and (schema.name, schema.data))
-    return same and known.message_encoding == channel.message_encoding
-
-
-def _of_sdk(schema: records.Schema) -> Schema:
-    return Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
+    return same and advertised.message_encoding == channel.message_encoding
 
 
 _WINDOW = 3600 * NANOSECONDS  # logs of this span are read at once
@@ -113,7 +109,11 @@ class RecordedSpan:
         self._passed_over: set[Path] = set()
         self.channels: dict[str, ChannelType] = {}
         for _, _, path in spans:
-            self._add_channels(path)
+            try:
+                for channel, schema in channels_of(path):
+                    self.channels.setdefault(channel.topic, (channel, schema))
+            except LogError as error:
+                damaged(error)
 
     def _span(self, log: Path) -> tuple[int, int] | None:
         try:
@@ -121,13 +121,6 @@ class RecordedSpan:
         except LogError as error:
             self._damaged(error)
             return None
-
-    def _add_channels(self, log: Path) -> None:
-        try:
-            for channel, schema in channels_of(log):
-                self.channels.setdefault(channel.topic, (channel, schema))
-        except LogError as error:
-            self._damaged(error)
 
     def messages(self, start: int) -> Generator[list[RawMessages], None, None]:
         """Read the messages from a moment on; none is older than any yielded before."""
@@ -144,7 +137,7 @@ class RecordedSpan:
         It is the last description of each stream in the logs that contain the moment, and the last
         message of each topic in the second before, with their places.
         """
-        known: dict[str, tuple[RawMessages, int]] = {}
+        latest: dict[str, tuple[RawMessages, int]] = {}
         topics = {
             topic
             for topic, (_, schema) in self.channels.items()
@@ -154,8 +147,8 @@ class RecordedSpan:
         descriptions = self._between(first, moment, topics)
         for batches in (descriptions, self._between(max(moment - _RECENT, 0), moment)):
             for batch in batches:
-                known |= {part.channel.topic: (part, len(part) - 1) for part in batch}
-        return list(known.values())
+                latest |= {part.channel.topic: (part, len(part) - 1) for part in batch}
+        return list(latest.values())
 
     def _between(
         self, start: int, end: int, topics: Collection[str] | None = None
@@ -185,16 +178,16 @@ def _is_sound(log: Path, start: int, end: int) -> bool:
 
 
 _SUBSCRIBE_SECONDS = 0.5  # time for viewers to subscribe to a new topic before its first message
-_HEARD = ("", AUDIO_LAYER)  # layers of current sound; the others are about earlier sound
+_CURRENT = ("", AUDIO_LAYER)  # layers of current sound; the others are about earlier sound
 
 
 def publish_live(folder: Path, publisher: Publisher, stop: Event, damaged: Damaged) -> None:
     """Publish new messages of the logs in a folder; `damaged` gets errors of unreadable logs."""
-    known: set[Path] = set()
+    advertised: set[Path] = set()
     for path, parts in follow_messages(folder, stop=stop, damaged=damaged, infos=True):
-        if log_name(path).layer in _HEARD:
-            if path not in known:
-                known.add(path)
+        if log_name(path).layer in _CURRENT:
+            if path not in advertised:
+                advertised.add(path)
                 if _advertise(path, publisher):
                     stop.wait(_SUBSCRIBE_SECONDS)
             for part, row in in_order_of_time(parts):

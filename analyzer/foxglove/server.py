@@ -104,7 +104,7 @@ def _is_local(origin: str) -> bool:
 
 _HEAD_SECONDS, _CLOSE_SECONDS = 5, 1
 _LARGEST_HEAD = 16384  # bytes: includes the cookies of all servers of this machine
-_MOST_ASKING, _MOST_LOOKING = 32, 8  # maximum connections at once
+_MOST_PENDING, _MOST_VIEWERS = 32, 8  # maximum connections at once
 _BLOCK = 1 << 16  # bytes
 _BUFFER = 1 << 17  # maximum bytes buffered by the system: seconds of sound, not minutes
 _REFUSAL = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
@@ -131,8 +131,8 @@ class Gate:
         self._behind = behind
         self._admission = admission
         self._refused = refused
-        self._asking: dict[Task[None], str] = {}  # pending requests: address, the oldest first
-        self._looking: set[Task[None]] = set()
+        self._pending: dict[Task[None], str] = {}  # requests: address, the oldest first
+        self._viewing: set[Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = Thread(target=self._run, name="gate", daemon=True)
 
@@ -150,7 +150,7 @@ class Gate:
             self._listener.setblocking(False)
             accepting = self._loop.create_task(self._accept())
             self._loop.run_forever()
-            tasks = {accepting, *self._asking, *self._looking}
+            tasks = {accepting, *self._pending, *self._viewing}
             for task in tasks:
                 task.cancel()
             self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
@@ -163,14 +163,14 @@ class Gate:
             except OSError:  # too many files are open, or the client was gone already
                 await asyncio.sleep(1)
                 continue
-            if len(self._asking) >= _MOST_ASKING:
-                oldest = busiest_address(self._asking)[0]
-                del self._asking[oldest]
+            if len(self._pending) >= _MOST_PENDING:
+                oldest = busiest_address(self._pending)[0]
+                del self._pending[oldest]
                 oldest.cancel()
             task = self._loop.create_task(self._take(connection))
-            self._asking[task] = address[0]
-            task.add_done_callback(lambda task: self._asking.pop(task, None))
-            task.add_done_callback(self._looking.discard)
+            self._pending[task] = address[0]
+            task.add_done_callback(lambda task: self._pending.pop(task, None))
+            task.add_done_callback(self._viewing.discard)
 
     async def _take(self, connection: socket.socket) -> None:
         """Serve a connection, from the request to the end."""
@@ -190,12 +190,12 @@ class Gate:
 
     def _admitted(self, head: bytes) -> bytes:
         head = self._admission.check(head)
-        if len(self._looking) >= _MOST_LOOKING:
-            raise RefusedError(f"refused: {_MOST_LOOKING} viewers are looking; close one")
+        if len(self._viewing) >= _MOST_VIEWERS:
+            raise RefusedError(f"refused: {_MOST_VIEWERS} viewers are looking; close one")
         task = asyncio.current_task()
         assert task is not None
-        self._looking.add(task)
-        self._asking.pop(task, None)
+        self._viewing.add(task)
+        self._pending.pop(task, None)
         return head
 
     async def _lead_on(self, head: bytes, reader: StreamReader, writer: StreamWriter) -> None:

@@ -415,7 +415,7 @@ def _in_time(spans: Iterable[LogSpan]) -> list[LogSpan]:
 
 
 def find_spans(
-    paths: Iterable[Path], span_of: SpanOf, start: int | None = None, end: int | None = None
+    paths: Iterable[Path], span_of: SpanOf, start: int | None, end: int | None
 ) -> LogSpans:
     """Find the logs of some folders with their first and last log times.
 
@@ -425,7 +425,7 @@ def find_spans(
     such log, or none in a folder.
     """
     catalogs: list[Catalog] = []
-    unknown: dict[str, Path] = {}
+    opened: dict[str, Path] = {}
     for path in paths:
         catalog = read_catalog(path, _TABLES[:2])
         if catalog is None or catalog.unusable:
@@ -433,8 +433,8 @@ def find_spans(
         else:
             logs = catalog.remove_changed(*_limits(start, end))
             catalogs.append(catalog)
-        unknown |= {str(log.resolve()): log for log in logs}
-    return LogSpans(time_spans(unknown.values(), span_of), catalogs)
+        opened |= {str(log.resolve()): log for log in logs}
+    return LogSpans(time_spans(opened.values(), span_of), catalogs)
 
 
 _HOUR = 3600 * NANOSECONDS // FRAME_NANOSECONDS  # frames

@@ -78,7 +78,10 @@ def read_clips(
     the topic holds no clips, or as `clips_of` does.
     """
     for clip in _clips(path, name, start, end):
-        yield clip.start, clip.rate, _mono(clip)
+        samples = np.frombuffer(clip.data, "<i2").astype(np.float32) / _FULL_SCALE
+        if clip.channels > 1:
+            samples = samples.reshape(-1, clip.channels).mean(axis=1)
+        yield clip.start, clip.rate, samples
 
 
 def _clips(path: Path, name: str, start: int | None, end: int | None) -> Iterator[LoggedClip]:
@@ -156,8 +159,3 @@ def stop_sound() -> None:
         import sounddevice  # noqa: PLC0415  PortAudio may be missing
 
         sounddevice.stop()
-
-
-def _mono(clip: LoggedClip) -> Float32:
-    samples = np.frombuffer(clip.data, "<i2").astype(np.float32) / _FULL_SCALE
-    return samples if clip.channels == 1 else samples.reshape(-1, clip.channels).mean(axis=1)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.layers import find_with_layers, latest_records
+from hearthlog.analyzer.logs.layers import find_with_layers, latest_records, readable_span
 from hearthlog.analyzer.logs.local_time import day_span, local_time
 from hearthlog.analyzer.logs.never_tell import list_of_log, recorded_list
 from hearthlog.analyzer.logs.recorder_info import (
@@ -141,14 +141,8 @@ class HomeLogs:
 
     def end(self) -> int | None:
         """Return the log time of the last readable message in nanoseconds of UTC, if any."""
-        for entry in reversed(self.between()):
-            try:
-                span = time_span(entry.path)
-            except LogError:
-                continue
-            if span is not None:
-                return span[1]
-        return None
+        span = readable_span(entry.path for entry in reversed(self.between()))
+        return None if span is None else span[1]
 
 
 def _dates(first: date, last: date) -> set[date]:
@@ -161,10 +155,7 @@ def _dates(first: date, last: date) -> set[date]:
 
 def _last_time(entry: HomeLog) -> int:
     """Return the time just before the end of a log; its start if it cannot be read."""
-    try:
-        span = time_span(entry.path)
-    except LogError:
-        span = None
+    span = readable_span([entry.path])
     return entry.start if span is None else max(entry.start, min(span[1], entry.end) - 1)
 
 
@@ -177,12 +168,9 @@ def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
     entries = []
     for path in find_with_layers(paths):
         try:
-            entry = _entry(path)
+            entries += _entries(path)
         except LogError as error:
             losses.append(str(error))
-            continue
-        if entry is not None:
-            entries.append(entry)
     return HomeLogs(
         sorted(_closed(entries), key=lambda entry: (entry.start, entry.path.name)), losses
     )
@@ -210,17 +198,17 @@ def check_day(logs: HomeLogs, first: date, last: date, zone: tzinfo) -> None:
     raise DataError(f"no logs of {when} in the home's time zone, {zone}; {there}{loss}")
 
 
-def _entry(path: Path) -> HomeLog | None:
-    """Return the entry of a file, by its name where possible; None for audio or no messages."""
+def _entries(path: Path) -> Iterator[HomeLog]:
+    """Yield the entry of a file, by its name where possible; none for audio or no messages."""
     _, layer, node, time = log_name(path)
     if layer == AUDIO_LAYER:
-        return None
+        return
     try:
         moment = datetime.strptime(time.partition("_")[0], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
-        return HomeLog(path, node, layer, int(moment.timestamp()) * NANOSECONDS, NEVER)
+        yield HomeLog(path, node, layer, int(moment.timestamp()) * NANOSECONDS, NEVER)
     except ValueError:
-        span = time_span(path)
-        return None if span is None else HomeLog(path, "", layer, span[0], span[1] + 1)
+        if (span := time_span(path)) is not None:
+            yield HomeLog(path, "", layer, span[0], span[1] + 1)
 
 
 def _closed(entries: Iterable[HomeLog]) -> Iterator[HomeLog]:

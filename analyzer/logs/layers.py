@@ -163,15 +163,19 @@ def _logs_by_node(root: Path) -> list[list[Path]]:
     for log in (*root.glob("*"), *root.glob(_DAYS)):
         if home_folder(log) == root and is_log(log) and not is_layer(log):
             name = log_name(log)
-            time = name.time or f"{_first_time(log):020}"
+            # Labelling a log that cannot be read will report the error.
+            time = name.time or f"{(readable_span([log]) or (0, 0))[0]:020}"
             nodes.setdefault(name.node, []).append((time, log))
     return [[log for _, log in sorted(logs)] for _, logs in sorted(nodes.items())]
 
 
-def _first_time(log: Path) -> int:
-    with suppress(LogError):  # labelling the log will report the error
-        return (time_span(log) or (0, 0))[0]
-    return 0
+def readable_span(logs: Iterable[Path]) -> tuple[int, int] | None:
+    """Return first and last log time of the first of some logs that has a readable message."""
+    for log in logs:
+        with suppress(LogError):
+            if (span := time_span(log)) is not None:
+                return span
+    return None
 
 
 _KIND = "features"

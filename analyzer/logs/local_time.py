@@ -34,8 +34,7 @@ def _zone(name: str, advice: str) -> tzinfo:
 
 def midnight(day: date, zone: tzinfo) -> int:
     """Return the start of a day, in nanoseconds of UTC."""
-    local = datetime(day.year, day.month, day.day, tzinfo=zone)
-    return int(local.timestamp()) * NANOSECONDS
+    return at_hour(day, 0, zone)
 
 
 def day_span(day: date, zone: tzinfo) -> Span:

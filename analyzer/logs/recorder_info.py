@@ -101,15 +101,20 @@ def read_recorder_infos(path: Path, kind: str) -> list[RecorderInfo]:
     damaged or has invalid values.
     """
     with LogFile(path) as file:
-        if not file.channels:
-            read_chunks(file, file.chunks[:1], topics=())  # a log without an index has it there
-        microphones = sorted(microphones_of(file, kind))
+        microphones = _described_microphones(file, kind)
         if not microphones:
             return []
         attachments = attachments_of(file)
         # A merged log is attributed to the last of its recorders.
         record = next(reversed(read_provenance(file)), {})
         return [_info_of(file, name, kind, record, attachments) for name in microphones]
+
+
+def _described_microphones(file: LogFile, kind: str) -> list[str]:
+    """Return the microphones with a topic of a kind, sorted."""
+    if not file.channels:
+        read_chunks(file, file.chunks[:1], topics=())  # a log without an index has them there
+    return sorted(microphones_of(file, kind))
 
 
 def _info_of(
@@ -179,10 +184,8 @@ def first_embedding_source(path: Path) -> EmbeddingSource | None:
     Raise `LogError` if the log is damaged.
     """
     with LogFile(path) as file:
-        if not file.channels:
-            read_chunks(file, file.chunks[:1], topics=())  # as in `read_recorder_infos`
-        names = (embedding_source(file, name) for name in sorted(microphones_of(file, "features")))
-        return next(filter(None, names), None)
+        names = _described_microphones(file, "features")
+        return next(filter(None, (embedding_source(file, name) for name in names)), None)
 
 
 def attachments_of(file: LogFile) -> list[Attachment]:

@@ -169,10 +169,12 @@ def _summarise(path: Path) -> LogSummary:
     with LogFile(path, partial=True) as file:
         summary = _without_messages(file)
         ours = [has_contents(*channel, is_compatible) for channel in _channels(file)]
+        for channel in _channels(file):
+            _topic(summary, *channel)
         if _is_counted(file) and not any(ours):
             _count_by_index(file, summary)
         else:
-            _add_contents(summary, _stated(file, summary) or _read(file, summary))
+            _add_contents(summary, stated_contents(file) or _read(file, summary))
     return summary
 
 
@@ -229,26 +231,15 @@ def _count_by_index(file: LogFile, summary: LogSummary) -> None:
     assert file.statistics is not None
     counts = file.statistics.channel_message_counts
     for identity, channel in file.channels.items():
-        topic = _topic(summary, channel, file.schemas.get(channel.schema_id))
         chunks = file.with_channels(file.chunks, {identity})
         count = counts.get(identity, 0)
         if count and len(chunks):
-            topic.add(count, None, (int(chunks["start"].min()), int(chunks["end"].max())))
-
-
-def _stated(file: LogFile, summary: LogSummary) -> LogContents | None:
-    """Return the contents that a finished log records about itself."""
-    contents = stated_contents(file)
-    if contents is not None:
-        for channel in _channels(file):
-            _topic(summary, *channel)
-    return contents
+            span = int(chunks["start"].min()), int(chunks["end"].max())
+            summary.topics[channel.topic].add(count, None, span)
 
 
 def _read(file: LogFile, summary: LogSummary) -> LogContents:
     """Read all messages of a log."""
-    for channel in _channels(file):
-        _topic(summary, *channel)
     contents = LogContents()
     damages = Damages()
     for batch in read_in_batches(file, file.chunks, on_damage=damages.add):
@@ -262,9 +253,9 @@ def _read(file: LogFile, summary: LogSummary) -> LogContents:
     return contents
 
 
-def _topic(summary: LogSummary, channel: Channel, schema: Schema | None) -> TopicSummary:
+def _topic(summary: LogSummary, channel: Channel, schema: Schema | None) -> None:
     new = TopicSummary("" if schema is None else schema.name, channel.message_encoding)
-    return summary.topics.setdefault(channel.topic, new)
+    summary.topics.setdefault(channel.topic, new)
 
 
 def _add_contents(summary: LogSummary, contents: LogContents) -> None:

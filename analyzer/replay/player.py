@@ -81,7 +81,7 @@ _MODELS = tuple(name.partition(".")[0] + "." for name in (CARD, DESCRIPTION))
 
 _PACED_FRAMES = 10  # 0.5 s
 _MOST_FRAMES = 4096
-_BESIDE = CANDIDATE, SCENARIO
+_OF_OTHER_MODELS = CANDIDATE, SCENARIO
 _LOST = "the log that was replayed does not have it"
 
 
@@ -213,7 +213,7 @@ class Player:
 
         A class of two models is refused, as by the recorder; names are left to the other model.
         """
-        known = {} if live is None else {LIVE: live}
+        by_labelling = {} if live is None else {LIVE: live}
         by_scenario = {}
         for name, model in self._options.scenarios.items():
             if is_by_names(model):
@@ -224,13 +224,13 @@ class Player:
                     f"{info.path}: is replayed with feature set {features.name}; model "
                     f"{model.name} of scenario {name} is for {theirs}: {models_for(features.name)}"
                 )
-            if reason := class_conflict(model, known):
+            if reason := class_conflict(model, by_labelling):
                 where = f"model {model.name} of scenario {name}"
                 raise LogError(f"{info.path}: cannot be replayed so: {where} {reason}")
-            known[scenario_labelling(name)] = by_scenario[name] = model
+            by_labelling[scenario_labelling(name)] = by_scenario[name] = model
         for name, model in self._options.scenarios.items():
             if is_by_names(model):
-                own = without_classes(model, shared_classes(model, known.values()), features)
+                own = without_classes(model, shared_classes(model, by_labelling.values()), features)
                 if len(own.classes) > 1:
                     by_scenario[name] = own
         return {name: by_scenario[name] for name in self._options.scenarios if name in by_scenario}
@@ -242,7 +242,8 @@ class Player:
             return False
         first = info.first_frame[0]
         follows = first == self._next or (self._after_gap and first > self._next)
-        same = _without(info, "model", *_BESIDE) == _without(self._info, "model", *_BESIDE)
+        models = "model", *_OF_OTHER_MODELS
+        same = _without(info, *models) == _without(self._info, *models)
         return self._next > 0 and follows and same
 
     def _change_model(self, info: RecorderInfo) -> None:
@@ -398,7 +399,7 @@ def _is_new_run(info: RecorderInfo, last: RecorderInfo, next_frame: int) -> bool
     """Return whether a log is of another recorder run than the last one."""
     if info.first_frame is not None and info.first_frame[0] < next_frame:
         return True
-    same = _without(info, *_BESIDE) == _without(last, *_BESIDE)
+    same = _without(info, *_OF_OTHER_MODELS) == _without(last, *_OF_OTHER_MODELS)
     return not same or info.model_sha256 != last.model_sha256
 
 

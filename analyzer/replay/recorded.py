@@ -1,6 +1,6 @@
 """Recorded events of a log, and the comparison of labels and segments with a replay."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
@@ -50,7 +50,7 @@ _LARGEST_VALUE = 1e30  # of a feature: its statistics are still finite
 _PLACE_BITS = 40
 
 _RawByType = dict[str, list[RawMessages]]
-_Known = TypeVar("_Known", Directions, Embeddings)
+_Rows = TypeVar("_Rows", Directions, Embeddings)
 
 
 class Features(NamedTuple):
@@ -64,8 +64,8 @@ class Features(NamedTuple):
     def part(self, frames: slice) -> "Features":
         """Return some of the frames."""
         first, stamps = self.first + (frames.start or 0), self.stamps[frames]
-        known = self.auxiliary.known_at(first, len(stamps))
-        return Features(first, self.values[frames], stamps, known)
+        auxiliary = self.auxiliary.known_at(first, len(stamps))
+        return Features(first, self.values[frames], stamps, auxiliary)
 
 
 class RecordedBatch(NamedTuple):
@@ -129,11 +129,8 @@ def _events(
     ]
     for raw in by_type[message_types.DIAGNOSTICS]:
         others += _health(raw, microphone)
-    raws = [
-        *by_type[message_types.FEATURES],
-        *by_type[message_types.GAP],
-        *by_type[message_types.DIAGNOSTICS],
-    ]
+    kinds = message_types.FEATURES, message_types.GAP, message_types.DIAGNOSTICS
+    raws = [raw for kind in kinds for raw in by_type[kind]]
     if not raws:
         return []
     times = np.concatenate([raw.log_times for raw in raws])
@@ -143,8 +140,8 @@ def _events(
         path: np.concatenate([fields[path] for fields in features])
         for path in (features[0] if features else ())
     }
-    directions = [_directions(raw) for raw in by_type[message_types.DIRECTION]]
-    embeddings = [_embeddings(raw) for raw in by_type[message_types.EMBEDDING]]
+    directions = _timed(by_type[message_types.DIRECTION], DIRECTION_FIELDS, directions_of)
+    embeddings = _timed(by_type[message_types.EMBEDDING], EMBEDDING_FIELDS, embeddings_of)
     count = len(times) - len(others)
     events: list[Features | Gap | SourceHealth] = []
     begin = 0
@@ -152,7 +149,7 @@ def _events(
         if position > begin:
             for run in _runs(frames, order[begin:position]):
                 here = Auxiliary(
-                    _known(run, directions, NOWHERE), _known(run, embeddings, NO_EMBEDDINGS)
+                    _rows_at(run, directions, NOWHERE), _rows_at(run, embeddings, NO_EMBEDDINGS)
                 )
                 events.append(run._replace(auxiliary=here))
         if position < len(order) and (event := others[order[position] - count]) is not None:
@@ -182,31 +179,28 @@ def _features(raw: RawMessages, width: int) -> Fields:
     return columns.fields | {"frame": numbers.astype(np.int64)}
 
 
-def _directions(raw: RawMessages) -> tuple[Int64, Directions]:
-    """Return directions, and their log times."""
-    (columns,) = decode([raw], _FIELDS[message_types.DIRECTION])
-    return columns.log_times, directions_of(columns)
+def _timed(
+    same: Iterable[RawMessages], fields: Sequence[str], convert: Callable[[Columns], _Rows]
+) -> list[tuple[Int64, _Rows]]:
+    """Return auxiliary data with their log times."""
+    return [
+        (columns.log_times, convert(columns)) for raw in same for columns in decode([raw], fields)
+    ]
 
 
-def _embeddings(raw: RawMessages) -> tuple[Int64, Embeddings]:
-    """Return embeddings, and their log times."""
-    (columns,) = decode([raw], _FIELDS[message_types.EMBEDDING])
-    return columns.log_times, embeddings_of(columns)
-
-
-def _known(run: Features, read: Sequence[tuple[Int64, _Known]], nothing: _Known) -> _Known:
+def _rows_at(run: Features, read: Sequence[tuple[Int64, _Rows]], nothing: _Rows) -> _Rows:
     """Return the auxiliary data logged with some frames; the rest belongs to other sound.
 
     Frames of another recorder run may have the same numbers, but not the same times.
     """
-    known = nothing
+    found = nothing
     for times, rows in read:
         places = rows.last_frames - run.first
         inside = np.flatnonzero((places >= 0) & (places < len(run.stamps)))
         same = inside[run.stamps[places[inside]] == times[inside]]
-        known = known.followed_by(rows.rows(same))
-    _, once = np.unique(known.frames, return_index=True)
-    return known.rows(once)
+        found = found.followed_by(rows.rows(same))
+    _, once = np.unique(found.frames, return_index=True)
+    return found.rows(once)
 
 
 def _gaps(raw: RawMessages) -> list[Gap]:
