@@ -320,14 +320,14 @@ _DAY = 1440 * MINUTE
 _MOST = 7  # days: more would cost time and hardly change the share
 
 
-def quiet_weight(logs: HomeLogs, labelling: str, checked: Bool) -> float:
+def quiet_weight(logs: HomeLogs, checked: Bool) -> float:
     """Return the number of quiet minutes per checked one, relative to minutes with sound.
 
     `checked` [shape=(n,)] says whether anything sounds in each checked minute. This is the weight
     of Horvitz and Thompson, over the last seven days with checked minutes; 1 if only one kind of
     minutes was checked, or exists.
     """
-    kinds = [sounding for day in _days(logs, labelling) for sounding in _sounding(logs, *day)]
+    kinds = [sounding for day in _days(logs) for sounding in _sounding(logs, *day)]
     sounding = np.concatenate([*kinds, np.empty(0, bool)])
     loud, quiet = int(sounding.sum()), int((~sounding).sum())
     checked_loud, checked_quiet = int(checked.sum()), int((~checked).sum())
@@ -336,25 +336,24 @@ def quiet_weight(logs: HomeLogs, labelling: str, checked: Bool) -> float:
     return (quiet / checked_quiet) / (loud / checked_loud)
 
 
-def _days(logs: HomeLogs, labelling: str) -> list[tuple[int, str, str]]:
+def _days(logs: HomeLogs) -> list[tuple[int, str]]:
     days = set()
     for layer in logs.between(layer=REVIEW_LAYER):
         try:
             spans = read_reviewed(log_of_layer(layer.path))
         except LogError:
             continue  # the reader of the minutes reports this
-        own = (s for s in spans if s.chosen == RANDOM and s.corrects == labelling)
-        days |= {(span.start // _DAY * _DAY, span.microphone, labelling) for span in own}
+        own = (span for span in spans if span.chosen == RANDOM and span.corrects == LIVE)
+        days |= {(span.start // _DAY * _DAY, span.microphone) for span in own}
     return sorted(days)[-_MOST:]
 
 
-def _sounding(logs: HomeLogs, start: int, microphone: str, labelling: str) -> Iterator[Bool]:
+def _sounding(logs: HomeLogs, start: int, microphone: str) -> Iterator[Bool]:
     """Return which minutes of a day have sound; unlabelled minutes are dropped."""
     paths = [entry.path for entry in logs.between(start, start + _DAY) if entry.path.exists()]
-    name = labelling if labelling == LIVE else relabelling(labelling)
     edges = start + np.arange(0, _DAY + 1, MINUTE)
     try:
-        labels = find_labellings(*paths).read(microphone, name, start, start + _DAY).labelling
+        labels = find_labellings(*paths).read(microphone, LIVE, start, start + _DAY).labelling
     except (DataError, LogError):
         return
     labelled = lengths(labels.spans(), edges) > 0

@@ -68,11 +68,6 @@ def _around(amounts: Int64) -> Int64:
     return np.convolve(amounts, np.ones(2 * AROUND + 1, np.int64))[AROUND : AROUND + len(amounts)]
 
 
-def events_by_minute(events: Spans, edges: Int64) -> Int64:
-    """Count the events that start in each of the minutes between n + 1 edges."""
-    return np.diff(np.searchsorted(events.starts, edges))
-
-
 def overlapping(events: Spans, others: Spans) -> Bool:
     """Return which events overlap one of others."""
     after = np.searchsorted(others.ends, events.starts, side="right")

@@ -116,7 +116,7 @@ class Bridge:
                 early += begun
                 columns += (part for part in read if part.type != message_types.LABEL)
                 if state.caught_up:
-                    self._tell(state, list(early), columns, is_first=not had_caught_up)
+                    self._update_outputs(state, list(early), columns, is_first=not had_caught_up)
                     early.clear()
                     columns = []
                 had_caught_up = state.caught_up
@@ -131,7 +131,7 @@ class Bridge:
             self._watchdog_due = time.monotonic() + _WATCHDOG_SECONDS
             notify(["WATCHDOG=1"])
 
-    def _tell(
+    def _update_outputs(
         self,
         state: HomeState,
         begun: Sequence[SoundEvent],

@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
@@ -147,10 +147,6 @@ class LiveMicrophone:
     def labels(self) -> list[str]:
         """Return the classes with recorded events that outputs show."""
         return [label for label in self._records if label not in self.never_tell]
-
-    def shown_names(self, labels: Iterable[str]) -> list[str]:
-        """Return the names that people are shown for some labels, each once."""
-        return list(dict.fromkeys(self.common_names.get(label, label) for label in labels))
 
     def _named_events(self, name: str, since: int, names: Mapping[str, str]) -> list[SoundEvent]:
         """Return the events of the classes that share a name."""
@@ -599,22 +595,16 @@ def _labelling_sources(log: Path) -> set[str] | None:
 
 
 def _decode(batch: list[RawMessages]) -> list[Columns]:
+    """Decode the messages of the types of `FIELDS`, without old ones that have no effect."""
     latest = [
         raw
         if raw.schema is None or raw.schema.name in _EVERY or not len(raw)
         else raw.between(int(np.max(raw.log_times)) - _LATEST, None)
         for raw in batch
     ]
-    return decode_fields(latest, FIELDS)
-
-
-def decode_fields(
-    batch: Sequence[RawMessages], fields: Mapping[str, Sequence[str]]
-) -> list[Columns]:
-    """Decode the given fields, by type, of the messages of these types."""
     return [
         columns
-        for raw in batch
-        if raw.schema is not None and raw.schema.name in fields and len(raw)
-        for columns in decode([raw], fields[raw.schema.name])
+        for raw in latest
+        if raw.schema is not None and raw.schema.name in FIELDS and len(raw)
+        for columns in decode([raw], FIELDS[raw.schema.name])
     ]

@@ -158,8 +158,9 @@ class _Bag:
         built_on: dict[str, tuple[str, str]] = {}
         types.gendefhash(name, built_on)
         own = {
-            each: (types.fielddefs[each][0], _without_bounds(types.fielddefs[each][1]))
+            each: (constants, [(field, _unbounded(*described)) for field, described in fields])
             for each in (name, *built_on)
+            for constants, fields in [types.fielddefs[each]]
         }
         if _HEADER in own:
             own[_HEADER] = get_typestore(Stores.ROS1_NOETIC).fielddefs[_HEADER]
@@ -225,12 +226,8 @@ def _readable(raw: RawMessages) -> RawMessages:
     )
 
 
-def _without_bounds(fields: Sequence[Any]) -> list[Any]:
-    """Remove bounds of texts and sequences, which ROS 1 lacks."""
-    return [(name, _unbounded(*described)) for name, described in fields]
-
-
 def _unbounded(node: Nodetype, details: Any) -> tuple[Nodetype, Any]:
+    """Remove bounds of texts and sequences, which ROS 1 lacks."""
     if node == Nodetype.BASE and details[0] == "wstring":
         raise LogError("ROS 1 has no wstring")
     if node == Nodetype.BASE:
@@ -285,7 +282,7 @@ def _save_rosbag2(selection: LogSelection, files: OutputFiles, progress: Progres
     assert record is not None  # each topic has one description
     information = record["serialized_metadata"]  # JSON, which is valid YAML
     text = f"rosbag2_bagfile_information: {information}\n"
-    (files.path / "metadata.yaml").write_text(text, "utf-8")
+    (files.path / METADATA).write_text(text, "utf-8")
     return repeated
 
 

@@ -253,7 +253,7 @@ class Accuracy:
         self.losses: list[str] = []
         reviewed = list(read_reviewed_labels(logs, LIVE, 0, _EVER, self.losses))
         self.minutes: CheckedMinutes = checked_minutes(reviewed)
-        self.weight = quiet_weight(logs, LIVE, self.minutes.sounding)
+        self.weight = quiet_weight(logs, self.minutes.sounding)
         self.right, self.looked_at = count_unchanged(reviewed)
 
     def lines(self) -> Iterator[str]:

@@ -522,7 +522,8 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
     if "television" in text:
         day = truth.metrics
     minutes = day.home.minutes.between(span)
-    known = home.microphones[0].shown_names(home.microphones[0].names)
+    common = home.microphones[0].common_names
+    known = list(dict.fromkeys(common.get(label, label) for label in home.microphones[0].names))
     names = [n for n in known if n not in _NO_SOUNDS and _mentions(text, n)]
     if match := re.search(r"[Nn]o ([^.:(]*)\.$", text):
         for name in (n for n in names if _mentions(match[1], n)):
@@ -563,7 +564,8 @@ def _sureness(home: HomeDay, truth: TrueDay, measured: Sureness) -> Iterator[Sta
     found: defaultdict[str, list[bool]] = defaultdict(list)
     for bout in bouts(events):
         words = re.sub(r" *\(.*", "", shown.describe(bout)["sure"])
-        (name,) = home.microphones[0].shown_names([bout.first.label])
+        label = bout.first.label
+        name = home.microphones[0].common_names.get(label, label)
         spans = truth.everywhere.home.spans.get(name, NONE)
         found[words].append(any(cut(spans, e.start, e.end).length for e in bout.events))
     for words, right in found.items():

@@ -54,11 +54,7 @@ class Outbox:
     """
 
     def __init__(
-        self,
-        state: BridgeState,
-        targets: Sequence[str],
-        report: Report,
-        most: int = MOST,
+        self, state: BridgeState, targets: Sequence[str], report: Report, most: int = MOST
     ) -> None:
         self._state = state
         self._targets = frozenset(targets)
@@ -307,6 +303,7 @@ def _text(data: bytes) -> str:
 
 
 _LOOK_SECONDS = 0.5
+_LONGEST_PAUSE = 900.0  # seconds
 _CLOSE_SECONDS = 2.0
 _LATE = 5 * 60 * NANOSECONDS
 
@@ -314,8 +311,7 @@ _LATE = 5 * 60 * NANOSECONDS
 class Delivery:
     """Delivers queued notifications, with one thread per target.
 
-    After a failure it waits for the first pause, in seconds, doubled after each further one, up to
-    the longest.
+    After a failure it waits for the first pause, in seconds, doubled after each further one.
     """
 
     def __init__(  # noqa: PLR0913
@@ -327,13 +323,12 @@ class Delivery:
         report: Report,
         *,
         first_pause: float = 5.0,
-        longest_pause: float = 900.0,
     ) -> None:
         self._outbox = outbox
         self._node = node
         self._zone = zone
         self._report = report
-        self._pauses = first_pause, longest_pause
+        self._first_pause = first_pause
         self._threads: dict[str, tuple[Thread, Flag]] = {}  # by name of the target
         self.set_targets(targets)
 
@@ -360,15 +355,14 @@ class Delivery:
             thread.join(max(until - time.monotonic(), 0.0))
 
     def _run(self, target: Target, stop: Flag) -> None:
-        first, longest = self._pauses
-        pause = first
+        pause = self._first_pause
         while not stop.wait(_LOOK_SECONDS):
             delivered, failed = self._deliver(target, stop)
             if delivered:
-                pause = first
+                pause = self._first_pause
             if failed:
                 stop.wait(pause)
-                pause = min(2 * pause, longest)
+                pause = min(2 * pause, _LONGEST_PAUSE)
 
     def _deliver(self, target: Target, stop: Flag) -> tuple[int, bool]:
         """Deliver all due notifications to a target; return their number and whether one failed."""

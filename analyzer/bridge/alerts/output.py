@@ -229,7 +229,7 @@ class AlertsOutput:
         self._columns += news.columns
         self._has_news.set()
         if self._on_notification is not None:
-            while self._publish_ring(self._on_notification):
+            while self._offer(self._on_notification):
                 pass
 
     def close(self) -> None:
@@ -238,7 +238,7 @@ class AlertsOutput:
         self._thread.join(_CLOSE_SECONDS)
         self._delivery.close()
 
-    def _publish_ring(self, on_notification: OnNotification) -> bool:
+    def _offer(self, on_notification: OnNotification) -> bool:
         """Offer one notification to the broker, repeatedly; return whether it was taken."""
         if self._in_delivery is None:
             waiting = self._outbox.waiting_for(BROKER, time.time_ns())

@@ -33,7 +33,7 @@ _ONLINE = {True: "online", False: "offline"}
 _ON = {True: "ON", False: "OFF"}
 _LONGEST = 200  # characters
 _BORN = b"online"  # birth message of Home Assistant
-_MOST_ASKED = 20  # waiting commands
+_MOST_WAITING = 20  # waiting commands
 _MOST_OFF = 1000  # muted classes read back from the broker
 _MOST_BEGUN = 1000
 _LARGEST_FOUND = 1 << 20  # bytes of a discovery payload that is read back
@@ -47,11 +47,7 @@ class MqttPublisher:
     """
 
     def __init__(
-        self,
-        settings: MqttSettings,
-        home: RecorderAddress,
-        state: BridgeState,
-        report: Report,
+        self, settings: MqttSettings, home: RecorderAddress, state: BridgeState, report: Report
     ) -> None:
         self._settings = settings
         self._home = home
@@ -66,8 +62,8 @@ class MqttPublisher:
         self._birth_topic = f"{settings.discovery_topic}/status"
         self._command_topic = topics.at("command")
         subscriptions = [self._birth_topic] if settings.home_assistant else []
-        self._received: deque[bytes] = deque(maxlen=_MOST_ASKED)
-        self._answers: deque[Answer] = deque(maxlen=_MOST_ASKED)
+        self._received: deque[bytes] = deque(maxlen=_MOST_WAITING)
+        self._answers: deque[Answer] = deque(maxlen=_MOST_WAITING)
         self._report = report
         self._announced = RetainedTopics(state, report)
         self._forgotten: set[str] = set()  # topics being cleared at the broker
