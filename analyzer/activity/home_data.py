@@ -1,6 +1,6 @@
 """Log data of a home for a report: reviewed segments, gaps, troubles, and scenario minutes."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -103,10 +103,9 @@ def read_home(
         home.labelled[source] = home.segments[source] = _labelling(home, parts[source])
     marks, reviewed = _reviews(home, logs.between(since, close[1], REVIEW_LAYER), labelling)
     for source in marks.keys() | reviewed.keys():
-        own = marks.get(source, [])
         labels = home.labelled.setdefault(source, labelling_of_marks([]))
-        home.segments[source] = overlaid(labels, labelling_of_marks(own))
-        through: list[Mark | ReviewedSpan] = [*own, *reviewed.get(source, [])]
+        home.segments[source] = overlaid(labels, labelling_of_marks(marks[source]))
+        through: list[Mark | ReviewedSpan] = [*marks[source], *reviewed[source]]
         starts, ends = np.array([(span.start, span.end) for span in through]).T
         home.gone_through[source] = joined(starts, ends)
     _check(home, logs, labelling, close)
@@ -227,17 +226,17 @@ def _as_classes(home: HomeData, topic: str, labels: Labelling) -> Labelling:
 def _reviews(
     home: HomeData, layers: Iterable[HomeLog], labelling: str
 ) -> tuple[dict[Source, list[Mark]], dict[Source, list[ReviewedSpan]]]:
-    """Read marks and reviewed spans of a labelling."""
-    marks: dict[Source, list[Mark]] = {}
-    reviewed: dict[Source, list[ReviewedSpan]] = {}
+    """Read marks and reviewed spans of a labelling; sources without any have empty lists."""
+    marks: defaultdict[Source, list[Mark]] = defaultdict(list)
+    reviewed: defaultdict[Source, list[ReviewedSpan]] = defaultdict(list)
     for entry in layers:
         try:
             log = log_of_layer(entry.path)
             for mark in read_marks(log):
-                marks.setdefault((entry.node, mark.microphone), []).append(mark)
+                marks[entry.node, mark.microphone].append(mark)
             for span in read_reviewed(log):
                 if span.corrects == labelling:
-                    reviewed.setdefault((entry.node, span.microphone), []).append(span)
+                    reviewed[entry.node, span.microphone].append(span)
         except LogError as error:
             home.lose(str(error))
     return marks, reviewed

@@ -2,7 +2,7 @@
 
 import stat
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -168,7 +168,7 @@ class ProblemReporter:
 
     def __init__(self, report: Report) -> None:
         self._report = report
-        self._reported: OrderedDict[str, float] = OrderedDict()
+        self._reported: dict[str, float] = {}  # the oldest first
         self._lock = Lock()
 
     def __call__(self, text: object) -> None:
@@ -177,10 +177,10 @@ class ProblemReporter:
         with self._lock:
             if now - self._reported.get(line, -_REPEAT_SECONDS) < _REPEAT_SECONDS:
                 return
+            self._reported.pop(line, None)  # so that it becomes the newest
             self._reported[line] = now
-            self._reported.move_to_end(line)
             if len(self._reported) > _MOST_TEXTS:
-                self._reported.popitem(last=False)
+                del self._reported[next(iter(self._reported))]
         with suppress(OSError, ValueError):  # a full disk, or a closed stream
             self._report(line)
 

@@ -266,9 +266,9 @@ class LiveMicrophone:
                 for name, own in found.items()
             }
             self._counts = key, counts
-        known = self.known_of(today)
+        enough = self.known_of(today)
         return {
-            name: (day if day or known.day else None, night if night or known.night else None)
+            name: (day if day or enough.day else None, night if night or enough.night else None)
             for name, (day, night) in self._counts[1].items()
         }
 

@@ -1,6 +1,5 @@
 """Writer of a catalogue: workers take inventories of new and changed logs."""
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field, replace
@@ -23,7 +22,7 @@ from hearthlog.analyzer.logs.catalog import (
 from hearthlog.analyzer.logs.labelling import MOST_CLASSES
 from hearthlog.analyzer.logs.locations import ListedLog, list_logs, size_and_time
 from hearthlog.analyzer.logs.selection import decode_types, is_compatible
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NONE, Spans, joined
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NONE, Spans, union
 from hearthlog.analyzer.workers.workers import InlineWorkers, Workers
 from hearthlog.schemas.errors import HearthlogError, LogError, Progress, ignore_progress
 from hearthlog.schemas.files import map_logs
@@ -58,6 +57,15 @@ _MOST_EVENTS = 1_000_000  # of a class in a log; a day has 8,640 at most, ten se
 
 
 @dataclass
+class LabelInventory:
+    """Segments and events of one label."""
+
+    segments: int = 0
+    seconds: float = 0.0
+    events: Spans = NONE  # of all microphones
+
+
+@dataclass
 class LogInventory:
     """Contents of a log."""
 
@@ -74,9 +82,7 @@ class LogInventory:
     gaps: int = 0
     gap_seconds: float = 0.0
     # by scenario (empty for the sounds of the home) and by label
-    seconds: dict[str, Counter[str]] = field(default_factory=dict)
-    segments: dict[str, Counter[str]] = field(default_factory=dict)  # number of segments
-    events: dict[str, dict[str, Spans]] = field(default_factory=dict)  # of all microphones
+    labels: dict[str, dict[str, LabelInventory]] = field(default_factory=dict)
 
 
 def read_contents(path: Path, labelling: str) -> LogInventory:
@@ -156,17 +162,12 @@ class _Reading:
         elif columns.type == message_types.GAP:
             self._contents.gaps += len(columns)
             self._contents.gap_seconds += float(columns["duration"].sum(dtype=float)) / NANOSECONDS
-        elif (scenario := self._scenario(columns.topic)) is not None:
-            self._note_segments(columns, scenario)
-
-    def _scenario(self, name: str) -> str | None:
-        """Return the scenario of a segment topic; None if its segments do not count."""
-        topic = parse_topic(name)
-        if topic is None or topic.kind != "segment":
-            return None
-        root = topic.labelling.partition("/")[0]
-        is_own = (LIVE if root == SCENARIO else root) == self._labelling
-        return scenario_name(topic.labelling) if is_own else None
+        else:
+            topic = parse_topic(columns.topic)
+            root = "" if topic is None else topic.labelling.partition("/")[0]
+            is_own = (LIVE if root == SCENARIO else root) == self._labelling
+            if topic is not None and topic.kind == "segment" and is_own:
+                self._note_segments(columns, scenario_name(topic.labelling))
 
     def _note_features(self, columns: Columns) -> None:
         ends = columns.take(np.array([0, len(columns) - 1]))
@@ -177,33 +178,24 @@ class _Reading:
         self._contents.frames += len(columns)
 
     def _note_segments(self, columns: Columns, scenario: str) -> None:
-        amounts = self._contents.segments, self._contents.seconds
-        counts, lengths = (amount.setdefault(scenario, Counter()) for amount in amounts)
+        labelled = self._contents.labels.setdefault(scenario, {})
+        starts, ends = columns["header.stamp"], columns["header.stamp"] + columns["duration"]
         labels, numbers = np.unique(columns["label"], return_inverse=True)
-        seconds = np.bincount(numbers, columns["duration"] / NANOSECONDS)
-        for label, count, length in zip(
-            labels.tolist(), np.bincount(numbers).tolist(), seconds.tolist(), strict=True
-        ):
-            counts[label[:_LONGEST]] += count
-            lengths[label[:_LONGEST]] += length
-        events = self._contents.events.setdefault(scenario, {})
-        ends = columns["header.stamp"] + columns["duration"]
+        seconds = np.bincount(numbers, columns["duration"] / NANOSECONDS).tolist()
         for number, label in enumerate(labels.tolist()):
-            own = numbers == number
-            before = events.get(label[:_LONGEST], NONE)
-            events[label[:_LONGEST]] = joined(
-                np.append(before.starts, columns["header.stamp"][own]),
-                np.append(before.ends, ends[own]),
-                EVENT_PAUSE,
-            )
-        if len(amounts[0]) > MOST_CLASSES:
+            rows = numbers == number
+            own = labelled.setdefault(label[:_LONGEST], LabelInventory())
+            own.segments += int(rows.sum())
+            own.seconds += seconds[number]
+            own.events = union(own.events, Spans(starts[rows], ends[rows]), pause=EVENT_PAUSE)
+        if len(self._contents.labels) > MOST_CLASSES:
             raise LogError(f"{self._file.path}: has more than {MOST_CLASSES} scenarios")
-        if any(len(one.starts) > _MOST_EVENTS for one in events.values()):
+        if any(len(own.events.starts) > _MOST_EVENTS for own in labelled.values()):
             raise LogError(
                 f"{self._file.path}: has more than {_MOST_EVENTS} events of a label; no recorder "
                 "writes so many"
             )
-        if len(counts) > MOST_CLASSES:
+        if len(labelled) > MOST_CLASSES:
             raise LogError(
                 f"{self._file.path}: has more than {MOST_CLASSES} different labels; "
                 "no classifier has so many"
@@ -269,18 +261,22 @@ def _filled(row: CatalogRow, contents: LogInventory) -> CatalogRow:
         labels=list(_labels(contents, "")),
         scenarios=[
             {"scenario": scenario, "model": _model(record, scenario), **labelled}
-            for scenario in sorted(contents.segments.keys() - {""})
+            for scenario in sorted(contents.labels.keys() - {""})
             for labelled in _labels(contents, scenario)
         ],
     )
 
 
 def _labels(contents: LogInventory, scenario: str) -> Iterator[dict[str, Any]]:
-    for label, count in sorted(contents.segments.get(scenario, {}).items()):
-        minutes = contents.seconds[scenario][label] / 60
-        starts, ends = contents.events[scenario][label]
-        own = {"label": label, "minutes": minutes, "segments": count, "events": len(starts)}
-        yield own | {"first": int(starts[0]), "last": int(ends[-1])}
+    for label, own in sorted(contents.labels.get(scenario, {}).items()):
+        yield {
+            "label": label,
+            "minutes": own.seconds / 60,
+            "segments": own.segments,
+            "events": len(own.events.starts),
+            "first": int(own.events.starts[0]),
+            "last": int(own.events.ends[-1]),
+        }
 
 
 def _model(record: Mapping[str, str], scenario: str) -> str:
