@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date, timedelta, tzinfo
+from datetime import date, tzinfo
 from functools import reduce
 from itertools import chain
 from typing import TypeVar
@@ -24,17 +24,8 @@ from hearthlog.analyzer.activity.event_counts import (
 from hearthlog.analyzer.activity.home_data import HomeData
 from hearthlog.analyzer.activity.values import Clock, Count, Duration, exactly
 from hearthlog.analyzer.logs.labelling import Labelling, in_order
-from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
-from hearthlog.analyzer.logs.spans import (
-    NONE,
-    Spans,
-    common,
-    cut,
-    lengths,
-    one,
-    rows_at,
-    without,
-)
+from hearthlog.analyzer.logs.local_time import at_hour, awake_span, day_span, local_time, night_span
+from hearthlog.analyzer.logs.spans import NONE, Spans, common, cut, lengths, one, rows_at, without
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, ordered
 from hearthlog.schemas.arrays import Bool, Int64
 
@@ -323,7 +314,7 @@ class DayMetrics:
     @property
     def quiet(self) -> Duration | None:
         """Length of `longest_quiet`; None if less than half of its search window is covered."""
-        waking = one(at_hour(self.day, MORNING, self.zone), at_hour(self.day, EVENING, self.zone))
+        waking = one(*awake_span(self.day, self.zone))
         return _length(self.longest_quiet) if self._share_of(waking) >= _HALF else None
 
     @property
@@ -368,8 +359,7 @@ def day_of(home: HomeMetrics, day: date, zone: tzinfo, now: int | None = None) -
     it that is not in the logs yet. By default the day is over.
     """
     start, end = day_span(day, zone)
-    night = one(at_hour(day - timedelta(days=1), EVENING, zone), at_hour(day, MORNING, zone))
-    span = one(start, end)
+    span, night = one(start, end), one(*night_span(day, zone))
     near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
     coverage = common(near.coverage, span)
     over = span

@@ -14,7 +14,7 @@ from hearthlog.analyzer.activity.event_counts import (
     television_minutes,
 )
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
+from hearthlog.analyzer.logs.local_time import at_hour, awake_span, local_time, night_span
 from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
     NONE,
@@ -47,8 +47,7 @@ _QUIET_PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
 
 def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spans:
     """Find the longest quiet span from 07:00 to 22:00; empty without any sound in that time."""
-    waking = one(at_hour(day, MORNING, zone), at_hour(day, EVENING, zone))
-    quiet = without(common(coverage, waking), sound)
+    quiet = without(cut(coverage, *awake_span(day, zone)), sound)
     if not len(quiet.starts):
         return NONE
     longest = int((quiet.ends - quiet.starts).argmax())
@@ -174,10 +173,8 @@ class Profiles:
 
     def _part(self, figure: DayFigure, day: date) -> tuple[int, int]:
         if not figure.night:
-            return at_hour(day, MORNING, self._zone), at_hour(day, EVENING, self._zone)
-        ends = day + self._night_ends
-        begins = at_hour(ends - _ONE, EVENING, self._zone)
-        return begins, at_hour(ends, MORNING, self._zone)
+            return awake_span(day, self._zone)
+        return night_span(day + self._night_ends, self._zone)
 
     def _busy(self, day: date, *, last: bool) -> float:
         """Return the start of the first busy half hour, or the end of the last, if recorded."""
@@ -195,7 +192,7 @@ class Profiles:
 
     def _clock(self, time: int, day: date) -> float:
         """Return the clock time in minutes since the midnight of a day."""
-        local = datetime.fromtimestamp(time // NANOSECONDS, self._zone)
+        local = local_time(time, self._zone)
         return 60.0 * local.hour + local.minute + 1440.0 * (local.date() - day).days
 
 

@@ -9,11 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.activity.events import ANY_SOUND
-from hearthlog.analyzer.activity.sources import (
-    is_of_scenario,
-    labelling_source,
-    source_microphone,
-)
+from hearthlog.analyzer.activity.sources import is_of_scenario, labelling_source, source_microphone
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.layers import readable_span
 from hearthlog.analyzer.logs.selection import array_names, select

@@ -91,18 +91,21 @@ def exactly(number: int) -> Count:
 
 
 @dataclass(frozen=True)
-class Duration(_Quantity):
-    """A duration."""
-
+class _Minutes(_Quantity):
     minutes: float = 0.0
-
-    def __add__(self, other: Self) -> "Duration":
-        return Duration(self.minutes + other.minutes)
 
     @property
     def middle(self) -> float:
         """Minutes."""
         return self.minutes
+
+
+@dataclass(frozen=True)
+class Duration(_Minutes):
+    """A duration."""
+
+    def __add__(self, other: Self) -> "Duration":
+        return Duration(self.minutes + other.minutes)
 
     @staticmethod
     def show(number: float) -> str:
@@ -114,15 +117,8 @@ class Duration(_Quantity):
 
 
 @dataclass(frozen=True)
-class Clock(_Quantity):
+class Clock(_Minutes):
     """A time of day, in minutes since midnight."""
-
-    minutes: float
-
-    @property
-    def middle(self) -> float:
-        """Minutes since midnight."""
-        return self.minutes
 
     @staticmethod
     def show(number: float) -> str:

@@ -12,12 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.activity.event_counts import (
-    AROUND,
-    MINUTE,
-    SET_APART,
-    television_minutes,
-)
+from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE, SET_APART, television_minutes
 from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, SoundEvent
 from hearthlog.analyzer.activity.segments import GrowingSpans
 from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, source_of_topic

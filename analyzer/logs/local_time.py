@@ -56,6 +56,16 @@ def local_time(nanoseconds: int, zone: tzinfo) -> datetime:
     return datetime.fromtimestamp(nanoseconds // NANOSECONDS, UTC).astimezone(zone)
 
 
+def awake_span(day: date, zone: tzinfo) -> Span:
+    """Return 07:00 and 22:00 of a day, in nanoseconds of UTC."""
+    return at_hour(day, MORNING, zone), at_hour(day, EVENING, zone)
+
+
+def night_span(day: date, zone: tzinfo) -> Span:
+    """Return start and end of the night that ends on a day, in nanoseconds of UTC."""
+    return evening_before(day, zone), at_hour(day, MORNING, zone)
+
+
 def evening_before(day: date, zone: tzinfo) -> int:
     """Return the start of the night that ends on a day, in nanoseconds of UTC."""
     return at_hour(day - timedelta(days=1), EVENING, zone)
@@ -73,9 +83,8 @@ class Today(NamedTuple):
 def today(now: int, zone: tzinfo) -> Today:
     """Return the local day and the last night at a time, in nanoseconds of UTC."""
     day = local_time(now, zone).date()
-    last = day if at_hour(day, EVENING, zone) <= now else day - timedelta(days=1)
-    night = at_hour(last, EVENING, zone), at_hour(last + timedelta(days=1), MORNING, zone)
-    return Today(now, midnight(day, zone), *night)
+    ends = day + timedelta(days=at_hour(day, EVENING, zone) <= now)
+    return Today(now, midnight(day, zone), *night_span(ends, zone))
 
 
 def iso_time(nanoseconds: int, zone: tzinfo) -> str:

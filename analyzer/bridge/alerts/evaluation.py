@@ -44,7 +44,7 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     pause_of,
 )
 from hearthlog.analyzer.logs.labelling import Labelling, in_order
-from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
+from hearthlog.analyzer.logs.local_time import day_span, local_time, night_span
 from hearthlog.analyzer.logs.spans import (
     Spans,
     Timed,
@@ -354,10 +354,9 @@ def judged_days(rule: DailyRule, start: int, end: int, zone: tzinfo) -> list[tup
 
 
 def _part(rule: UnlikeUsual, day: date, zone: tzinfo) -> tuple[int, int]:
-    before = day - timedelta(days=1)
     if rule.part == "day":
-        return day_span(before, zone)
-    return at_hour(before, EVENING, zone), at_hour(day, MORNING, zone)
+        return day_span(day - timedelta(days=1), zone)
+    return night_span(day, zone)
 
 
 def _is_unlike(rule: UnlikeUsual, value: float, baseline: UsualRange) -> bool:
