@@ -1,6 +1,7 @@
 """Events of a home in a time span: what a report counts, one by one."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import date, tzinfo
 from functools import reduce
 from itertools import chain
@@ -11,6 +12,7 @@ import numpy as np
 from hearthlog.analyzer.activity.daily_metrics import HomeMetrics, whole_home
 from hearthlog.analyzer.activity.home_data import HomeData, read_home
 from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.labelling import in_order
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
@@ -18,7 +20,6 @@ from hearthlog.analyzer.logs.spans import (
     Spans,
     common,
     first_of_groups,
-    joined,
     lengths,
     rows_at,
 )
@@ -102,28 +103,23 @@ def home_events(
 def _events_of(
     data: HomeData, metrics: HomeMetrics, name: str, start: int, end: int
 ) -> Iterator[HomeEvent]:
-    sources = list(data.segments)
-    parts = [np.flatnonzero(data.segments[source].labels == name) for source in sources]
-    pairs = [*zip(data.segments.values(), parts, strict=True)]
-    starts = np.concatenate([own.starts[rows] for own, rows in pairs])
-    ends = np.concatenate([own.ends[rows] for own, rows in pairs])
-    confidences = np.concatenate([own.confidences[rows] for own, rows in pairs])
-    owners = np.repeat(np.arange(len(sources)), [len(rows) for rows in parts])
-    order = np.argsort(starts, kind="stable")
-    starts, ends, confidences, owners = (
-        column[order] for column in (starts, ends, confidences, owners)
-    )
-    firsts = first_of_groups(starts, ends, EVENT_PAUSE)
-    begin, stop = np.searchsorted(starts[firsts], [start, end])
+    parts = []
+    for (_, microphone), labels in data.segments.items():
+        own = labels.rows(labels.labels == name)
+        parts.append(replace(own, labels=np.full(len(own), microphone, object)))
+    segments = in_order(parts)  # labelled with their microphones
+    firsts = first_of_groups(segments.starts, segments.ends, EVENT_PAUSE)
+    begin, stop = np.searchsorted(segments.starts[firsts], [start, end])
     if begin == stop:
         return
-    events = Spans(starts[firsts], np.maximum.reduceat(ends, firsts))
-    seconds = lengths(joined(starts, ends), np.append(events.starts, events.ends[-1])) / NANOSECONDS
-    highest = np.maximum.reduceat(confidences, firsts)
+    events = Spans(segments.starts[firsts], np.maximum.reduceat(segments.ends, firsts))
+    edges = np.append(events.starts, events.ends[-1])
+    seconds = lengths(segments.spans(), edges) / NANOSECONDS
+    highest = np.maximum.reduceat(segments.confidences, firsts)
     counted = np.isin(events.starts, metrics.minutes.counted(name, events.starts))
-    through = reduce(common, [data.gone_through.get(source, NONE) for source in sources])
+    through = reduce(common, [data.gone_through.get(source, NONE) for source in data.segments])
     reviewed = rows_at(through, events.starts) >= 0
-    of_events = np.split(owners, firsts[1:])
+    microphones = np.split(segments.labels, firsts[1:])
     for row in range(begin, stop):
         yield HomeEvent(
             name,
@@ -131,7 +127,7 @@ def _events_of(
             int(events.ends[row]),
             float(seconds[row]),
             float(highest[row]),
-            tuple(sorted({sources[owner][1] for owner in of_events[row].tolist()})),
+            tuple(sorted(set(microphones[row].tolist()))),
             bool(reviewed[row]),
             not counted[row],
         )

@@ -76,8 +76,8 @@ class Totals:
         """
         sums = {total[:2]: total for total in self._kept.totals}
         for microphone in state.every():
-            known = (label for label in microphone.classes if label != SILENCE)
-            for label in dict.fromkeys([*known, *microphone.all_labels()]):
+            sounds = (label for label in microphone.classes if label != SILENCE)
+            for label in dict.fromkeys([*sounds, *microphone.all_labels()]):
                 events = [
                     event
                     for event in microphone.events(label, self.time)

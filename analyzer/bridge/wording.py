@@ -158,8 +158,8 @@ def preferred_language(header: str) -> str:
             continue
         if 0 < share <= 1:
             wanted.append((-share, tag.partition("-")[0]))
-    known = [tag for _, tag in sorted(wanted, key=lambda each: each[0]) if tag in languages()]
-    return known[0] if known else _DEFAULT
+    ordered = (tag for _, tag in sorted(wanted, key=lambda each: each[0]))
+    return next((tag for tag in ordered if tag in languages()), _DEFAULT)
 
 
 ENGLISH = words_of(_DEFAULT)

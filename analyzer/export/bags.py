@@ -288,7 +288,7 @@ def _save_rosbag2(selection: LogSelection, files: OutputFiles, progress: Progres
 
 def _warn_of_definitions(selection: LogSelection) -> None:
     """Warn of types with several definitions: rosbag2 readers decode all by one of them."""
-    known: dict[str, Any] = {}
+    definitions: dict[str, Any] = {}
     for topic, channels in selection.channels.items():
         for schema in [schema for _, schema in channels if schema is not None]:
             try:
@@ -296,7 +296,7 @@ def _warn_of_definitions(selection: LogSelection) -> None:
             except LogError:
                 continue  # its messages are copied regardless
             for name, (_, fields) in types.items():
-                if known.setdefault(name, fields) != fields:
+                if definitions.setdefault(name, fields) != fields:
                     text = f"{name} is defined in two ways, of which readers of rosbag2 take one"
                     warnings.warn(HearthlogWarning(text, topic), stacklevel=2)
 
@@ -374,12 +374,12 @@ def _count(log: Path, folder: Path) -> FileCounts | None:
 
 def _check_topics(files: Sequence[FileCounts]) -> None:
     """Check that every topic is described equally in all files."""
-    known: dict[str, tuple[object, str]] = {}
+    described: dict[str, tuple[object, str]] = {}
     for file in files:
         for name, topic in file.topics.items():
             about = topic.channel_metadata
             identity = topic.type, about["offered_qos_profiles"], about["topic_type_hash"]
-            other, where = known.setdefault(name, (identity, file.name))
+            other, where = described.setdefault(name, (identity, file.name))
             if other != identity:
                 raise LogError(
                     f"{name} is of different types or qualities of service in {where} and "

@@ -457,8 +457,8 @@ def _logs_of_held(selection: LogSelection, topics: Collection[str]) -> list[Path
 
 def _has_all(counts: Counter[Hashable], depths: Mapping[Hashable, float]) -> bool:
     """Return whether all publishers reached their depth; copies have different publishers."""
-    known = counts.keys() & depths.keys()
-    return bool(known) and all(counts[each] >= depths[each] for each in known)
+    counted = counts.keys() & depths.keys()
+    return bool(counted) and all(counts[each] >= depths[each] for each in counted)
 
 
 def _counts(batches: Iterable[Sequence[RawMessages]]) -> Counter[Hashable]:

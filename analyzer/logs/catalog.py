@@ -243,10 +243,10 @@ class Catalog:
             (UNSURE, UNSURE, since, until),
         ):
             if is_listed:
-                known = listed.get(name) == (name, size, mtime)
+                is_same = listed.get(name) == (name, size, mtime)
             else:
-                known = _is_current(self.path(name), size, mtime)
-            if known and start is not None:
+                is_same = _is_current(self.path(name), size, mtime)
+            if is_same and start is not None:
                 listed.pop(name, None)
                 continue
             removed.append((file,))
@@ -262,8 +262,8 @@ class Catalog:
         """Keep only the rows of unchanged and undamaged files; return the files without a row."""
         self.database.execute("DELETE FROM files WHERE state = ?", [DAMAGED])  # may be mended
         files = self.database.execute("SELECT path, size, mtime, file FROM catalog")
-        known = {ListedLog(*row[:3]): row[3] for row in files}
-        gone = [(known[log],) for log in known.keys() - listing.logs]
+        numbers = {ListedLog(*row[:3]): row[3] for row in files}
+        gone = [(numbers[log],) for log in numbers.keys() - listing.logs]
         self.database.executemany("DELETE FROM files WHERE file = ?", gone)
         self.database.executemany("DELETE FROM labels WHERE file = ?", gone)
         paths = {log.name.rpartition("/")[0] for log in listing.logs} | listing.folders.keys()
@@ -281,7 +281,7 @@ class Catalog:
                 for path in sorted(paths)
             ],
         )
-        return [log for log in listing.logs if log not in known]
+        return [log for log in listing.logs if log not in numbers]
 
     def add(self, rows: Iterable[CatalogRow]) -> None:
         """Add the rows of files in known folders."""
@@ -398,8 +398,8 @@ class LogSpans:
 
     def _latest_first(self, since: int, until: int) -> Iterator[LogSpan]:
         opened = (one for one in reversed(self._opened) if one[1] >= since and one[0] < until)
-        known = [catalog.spans(since, until) for catalog in self._catalogs]
-        return merge(opened, *known, key=lambda span: span[:2], reverse=True)
+        listed = [catalog.spans(since, until) for catalog in self._catalogs]
+        return merge(opened, *listed, key=lambda span: span[:2], reverse=True)
 
 
 def _limits(start: int | None, end: int | None) -> tuple[int, int]:

@@ -118,8 +118,7 @@ def labelling_of(segments: Columns) -> Labelling:
             f"{segments.topic}: segments overlap; is a log there twice, or those of two homes? "
             "name the folder of one"
         )
-    known = "confidence" in segments.fields
-    confidences = segments["confidence"] if known else np.ones(len(starts), np.float32)
+    confidences = segments.fields.get("confidence", np.ones(len(starts), np.float32))
     return Labelling(starts, ends, segments["label"], confidences)
 
 

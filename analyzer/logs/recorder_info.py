@@ -231,8 +231,8 @@ def features_of(origin: RecorderInfo) -> FeatureSet:
         features = feature_set(name)
     except ModelError as error:
         source = origin.metadata.get(FEATURE_SET_DISTRIBUTION, "")
-        known = f" (the recorder had it from {source[:64]})" if source else ""
-        raise LogError(f"{origin.path}: {error}{known}") from error
+        origin_text = f" (the recorder had it from {source[:64]})" if source else ""
+        raise LogError(f"{origin.path}: {error}{origin_text}") from error
     version = origin.metadata.get(FEATURE_SET_VERSION, "1")
     if version != str(features.version):
         raise LogError(

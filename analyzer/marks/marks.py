@@ -248,11 +248,11 @@ def _reviewed(path: Path, rows: Mapping[Key, Sequence[Row]], scenario: str) -> R
     def of_type(type_: str) -> Sequence[Row]:
         return rows.get((review_labelling(scenario), type_), ())
 
-    known = {mark[:4]: mark for mark in (Mark(*row) for row in of_type(message_types.MARK))}
+    with_origin = {mark[:4]: mark for mark in (Mark(*row) for row in of_type(message_types.MARK))}
     marks = [Mark(*row) for row in of_type(message_types.SEGMENT)]
     try:
         return Reviewed(
-            _checked(known.get(mark[:4], mark) for mark in marks),
+            _checked(with_origin.get(mark[:4], mark) for mark in marks),
             _checked_reviewed(ReviewedSpan(*row) for row in of_type(message_types.REVIEWED)),
         )
     except (DataError, LogError) as error:

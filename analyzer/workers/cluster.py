@@ -78,8 +78,8 @@ def connected(scheduler: str) -> Iterator["Cluster"]:
 @contextmanager
 def _silence() -> Iterator[None]:
     """Disable Dask's logging, since errors are reported once, by hearthlog."""
-    known = (name for name in logging.root.manager.loggerDict if name.split(".")[0] in _NOISY)
-    loggers = [logging.getLogger(name) for name in {*_NOISY, *known}]
+    inner = (name for name in logging.root.manager.loggerDict if name.split(".")[0] in _NOISY)
+    loggers = [logging.getLogger(name) for name in {*_NOISY, *inner}]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.CRITICAL + 1)
