@@ -296,7 +296,7 @@ class _Writing:
         self, topic: str, channels: Sequence[Described], pieces: Sequence[TypedColumns]
     ) -> None:
         if topic not in self._tables:
-            same = [each for each in channels if self._type in {"", type_name(each)}]
+            same = [(c, s) for c, s in channels if s is not None and self._type in {"", s.name}]
             self._tables[topic] = tables_of(topic, same)
         tables = self._tables[topic]
         of_table: dict[int, list[TypedColumns]] = {}
@@ -343,12 +343,6 @@ class _Writing:
             text = str(fault).removeprefix(f"{topic}: ")
             warnings.warn(HearthlogWarning(f"{text}: left out", topic, each=True), stacklevel=2)
         return bool(self._writers)
-
-
-def type_name(described: Described) -> str:
-    """Return the name of a channel's message type."""
-    schema = described[1]
-    return "" if schema is None else schema.name
 
 
 class TableFile(io.RawIOBase):

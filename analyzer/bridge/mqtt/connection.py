@@ -172,7 +172,11 @@ class Connection:
         if settings.user:
             client.username_pw_set(settings.user, read_password(settings))
         if settings.tls:
-            self._use_tls(client, settings)
+            client.tls_set_context(tls_context(settings))
+            if settings.certificate_file is None:
+                self._hint = (
+                    "; does it need a client certificate? see certificate_file and key_file"
+                )
         client.on_connect = self._on_connect
         client.on_connect_fail = self._on_connect_fail
         client.on_disconnect = self._on_disconnect
@@ -182,11 +186,6 @@ class Connection:
         client.connect_async(settings.host, _port(settings), _KEEPALIVE)
         client.loop_start()
         return client
-
-    def _use_tls(self, client: mqtt.Client, settings: MqttSettings) -> None:
-        client.tls_set_context(tls_context(settings))
-        if settings.certificate_file is None:
-            self._hint = "; does it need a client certificate? see certificate_file and key_file"
 
     def _publish(self, topic: str, payload: str, *, retain: bool) -> bool:
         """Pass a message to the client; return False if the message has to wait."""
@@ -300,13 +299,10 @@ def tls_context(settings: MqttSettings) -> ssl.SSLContext:
 
     Raise `BridgeError` if a file cannot be used.
     """
-    names = "ca_file", "certificate_file", "key_file"
-    ca, certificate, key = paths = [getattr(settings, name) for name in names]
+    ca, certificate, key = settings.ca_file, settings.certificate_file, settings.key_file
+    paths = [path for path in (ca, certificate, key) if path is not None]
     for path in paths:
-        if path is not None:
-            read_limited(
-                path, "certificate", _LARGEST_CERTIFICATE, BridgeError
-            )  # a pipe would hang
+        read_limited(path, "certificate", _LARGEST_CERTIFICATE, BridgeError)  # a pipe would hang
     try:
         context = ssl.create_default_context(cafile=ca)
         if ca is not None:
@@ -316,7 +312,7 @@ def tls_context(settings: MqttSettings) -> ssl.SSLContext:
         if certificate is not None:
             context.load_cert_chain(certificate, key, password=_no_password)
     except (OSError, ValueError) as error:
-        files = ", ".join(str(path) for path in paths if path is not None)
+        files = ", ".join(map(str, paths))
         what = getattr(error, "strerror", None) or error
         raise BridgeError(f"bridge.mqtt: {files}: no certificates of use ({what})") from error
     return context

@@ -80,10 +80,9 @@ class MqttPublisher:
                 subscriptions.append(topics.at(TOLD) + "+")
         if self._is_new:
             subscriptions.append(self._discovery_topic("+"))
-        client_id = settings.client_id or f"hearthlog-{home.node}"
         self._connection = Connection(
             settings,
-            client_id,
+            settings.client_id or f"hearthlog-{home.node}",
             topics.at("bridge"),
             report,
             subscriptions=subscriptions,
@@ -221,12 +220,10 @@ class MqttPublisher:
         self._has_published_muted = True
 
     def _topic(self, place: Place) -> str:
-        kind, microphone, _ = place
-        node = self._topics.node
-        if kind == CONFIG:
-            device = device_id(node, microphone) if microphone else home_id(node)
-            return self._discovery_topic(device)
-        return self._topics.at(*place)
+        if place.kind != CONFIG:
+            return self._topics.at(*place)
+        node, microphone = self._topics.node, place.microphone
+        return self._discovery_topic(device_id(node, microphone) if microphone else home_id(node))
 
     def _keep(self, place: Place, value: str) -> None:
         """Publish a retained value, and record its topic."""
