@@ -23,6 +23,7 @@ from hearthlog.analyzer.logs.confused_classes import WATER, common_names_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.never_tell import read_list
+from hearthlog.analyzer.logs.recorder_info import status_value
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN, class_name, ordered
 from hearthlog.schemas.errors import LogError
@@ -470,14 +471,7 @@ class HomeState:
                 self.health[subject] = Health(int(status["level"]), str(status["message"]))
             microphone = self.microphones.get(subject)
             if microphone is not None:
-                microphone.level_dbfs = next(_levels(status), math.nan)
-
-
-def _levels(status: Any) -> Iterator[float]:
-    for pair in status["values"]:
-        if pair["key"] == "level_dbfs":
-            with suppress(ValueError):
-                yield float(pair["value"])
+                microphone.level_dbfs = status_value(status, "level_dbfs")
 
 
 def _class_names(columns: Columns) -> list[str]:

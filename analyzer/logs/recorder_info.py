@@ -385,16 +385,17 @@ def microphone_states(columns: Columns) -> Iterator[MicrophoneHealth]:
         if topic is not None and topic.labelling == LIVE:
             level = max((status["level"] for status in statuses), default=0)
             bad = [status["message"] for status in statuses if status["level"]]
-            yield MicrophoneHealth(name, time, level, "; ".join(bad)[:_LONGEST], _floor(statuses))
+            floors = (status_value(status, "floor_dbfs") for status in statuses)
+            floor = next(filter(math.isfinite, floors), math.nan)
+            yield MicrophoneHealth(name, time, level, "; ".join(bad)[:_LONGEST], floor)
 
 
-def _floor(statuses: Sequence[Any]) -> float:
-    for status in statuses:
-        for pair in status["values"]:
-            if pair["key"] == "floor_dbfs":
-                with suppress(ValueError):
-                    value = float(pair["value"])
-                    return value if math.isfinite(value) else math.nan
+def status_value(status: Any, key: str) -> float:
+    """Return a number among the values of a diagnostic status; NaN if there is none."""
+    for pair in status["values"]:
+        if pair["key"] == key:
+            with suppress(ValueError):
+                return float(pair["value"])
     return math.nan
 
 
