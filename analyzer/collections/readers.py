@@ -119,26 +119,19 @@ def clips_by_name(
         yield CollectionClip(path, sounds, f"{group}_{source}", licence, left_out=reason)
 
 
-class AnnotatedFile(NamedTuple):
-    """A file in tables of timed sounds, and the line that lists it first."""
-
-    where: str
-    sounds: list[CategorySpan]
-
-
 def read_timed_sounds(
     paths: Iterable[Path], columns: Sequence[str], names: Mapping[str, str] | None = None
-) -> dict[str, AnnotatedFile]:
-    """Read tables of timed sounds, separated by tabs, by file name.
+) -> dict[str, tuple[str, list[CategorySpan]]]:
+    """Read tables of timed sounds, separated by tabs: by file name, its first line and its sounds.
 
     The columns are those of file, start, end and category; a line without a category names a file
     alone. `names` has the names of categories that the tables give as ids. Raise `DataError` as
     `read_table` and `read_seconds` do.
     """
-    files: dict[str, AnnotatedFile] = {}
+    files: dict[str, tuple[str, list[CategorySpan]]] = {}
     for path in paths:
         for where, (file, start, end, category) in read_table(path, columns, "\t"):
-            sounds = files.setdefault(file, AnnotatedFile(where, [])).sounds
+            _, sounds = files.setdefault(file, (where, []))
             if category:
                 name = (names or {}).get(category, category)
                 sounds.append(CategorySpan((name,), *read_seconds(where, start, end)))

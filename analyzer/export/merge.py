@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.exceptions import McapError
@@ -151,16 +151,8 @@ def merge_logs(
         log time of the first message in the span and their own publish times.
     """
     with new_file(output) as temporary, temporary.open("xb") as stream:
-        return write_log(selection, stream, output.name, progress, latched=latched).repeated
-
-
-class WrittenLog(NamedTuple):
-    """Result of writing a log."""
-
-    # `rosbag2` record; None, and not in the log, if a topic has channels that rosbag2 cannot
-    # distinguish, or no ROS 2 messages
-    record: Mapping[str, str] | None
-    repeated: int
+        _, repeated = write_log(selection, stream, output.name, progress, latched=latched)
+    return repeated
 
 
 def write_log(
@@ -170,8 +162,12 @@ def write_log(
     progress: Progress = ignore_progress,
     *,
     latched: bool = False,
-) -> WrittenLog:
+) -> tuple[Mapping[str, str] | None, int]:
     """Write the messages of a selection to a stream, as `merge_logs` does to a file.
+
+    Return the `rosbag2` record, and the number of messages that several logs hold. The record is
+    None, and not in the log, if a topic has channels that rosbag2 cannot distinguish, or no ROS 2
+    messages.
 
     `progress` receives the completed share, 0 to 1. Raise `LogError` if a log is damaged, there is
     no message, or there are more channels than a log can have.
@@ -189,7 +185,7 @@ def write_log(
         once = without_repeats(batch)
         repeated += sum(map(len, batch)) - sum(map(len, once))
         log.write(once)
-    return WrittenLog(log.finish(name), repeated)
+    return log.finish(name), repeated
 
 
 def _count_repeated(selection: LogSelection) -> int:
