@@ -226,7 +226,7 @@ def _readable(raw: RawMessages) -> RawMessages:
     )
 
 
-def _unbounded(node: Nodetype, details: Any) -> tuple[Nodetype, Any]:
+def _unbounded(node: Nodetype, details: Any) -> Any:
     """Remove bounds of texts and sequences, which ROS 1 lacks."""
     if node == Nodetype.BASE and details[0] == "wstring":
         raise LogError("ROS 1 has no wstring")

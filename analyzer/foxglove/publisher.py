@@ -44,10 +44,13 @@ class Publisher:
                 return False
             self._descriptions.pop(advertised.id(), None)
             advertised.close()
+        of_sdk = None
+        if schema is not None:
+            of_sdk = Schema(name=schema.name, encoding=schema.encoding, data=schema.data)
         self._channels[channel.topic] = Channel(
             channel.topic,
             message_encoding=channel.message_encoding,
-            schema=schema and Schema(name=schema.name, encoding=schema.encoding, data=schema.data),
+            schema=of_sdk,
             metadata=dict(channel.metadata),
             context=self.context,
         )

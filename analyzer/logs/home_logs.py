@@ -165,7 +165,7 @@ def find_home_logs(paths: Iterable[Path]) -> HomeLogs:
     Raise `LogError` if there is no such log, or none in a folder.
     """
     losses: list[str] = []
-    entries = []
+    entries: list[HomeLog] = []
     for path in find_with_layers(paths):
         try:
             entries += _entries(path)
