@@ -22,7 +22,7 @@ from hearthlog.analyzer.activity.event_counts import (
     television_minutes,
 )
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.confused_classes import common_names_of, renamed
+from hearthlog.analyzer.logs.confused_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overlaid, unified
 from hearthlog.analyzer.logs.recorder_info import model_of
@@ -143,8 +143,8 @@ def _reviewed_labels(
             labels = unified(sources.read(span.microphone, name, first, last).labelling)
             own = labelling_of_marks(mark for mark in marks if mark.microphone == span.microphone)
             names = common_names_of(log, [*labels.labels, *own.labels])
-            labels = renamed(labels, names)
-            decided = renamed(own.rows(own.labels != UNKNOWN), names)
+            labels = labels.renamed(names)
+            decided = own.rows(own.labels != UNKNOWN).renamed(names)
             rest = own.rows(own.labels == UNKNOWN)
             yield ReviewedLabels(
                 span,

@@ -8,7 +8,7 @@ import numpy as np
 
 from hearthlog.analyzer.activity.checked_minutes import labelling_of_marks
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.confused_classes import common_names_of, renamed_array
+from hearthlog.analyzer.logs.confused_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.labelling import (
     MOST_CLASSES,
@@ -195,7 +195,7 @@ def _segments(
             [entry.path], segments, *limits, fields=_SEGMENT_FIELDS
         ).values():
             names = common_names_of(entry.path, columns["label"])
-            own = renamed_array(columns["label"], names)
+            own = np.array([names.get(label, label) for label in columns["label"]], object)
             yield replace(columns, fields=columns.fields | {"label": own}) if names else columns
     except LogError as error:
         home.lose(str(error))
@@ -219,8 +219,7 @@ def _as_classes(home: HomeData, topic: str, labels: Labelling) -> Labelling:
     names = {label: near.get(label, OTHER) for label in odd}
     more = f", and {len(odd) - 1} more so" if len(odd) > 1 else ""
     home.lose(f"{topic}: {odd[0][:64]!r} is called {names[odd[0]]} here{more}: no name of a class")
-    called = np.array([names.get(label, label) for label in labels.labels], object)
-    return replace(labels, labels=called)
+    return labels.renamed(names)
 
 
 def _reviews(

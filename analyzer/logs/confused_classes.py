@@ -3,21 +3,11 @@
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.recorder_info import attachments_of
-from hearthlog.models.classes import (
-    FLUSHING_WATER,
-    RUNNING_WATER,
-    SHOWER,
-    TAP_WATER,
-    class_name,
-)
+from hearthlog.models.classes import FLUSHING_WATER, RUNNING_WATER, SHOWER, TAP_WATER, class_name
 from hearthlog.models.modelfile.modelfile import DESCRIPTION
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.logfile import LogFile
@@ -59,15 +49,3 @@ def common_names_of(path: Path, labels: Iterable[str]) -> dict[str, str]:
                     found = json.loads(each.data)
                     names |= common_names(found) if isinstance(found, dict) else {}
     return names
-
-
-def renamed(labels: Labelling, names: Mapping[str, str]) -> Labelling:
-    """Return a labelling with common names."""
-    if not names:
-        return labels
-    return replace(labels, labels=renamed_array(labels.labels, names))
-
-
-def renamed_array(labels: Iterable[str], names: Mapping[str, str]) -> Any:
-    """Return labels with common names, as an array of objects."""
-    return np.array([names.get(label, label) for label in labels], object)

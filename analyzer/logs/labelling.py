@@ -80,8 +80,12 @@ class Labelling:
         classes : sequence of str
             A label with the same meaning as exactly one of these gets its name; other labels stay.
         """
-        names = translation(set(self.labels), classes)
-        return replace(self, labels=np.array([names[label] for label in self.labels], object))
+        return self.renamed(translation(set(self.labels), classes))
+
+    def renamed(self, names: Mapping[str, str]) -> "Labelling":
+        """Rename some labels; the others stay."""
+        labels = [names.get(label, label) for label in self.labels]
+        return replace(self, labels=np.array(labels, object))
 
 
 def overlaid(labels: Labelling, above: Labelling) -> Labelling:
@@ -100,9 +104,7 @@ def in_order(parts: Iterable[Labelling]) -> Labelling:
 
 def unified(labels: Labelling) -> Labelling:
     """Rename each label to the name of its class."""
-    names = {label: class_name(label) for label in set(labels.labels)}
-    unique = np.array([names[label] for label in labels.labels], object)
-    return replace(labels, labels=unique)
+    return labels.renamed({label: class_name(label) for label in set(labels.labels)})
 
 
 def labelling_of(segments: Columns) -> Labelling:
