@@ -75,8 +75,7 @@ def speech_spans(segments: Columns, labels: Columns | None = None) -> Spans:
 def _is_of(segments: Columns, kind: str) -> Bool:
     labels = segments["label"]
     names = {label for label in set(labels.tolist()) if class_name(label) == kind}
-    found: Bool = np.isin(labels.astype(str), sorted(names))
-    return found
+    return np.isin(labels.astype(str), sorted(names))
 
 
 def _speech_likelihood(labels: Columns, starts: Int64, ends: Int64) -> Float64:
@@ -91,8 +90,7 @@ def _speech_likelihood(labels: Columns, starts: Int64, ends: Int64) -> Float64:
     values = np.nan_to_num(probabilities[order][:, own].sum(axis=1, dtype=np.float64))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     first, last = np.searchsorted(stamps, starts), np.searchsorted(stamps, ends)
-    means: Float64 = (sums[last] - sums[first]) / np.maximum(last - first, 1)
-    return means
+    return (sums[last] - sums[first]) / np.maximum(last - first, 1)
 
 
 _ALIKE = 0.7  # correlation of loudness
@@ -362,8 +360,7 @@ def speech_voices(
 def _can_be(values: Float32, names: Sequence[str]) -> Bool:
     """Return which frames have plausible features; damaged logs may hold others."""
     energy = values[:, list(names).index(ENERGY)]
-    possible: Bool = (np.abs(values) <= _LARGE).all(axis=1) & (energy >= 0.0)
-    return possible
+    return (np.abs(values) <= _LARGE).all(axis=1) & (energy >= 0.0)
 
 
 def _conversations(stamps: Int64) -> Iterator[slice]:

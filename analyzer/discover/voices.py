@@ -87,8 +87,7 @@ def _likelihood(counts: Float64, sums: Float64) -> Float64:
     variance = voice_space().spread[:, np.newaxis]
     scale = 1.0 + counts * variance
     terms = (sums**2 * (variance / scale)).sum(axis=0)
-    likelihood: Float64 = 0.5 * (terms - np.log(scale.prod(axis=0)))
-    return likelihood
+    return 0.5 * (terms - np.log(scale.prod(axis=0)))
 
 
 def merged_voices(evidence: VoiceEvidence) -> Int64:
@@ -141,16 +140,14 @@ def _likeness(points: Float64, voices: VoiceEvidence) -> Float64:
     spread = voice_space().spread
     variance = spread / (1.0 + counts[:, np.newaxis] * spread)
     mean = variance * sums
-    likeness: Float64 = points @ mean.T - 0.5 * (mean**2 + variance).sum(axis=1)
-    return likeness
+    return points @ mean.T - 0.5 * (mean**2 + variance).sum(axis=1)
 
 
 def _smoothed(values: Float64) -> Float64:
     """Average each row with its neighbours."""
     width = 2 * _SMOOTHED + 1
     padded = np.pad(values, ((_SMOOTHED, _SMOOTHED), (0, 0)), "edge")
-    smoothed: Float64 = np.lib.stride_tricks.sliding_window_view(padded, width, 0).mean(axis=-1)
-    return smoothed
+    return np.lib.stride_tricks.sliding_window_view(padded, width, 0).mean(axis=-1)
 
 
 FILE = "voice_space.safetensors"
@@ -177,8 +174,7 @@ class VoiceSpace(NamedTuple):
 
     def points(self, described: Float64) -> Float64:
         """Return the points of window descriptors, shape (n, d)."""
-        points: Float64 = (described - self.mean) @ self.axes.T
-        return points
+        return (described - self.mean) @ self.axes.T
 
 
 @cache

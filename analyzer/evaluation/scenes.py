@@ -105,8 +105,7 @@ def _coloured(noise: Float32, slope: float) -> Float32:
     spectrum = rfft(noise, overwrite_x=True)  # single precision, because an hour of noise is large
     frequencies = np.arange(len(spectrum), dtype=np.float32) * np.float32(SAMPLE_RATE / len(noise))
     spectrum /= np.maximum(frequencies, _LOWEST_HERTZ) ** np.float32(slope)
-    coloured: Float32 = irfft(spectrum, len(noise), overwrite_x=True)
-    return coloured
+    return irfft(spectrum, len(noise), overwrite_x=True)
 
 
 def compose(

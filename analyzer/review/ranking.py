@@ -257,8 +257,7 @@ def worth(spans: JudgeableSpans, uncertain: Float64) -> Float64:
     """
     seconds = np.minimum(spans.ends - spans.starts, _LONGEST_WEIGHED) / NANOSECONDS
     of_class = np.bincount(spans.labels, seconds)[spans.labels]
-    weights: Float64 = seconds * (uncertain if uncertain.any() else 1.0) / np.sqrt(of_class)
-    return weights
+    return seconds * (uncertain if uncertain.any() else 1.0) / np.sqrt(of_class)
 
 
 def _ranked(

@@ -279,8 +279,7 @@ def spectrogram(
     if not peak:
         return None
     level = 10 * np.log10(np.maximum(power / peak, 1e-12))
-    shades: Float64 = np.clip(1 + level / _RANGE, 0.0, 1.0).T
-    return shades
+    return np.clip(1 + level / _RANGE, 0.0, 1.0).T
 
 
 @dataclass

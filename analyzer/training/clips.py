@@ -195,14 +195,12 @@ def band_limits(frequencies: Float64, low: float, high: float) -> Float64:
     frequencies = np.maximum(frequencies, 1.0)
     order = 2 * _LIMITS_ORDER
     below, above = 1.0 + (low / frequencies) ** order, 1.0 + (frequencies / high) ** order
-    limits: Float64 = -10.0 * np.log10(below * above)
-    return limits
+    return -10.0 * np.log10(below * above)
 
 
 def octaves_of(frequencies: Float64) -> Float64:
     """Return the distance of frequencies in hertz (at least 30) from 1 kHz in octaves."""
-    octaves: Float64 = np.log2(np.maximum(frequencies, 30.0) / 1000.0)
-    return octaves
+    return np.log2(np.maximum(frequencies, 30.0) / 1000.0)
 
 
 def _microphone_response(rng: np.random.Generator) -> Callable[[Float64], Float64]:
@@ -238,8 +236,7 @@ def steady_noise(count: int, level: float, rng: np.random.Generator) -> Float64:
     spectrum = np.fft.rfft(rng.standard_normal(count))
     frequencies = np.maximum(np.fft.rfftfreq(count, 1.0 / SAMPLE_RATE), _LOWEST_HERTZ)
     noise = np.fft.irfft(spectrum / frequencies ** rng.choice(_SLOPES), count)
-    scaled: Float64 = noise * (10.0 ** (level / 20.0) / np.sqrt(np.mean(np.square(noise))))
-    return scaled
+    return noise * (10.0 ** (level / 20.0) / np.sqrt(np.mean(np.square(noise))))
 
 
 def captured(sound: Float64, features: FeatureSet) -> Float32:
@@ -253,8 +250,7 @@ def captured(sound: Float64, features: FeatureSet) -> Float32:
 
 
 def _floor_error(bands: int, rng: np.random.Generator) -> Float64:
-    error: Float64 = 10.0 ** (rng.normal(0.0, _FLOOR_ERROR_DB, bands) / 10.0)
-    return error
+    return 10.0 ** (rng.normal(0.0, _FLOOR_ERROR_DB, bands) / 10.0)
 
 
 AS_IT_IS, IN_A_ROOM, SHORT = 0, 1, 2  # versions of windows

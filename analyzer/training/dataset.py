@@ -460,5 +460,4 @@ def _digests(windows: Float32) -> Int64:
 
 def _distinguishable(windows: Float32) -> Bool:
     """Return which segments have changing features."""
-    changing: Bool = (windows != windows[:, :1]).any(axis=(1, 2))
-    return changing
+    return (windows != windows[:, :1]).any(axis=(1, 2))

@@ -131,13 +131,11 @@ def _likelihood(shares: Float64, hours: Int64) -> Float64:
     likelihoods = np.log(again * left_out + (1 - again) / SECTORS)
     best = _AGAIN[(likelihoods * shares[tried]).sum(axis=(1, 2)).argmax()]
     best *= len(shares) / (len(shares) + 1)
-    likely: Float64 = best * near.mean(axis=0) + (1 - best) / SECTORS
-    return likely
+    return best * near.mean(axis=0) + (1 - best) / SECTORS
 
 
 def _smoothing() -> Float64:
     """Return the von Mises smoothing matrix of the sectors; rows sum to 1."""
     turn = np.arange(SECTORS) * (2 * np.pi / SECTORS)
     near = np.exp((np.cos(turn - turn[:, np.newaxis]) - 1) / _SPREAD**2)
-    smoothing: Float64 = near / near.sum(axis=1, keepdims=True)
-    return smoothing
+    return near / near.sum(axis=1, keepdims=True)

@@ -172,8 +172,7 @@ class _Sums:
         together = np.bincount(of_pair, count)
         root = together**_ROOT
         root /= np.bincount(pairs[0], root)[pairs[0]]
-        weights: Float64 = (root / together)[of_pair] * count / (number.max() + 1)
-        return weights
+        return (root / together)[of_pair] * count / (number.max() + 1)
 
 
 HEAD_WEIGHT = 1.0
@@ -450,5 +449,4 @@ def _right(data: Dataset, results: Sequence[Float64]) -> float:
 
 def _log_sum(values: Float64) -> Float64:
     highest = values.max(axis=1, keepdims=True)
-    total: Float64 = np.log(np.exp(values - highest).sum(axis=1, keepdims=True)) + highest
-    return total
+    return np.log(np.exp(values - highest).sum(axis=1, keepdims=True)) + highest

@@ -18,8 +18,7 @@ def viterbi(probabilities: Float32, transitions: Float64, weight: float = 1.0) -
     model = _LikelihoodHMM(count)
     model.startprob_ = np.full(count, 1.0 / count)
     model.transmat_ = transitions
-    path: Indices = model.predict(log_likelihoods(probabilities, weight))
-    return path
+    return model.predict(log_likelihoods(probabilities, weight))
 
 
 class _LikelihoodHMM(BaseHMM):  # type: ignore[misc]

@@ -93,8 +93,7 @@ class HomeSound:
         last = np.maximum(np.searchsorted(self.stamps, times[:, 1]), first)
         np.add.at(change, first, 1)
         np.add.at(change, last, -1)
-        touched: Bool = change.cumsum()[:-1] > 0
-        return touched
+        return change.cumsum()[:-1] > 0
 
 
 def read_reviewed_sound(

@@ -30,8 +30,7 @@ def balanced(target: Indices, weight: Float64) -> Float64:
     """Return weights scaled inversely to the size of the class, as scikit-learn does."""
     counts = np.bincount(target)
     costs = len(target) / (np.count_nonzero(counts) * np.maximum(counts, 1))
-    weighted: Float64 = weight * costs[target]
-    return weighted
+    return weight * costs[target]
 
 
 def fitted_scaler(inputs: Float32) -> StandardScaler:

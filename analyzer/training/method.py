@@ -50,8 +50,7 @@ class Examples(NamedTuple):
         """Return decision values [shape=(m, C)] of `unseen` segments: means over their windows."""
         inputs = self.inputs[0, unseen]
         decisions = learned.decide(inputs.reshape(-1, inputs.shape[-1]), classes)
-        means: Float64 = decisions.reshape(*inputs.shape[:2], classes).mean(axis=1)
-        return means
+        return decisions.reshape(*inputs.shape[:2], classes).mean(axis=1)
 
 
 class Learned(Protocol):
@@ -219,8 +218,7 @@ def _usable(
     loud = loud_windows(power, window_frames, least)
     if SILENCE in data.classes:
         loud |= (data.target == data.classes.index(SILENCE))[:, np.newaxis]
-    usable: Bool = loud & is_finite
-    return usable
+    return loud & is_finite
 
 
 def loud_windows(power: Float64, window_frames: int, least: Float64 | None = None) -> Bool:
@@ -234,8 +232,7 @@ def loud_windows(power: Float64, window_frames: int, least: Float64 | None = Non
     quietest = power.mean(axis=1, keepdims=True) * _BELOW_SEGMENT
     if least is not None:
         quietest = np.maximum(quietest, least)
-    loud: Bool = np.stack(windows, axis=1) > quietest
-    return loud
+    return np.stack(windows, axis=1) > quietest
 
 
 def _empty_rooms(features: FeatureSet, inputs: Inputs, rng: np.random.Generator) -> Float32:

@@ -142,8 +142,7 @@ def merged_spans(spans: Int64) -> list[list[int]]:
     widest = np.argsort(-apart, kind="stable")[: MOST_SPANS - 1]
     breaks = np.sort(widest[apart[widest] >= _MERGED_WITHIN])
     starts = ordered[np.concatenate([[0], breaks + 1]), 0]
-    merged: list[list[int]] = np.stack([starts, ends[np.append(breaks, -1)]], axis=1).tolist()
-    return merged
+    return np.stack([starts, ends[np.append(breaks, -1)]], axis=1).tolist()
 
 
 MOST_FOLDS = 5

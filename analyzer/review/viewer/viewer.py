@@ -402,8 +402,7 @@ def _set_view(blueprint: Blueprint, start: int, end: int) -> None:
 
 def _container(blueprint: Blueprint, path: str) -> dict[str, Any]:
     """Return a container of a blueprint; empty for anything else."""
-    found: dict[str, Any] = blueprint.get(path, {}).get("ContainerBlueprint", {})
-    return found
+    return blueprint.get(path, {}).get("ContainerBlueprint", {})
 
 
 def _view(blueprint: Blueprint) -> Any:
