@@ -19,6 +19,7 @@ from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.message_checks import (
     ALLOWED_DELAY,
     ATTACHMENTS,
+    DAY_FOLDERS,
     MessageChecks,
     MetadataChecks,
 )
@@ -136,12 +137,12 @@ def _is_ours(file: LogFile) -> bool:
     if _LAYER.fullmatch(file.path.name):
         return False
     records = provenance_records(file)
-    is_made = file.header is not None and file.header.library == LIBRARY
+    is_made = len(records) > 0 or (file.header is not None and file.header.library == LIBRARY)
     if LOG_NAME.fullmatch(file.path.name):
-        return is_made or len(records) > 0
+        return is_made
     kinds = {split_topic(channel.topic)[1] for channel in file.channels.values()}
     is_part = bool(file.channels) and not kinds >= ALWAYS
-    return (is_made or len(records) > 0) and len(records) < 2 and not is_part
+    return is_made and len(records) < 2 and not is_part
 
 
 def _walk(walk: RecordWalk, data: DataSection, summary_start: int, progress: Progress) -> bool:
@@ -251,7 +252,6 @@ class ForeignMessages:
         """Ignore missing messages: each message is checked on its own."""
 
 
-_DAY = re.compile(r"\d{4}/\d{2}/\d{2}")
 _TOLERANCE = 0.01  # share of the time between two files, for the error of a sound card's clock
 _BESIDE = 60 * NANOSECONDS  # maximum extent of a layer beyond its log
 _LEFT = {
@@ -277,14 +277,17 @@ def check_series(files: Sequence[ExaminedFile]) -> None:
 
     Files that are not ours, or have no messages, are skipped.
     """
-    homes = {home for file in files if (home := _folder_of_days(file.findings.path)) is not None}
+    paths = [file.findings.path for file in files]
+    homes = {
+        path.parents[3] for path in paths if DAY_FOLDERS.fullmatch("/".join(path.parts[-4:-1]))
+    }
     nodes: dict[tuple[Path | None, str], list[ExaminedFile]] = {}
     for file in files:
         if file.ours and file.span is not None:
             home = next((each for each in file.findings.path.parents if each in homes), None)
             nodes.setdefault((home, file.node), []).append(file)
     for same in nodes.values():
-        same.sort(key=_start)
+        same.sort(key=lambda file: (file.span or (0, 0))[0])
         _check_overlaps(same)
         for microphone in {name for file in same for name in file.frames}:
             _check_frames(microphone, [file for file in same if microphone in file.frames])
@@ -302,16 +305,6 @@ def _check_layers(files: Sequence[ExaminedFile]) -> None:
             what = f"speaks of a time when {log.name} was not recorded"
             advice = "it belongs to another log; move it beside that"
             findings.warning("layer", what, advice, time=start)
-
-
-def _folder_of_days(path: Path) -> Path | None:
-    """Return the home folder of a log in YYYY/MM/DD; None for other logs."""
-    return path.parents[3] if _DAY.fullmatch("/".join(path.parts[-4:-1])) else None
-
-
-def _start(file: ExaminedFile) -> int:
-    assert file.span is not None
-    return file.span[0]
 
 
 def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
@@ -333,16 +326,12 @@ def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
 
 def _lived_twice(file: ExaminedFile) -> tuple[int, int] | None:
     """Return the time span that was repeated because the clock was set back, or None."""
-    back = [frames.gap_before for frames in file.frames.values() if _begins_back(frames)]
-    gaps = [gap for gap in back if gap is not None]
+    gaps = [
+        gap for frames in file.frames.values() if (gap := frames.gap_before) and gap[1] < gap[0]
+    ]
     if not gaps:
         return None
     return min(new for _, new in gaps) - NANOSECONDS, max(old for old, _ in gaps) + NANOSECONDS
-
-
-def _begins_back(frames: FrameSequence) -> bool:
-    """Whether a file begins with the clock set back."""
-    return frames.gap_before is not None and frames.gap_before[1] < frames.gap_before[0]
 
 
 def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:

@@ -303,7 +303,7 @@ def _sequence_rows(kind: str, columns: Columns) -> Int64 | None:
 
 
 _TIME = "%Y%m%dT%H%M%SZ"
-_FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
+DAY_FOLDERS = re.compile(r"\d{4}/\d{2}/\d{2}")
 _KEYS = {"version", "node", "configuration_sha256", "feature_set", "model", "model_sha256"}
 _CONFIGURATION, _MODEL_CARD, _MODEL = ATTACHMENTS = ("configuration.json", CARD, DESCRIPTION)
 
@@ -377,9 +377,7 @@ class MetadataChecks:
         named = LOG_NAME.fullmatch(path.name)
         if named is None:
             return
-        node = named["node"]
-        for record in self._records[:1]:
-            node = record.get("node", node)
+        node = self._records[0].get("node", named["node"]) if self._records else named["node"]
         if node != named["node"]:
             self._error("name", f"the name says node {named['node']}, the file {node}")
         if self._data.span is None:
@@ -393,7 +391,7 @@ class MetadataChecks:
             self._error("name", f"the name says {named['time']}, the first message {start:%c}")
         folders = "/".join(path.absolute().parts[-4:-1])
         days = {f"{start:%Y/%m/%d}", f"{latest:%Y/%m/%d}"}
-        if _FOLDERS.fullmatch(folders) and folders not in days:
+        if DAY_FOLDERS.fullmatch(folders) and folders not in days:
             self._error("name", f"the folder says {folders}, the first message {start:%Y/%m/%d}")
 
     def _check_info(self, microphone: str, info: dict[str, Any]) -> None:
@@ -422,14 +420,14 @@ class MetadataChecks:
         for microphone, info in self._infos.items():
             classes = list(info["labels"]) or None
             own = [scenario_labelling(s.name) for s in scenarios if s.microphone == microphone]
-            beside: dict[str, list[str]] = {name: [] for name in (*candidates, *own)}
+            others: dict[str, list[str]] = {name: [] for name in (*candidates, *own)}
             is_array = f"/{microphone}/{DIRECTION}" in self._channels
             channel = self._channels.get(f"/{microphone}/{EMBEDDING}")
             metadata = {} if channel is None else channel.metadata
             embedding = EmbeddingSource.from_metadata(metadata)
             names = list(info["feature_names"])
             topics = topics_of(
-                microphone, names, classes, beside, directions=is_array, embedding=embedding
+                microphone, names, classes, others, directions=is_array, embedding=embedding
             )
             expected |= {topic.name: topic for topic in topics}
         for name, topic in expected.items():
