@@ -18,19 +18,14 @@ from hearthlog.analyzer.promotion.promotion_check import find_champion, other_fe
 from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.analyzer.review.ranking import spread
 from hearthlog.analyzer.review.review_list import CHANGE, HINT, ReviewSpan
-from hearthlog.analyzer.review.spans import (
-    JudgeableSpans,
-    judgeable_spans,
-    other_labels,
-    without,
-)
+from hearthlog.analyzer.review.spans import JudgeableSpans, judgeable_spans, other_labels, without
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import AUDIOSET
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import Embeddings, Projection, read_projection
 from hearthlog.models.embedding.sound_names import SoundName, audioset_names, named_sounds
-from hearthlog.schemas.arrays import Bool, Int64
+from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -92,9 +87,7 @@ def hinted_spans(
     ]
 
 
-def _named(
-    sources: Labellings, microphone: str, names: list[SoundName]
-) -> tuple[Events, np.ndarray[tuple[int], np.dtype[np.float64]]]:
+def _named(sources: Labellings, microphone: str, names: list[SoundName]) -> tuple[Events, Float64]:
     """Return the sounds named by networks, one at a time, and their logits above the threshold.
 
     Of two simultaneous names the one further above its threshold is used.

@@ -17,7 +17,7 @@ from hearthlog.analyzer.logs.never_tell import read_list, recorded_list
 from hearthlog.analyzer.logs.selection import checked_array_names, decode_types
 from hearthlog.analyzer.review.lanes import decibel
 from hearthlog.models.classes import class_name, in_words
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.arrays import Float32, Int64
 from hearthlog.schemas.errors import LogError, printable, shortened
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -57,15 +57,13 @@ class CurrentSound:
         self.seen = -math.inf  # of the newest label, by CLOCK_MONOTONIC
         self._times: Int64 = np.empty(0, np.int64)
         self._labels: NDArray[np.object_] = np.empty(0, object)
-        self._confidences: NDArray[np.float32] = np.empty(0, np.float32)
+        self._confidences: Float32 = np.empty(0, np.float32)
 
     def is_listening(self) -> bool:
         """Whether labels have arrived in the last fifteen seconds."""
         return time.monotonic() - self.seen <= AWAY_SECONDS
 
-    def push(
-        self, times: Int64, labels: NDArray[np.object_], confidences: NDArray[np.float32]
-    ) -> None:
+    def push(self, times: Int64, labels: NDArray[np.object_], confidences: Float32) -> None:
         """Add labels, at least one; a pause, or a clock that was set back, begins a new sound."""
         times = np.concatenate([self._times, times])
         labels = np.concatenate([self._labels, labels])

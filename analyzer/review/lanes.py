@@ -32,6 +32,7 @@ from hearthlog.analyzer.review.timeline import (
     Style,
     Timeline,
     TimelineGrid,
+    labelled_spans,
     no_spans,
 )
 from hearthlog.models.classes import (
@@ -225,8 +226,7 @@ def reviewed_lane(
 
 def selected_lane(microphone: str, span: tuple[int, int] | None = None) -> Lane:
     """Make the lane of the selected span (ns of UTC), if there is one."""
-    edges = np.array([] if span is None else [span], np.int64).reshape(-1, 2)
-    spans = LabelledSpans(edges[:, 0], edges[:, 1], np.full(len(edges), SELECTED, object))
+    spans = labelled_spans([] if span is None else [(*span, SELECTED)])
     return Lane(microphone, "", SELECTED, spans, {SELECTED: SELECTED_COLOUR})
 
 
@@ -237,8 +237,8 @@ def _classes(
 
     Those that were heard, and as many others as there are lanes left.
     """
-    known = {name for one in labellings for name in (*one.classes, *one.spans.texts)}
-    own = [name for name in microphone.classes if name in known and class_name(name) != SILENCE]
+    labels = {name for one in labellings for name in (*one.classes, *one.spans.texts)}
+    own = [name for name in microphone.classes if name in labels and class_name(name) != SILENCE]
     names = ordered(own)
     seconds: Counter[str] = Counter()
     for one in labellings:
@@ -490,9 +490,11 @@ def features_image(
 
 def _shades(values: NDArray[np.floating]) -> Float64:
     """Scale each column from its low values (0) to its high values (1); NaN stays."""
-    known = values[~np.isnan(values).all(axis=1)]
-    lowest = np.nanmin(known, axis=0)
-    low, high = np.percentile(np.where(np.isnan(known), lowest, known), _HEAT_PERCENTILES, axis=0)
+    present = values[~np.isnan(values).all(axis=1)]
+    lowest = np.nanmin(present, axis=0)
+    low, high = np.percentile(
+        np.where(np.isnan(present), lowest, present), _HEAT_PERCENTILES, axis=0
+    )
     return np.clip((values - low) / np.maximum(high - low, _TINY), 0.0, 1.0)
 
 

@@ -18,7 +18,7 @@ from hearthlog.analyzer.marks.marks import (
     read_reviewed,
     write_marks,
 )
-from hearthlog.analyzer.review.timeline import LabelledSpans
+from hearthlog.analyzer.review.timeline import LabelledSpans, labelled_spans
 from hearthlog.schemas.frames import NANOSECONDS
 
 
@@ -179,7 +179,7 @@ class Marking:
         self._read()
         marks = (mark for same in self._marks.values() for mark in same)
         own = sorted(mark for mark in marks if mark.microphone == self.microphone)
-        return _spans([(mark.start, mark.end, mark.label) for mark in own])
+        return labelled_spans((mark.start, mark.end, mark.label) for mark in own)
 
     def reviewed(self) -> LabelledSpans:
         """Return the reviewed spans of the microphone in these logs, with how they were chosen.
@@ -189,7 +189,7 @@ class Marking:
         self._read()
         spans = (span for same in self._reviewed.values() for span in same)
         own = sorted(span for span in spans if span.microphone == self.microphone)
-        return _spans([(span.start, span.end, span.chosen) for span in own])
+        return labelled_spans((span.start, span.end, span.chosen) for span in own)
 
     def _read(self) -> None:
         for log in self.coverage.logs:
@@ -284,14 +284,6 @@ def _is_of(span: ReviewedSpan, marks: Sequence[Mark]) -> bool:
     """Return whether a span was reviewed by one of these marks."""
     places = {(mark.start, mark.end, mark.made) for mark in marks}
     return (span.start, span.end, span.made) in places and span.chosen != RANDOM
-
-
-def _spans(rows: Sequence[tuple[int, int, str]]) -> LabelledSpans:
-    return LabelledSpans(
-        np.array([start for start, _, _ in rows], np.int64),
-        np.array([end for _, end, _ in rows], np.int64),
-        np.array([text for _, _, text in rows], object),
-    )
 
 
 def _outside(span: ReviewedSpan, start: int, end: int) -> list[ReviewedSpan]:

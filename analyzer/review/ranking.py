@@ -77,12 +77,12 @@ def cover(points: Float64, gamma: float, weights: Float64, eligible: Bool, count
 
 
 def _similarities(points: Float64, gamma: float) -> Float32:
-    known = np.isfinite(points.sum(axis=1))
-    there = np.where(known[:, np.newaxis], points, 0.0).astype(np.float32)
+    finite = np.isfinite(points.sum(axis=1))
+    there = np.where(finite[:, np.newaxis], points, 0.0).astype(np.float32)
     squares = np.vecdot(there, there)
     distances = squares[:, np.newaxis] + squares - 2.0 * (there @ there.T)
     similar = np.exp(np.float32(-gamma) * np.maximum(distances, 0.0))
-    similar[~known], similar[:, ~known] = 0.0, 0.0
+    similar[~finite], similar[:, ~finite] = 0.0, 0.0
     np.fill_diagonal(similar, 1.0)
     return similar
 
@@ -185,8 +185,8 @@ def make_queue(  # noqa: PLR0913
         progress(share / steps)
 
     _add_frames(means, sources, labelling_topic(microphone, side.name, "label"), spans, report)
-    known = means.uncertainty.exist or means.novelty.exist
-    if other is None and ranking != USEFUL and not known:
+    has_values = means.uncertainty.exist or means.novelty.exist
+    if other is None and ranking != USEFUL and not has_values:
         raise DataError(
             f"{side.name}: its labels have no probabilities; name a second labelling to compare "
             "it with"

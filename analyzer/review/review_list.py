@@ -1,5 +1,6 @@
 """CSV lists of spans to review, and the label files and sounds made from them."""
 
+import csv
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ from hearthlog.analyzer.evaluation.event_scores import LabellingDifference
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
 from hearthlog.analyzer.logs.layers import Coverage
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, pieces
+from hearthlog.analyzer.logs.spans import NEVER, Spans, cut, one, pieces, union
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.analyzer.marks.formats import find_format
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
@@ -39,7 +40,6 @@ CHANGE = "change"  # a label that another model would change
 HINT = "hint"  # a sound named by a network
 REASONS = (*_PARTS, USEFUL, RANDOM, CHANGE, HINT)
 _SIZE_LIMIT = 64 << 20
-_LATEST = 1 << 62  # nanoseconds
 _NUMBER = re.compile(r"[0-9]{1,4}(\.[0-9]{1,20})?")
 
 
@@ -120,12 +120,10 @@ def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
     Raise `LogError` if the file exists, or cannot be written.
     """
     assert len(spans) <= MOST_SPANS
-    lines = [",".join(ReviewSpan._fields)]
-    for span in spans:
-        fields = span.as_text().values()
-        lines.append(",".join("" if value is None else str(value) for value in fields))
-    with new_file(path) as temporary:
-        temporary.write_text("".join(f"{line}\n" for line in lines), "utf-8", newline="\n")
+    with new_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(ReviewSpan._fields)
+        writer.writerows(span.as_text().values() for span in spans)
 
 
 def read_list(path: Path) -> list[ReviewSpan]:
@@ -170,7 +168,7 @@ def _span(where: str, fields: Sequence[str]) -> ReviewSpan:
     if score and not _NUMBER.fullmatch(score):
         raise DataError(f"{where}: {score[:64]!r} is no score")
     first, last = _time(where, start), _time(where, end)
-    if not 0 <= first < last <= _LATEST:
+    if not 0 <= first < last <= NEVER:
         raise DataError(f"{where}: {start[:40]} to {end[:40]} is no span of time")
     return ReviewSpan(
         microphone, first, last, a, label_a, b, label_b, float(score) if score else None, reason
@@ -185,7 +183,6 @@ def _time(where: str, text: str) -> int:
 
 
 _SUFFIX = ".queue.csv"
-_EVER = 1 << 62  # nanoseconds
 _SHORTEST = NANOSECONDS // 10  # minimum sound for a file
 
 
@@ -235,7 +232,7 @@ def find_kept_sound(
     Raise `LogError` if there is no log.
     """
     topic = labelling_topic(microphone, LIVE, "audio")
-    start, end = 0 if limits[0] is None else limits[0], _EVER if limits[1] is None else limits[1]
+    start, end = limits[0] or 0, NEVER if limits[1] is None else limits[1]
     layers: dict[Path, Spans] = {}
     near = logs if logs.is_dir() else logs.parent
     for layer in find_logs(near):
@@ -245,9 +242,7 @@ def find_kept_sound(
             layers[layer] = kept_time([layer], topic, start, end)
         except LogError as error:
             losses.append(str(error))
-    times = zip(NONE, *layers.values(), strict=True)
-    starts, ends = (np.concatenate(each) for each in times)
-    return KeptSoundLayers(layers, topic, joined(starts, ends))
+    return KeptSoundLayers(layers, topic, union(*layers.values()))
 
 
 def sound_files(

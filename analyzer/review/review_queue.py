@@ -4,11 +4,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
-from hearthlog.analyzer.logs.spans import NONE, Spans, joined
+from hearthlog.analyzer.logs.spans import NONE, Spans, union
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM
 from hearthlog.analyzer.promotion.paired_labels import A_DAY, class_words, time_words
 from hearthlog.analyzer.review.candidates import (
@@ -122,7 +120,7 @@ def queue_spans(  # noqa: PLR0913, PLR0917
             microphone,
             side,
             other=other,
-            reviewed=joined(*np.concatenate([done.spans, minutes], axis=1)),
+            reviewed=union(done.spans, minutes),
             count=wanted - len(drawn_at_random),
             ranking=queue,
             models=models,

@@ -18,7 +18,6 @@ from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_queue import ReviewItem
 from hearthlog.analyzer.review.timeline import Key, LabelledSpans, Question, SoundClip, sound_of
 from hearthlog.models.classes import TELEVISION, UNKNOWN, in_words
-from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import NANOSECONDS
 
@@ -103,7 +102,7 @@ class ReviewSession:
     marking: Marking
     classes: Sequence[str]
     zone: tzinfo
-    say: Callable[[str], None]
+    announce: Callable[[str], None]
     look_closely: Callable[[int, int], None]
     listen: Callable[[int, int], tuple[float, str]]
     stop: Callable[[], None]
@@ -162,7 +161,7 @@ class ReviewSession:
         """
         self._began = time.monotonic()
         self._redraw()
-        self.say(
+        self.announce(
             "press a if the label is right, else the key of the right class; n skips"
             if self.items
             else f"{_SELECT}; then press a key"
@@ -188,21 +187,18 @@ class ReviewSession:
         A key is one of `keys`, Enter, or a space, which plays. Any other key except white space
         shows the list of keys.
         """
-        try:
-            self._press(key)
-        except HearthlogError as error:
-            self.say(str(error))
-        except (ConnectionError, TimeoutError):
-            self.say("nothing was done, as the viewer did not answer: press the key again")
-
-    def _press(self, key: str) -> None:
         actions = self._actions()
         same = {"\n": _RIGHT, " ": "p"}.get(key, key)
-        if same in actions:
-            actions[same][1]()
-        elif key.strip():
-            known = ", ".join(f"{one.cap} {one.text}" for one in self.keys)
-            self.say(f"{key!r} does nothing; the keys are: {known}")
+        try:
+            if same in actions:
+                actions[same][1]()
+            elif key.strip():
+                keys = ", ".join(f"{one.cap} {one.text}" for one in self.keys)
+                self.announce(f"{key!r} does nothing; the keys are: {keys}")
+        except HearthlogError as error:
+            self.announce(str(error))
+        except (ConnectionError, TimeoutError):
+            self.announce("nothing was done, as the viewer did not answer: press the key again")
 
     def _mark_as(self, label: str) -> None:
         chosen = "" if self._in_minute or not self.items else self.items[self._at].chosen
@@ -248,16 +244,16 @@ class ReviewSession:
 
     def _done(self, start: int, end: int, text: str) -> None:
         self._judged.append(self._at)
-        self.say(f"{text}: {self._text(start, end)}")
+        self.announce(f"{text}: {self._text(start, end)}")
         self._redraw()
 
     def _undo(self) -> None:
         span = self.marking.undo()
         if span is None:
-            self.say("nothing to undo")
+            self.announce("nothing to undo")
             return
         judged = self._judged.pop()
-        self.say(f"undone: {self._text(*span)}")
+        self.announce(f"undone: {self._text(*span)}")
         self._redraw()
         if judged != self._at:
             self._go(judged - self._at)
@@ -274,19 +270,19 @@ class ReviewSession:
         try:
             yield
         except (ConnectionError, TimeoutError):
-            self.say("saved, but not shown, as the viewer did not answer")
+            self.announce("saved, but not shown, as the viewer did not answer")
 
     def _play(self) -> None:
         """Play the selected span, or the item; stop a sound that plays."""
         if time.monotonic() < self._plays_until:
             self._plays_until = 0.0
             self.stop()
-            self.say("stopped")
+            self.announce("stopped")
             return
         start, end = self.span_to_play()
         seconds, text = self.listen(start, end)
         self._plays_until = time.monotonic() + seconds
-        self.say(text)
+        self.announce(text)
         if seconds:
             self.screen.play(start)
 
@@ -304,7 +300,7 @@ class ReviewSession:
     def _look_around(self) -> None:
         cursor = self._cursor()
         self.look_closely(cursor - _AROUND, cursor + _AROUND)
-        self.say(f"each frame drawn: {self._text(cursor - _AROUND, cursor + _AROUND)}")
+        self.announce(f"each frame drawn: {self._text(cursor - _AROUND, cursor + _AROUND)}")
 
     def _begin_here(self) -> None:
         """Begin a span, or move the start of the selected one."""
@@ -315,7 +311,7 @@ class ReviewSession:
             return
         self._begin = cursor
         begin = local_time(self._begin, self.zone)
-        self.say(f"start set, {begin:%H:%M:%S}: put the time cursor on the end and press ]")
+        self.announce(f"start set, {begin:%H:%M:%S}: put the time cursor on the end and press ]")
 
     def _end_here(self) -> None:
         selection = self.screen.selection()
@@ -328,7 +324,7 @@ class ReviewSession:
 
     def _select(self, start: int, end: int) -> None:
         self.screen.show(start, end, _margin(start, end))
-        self.say(self._text(start, end))
+        self.announce(self._text(start, end))
 
     def _cursor(self) -> int:
         cursor = self.screen.cursor()
@@ -355,7 +351,7 @@ class ReviewSession:
             return
         item = self.items[self._at]
         place = f"{self._at + 1} of {len(self.items)}"
-        self.say(f"{place}: {_question(item)} {self._text(item.start, item.end)}; {item.text}")
+        self.announce(f"{place}: {_question(item)} {self._text(item.start, item.end)}; {item.text}")
         margin = _margin(item.start, item.end)
         with self._unless_silent():
             self.look_closely(item.start - margin, item.end + margin)
@@ -372,7 +368,7 @@ class ReviewSession:
         minutes = (time.monotonic() - self._began) / 60
         count = len(self._judged)
         spans = "1 span" if count == 1 else f"{count} spans"
-        self.say(f"{spans} reviewed in {minutes:.1f} min, {count / minutes:.1f} a minute")
+        self.announce(f"{spans} reviewed in {minutes:.1f} min, {count / minutes:.1f} a minute")
 
     def _answers(self) -> list[Key]:
         """Return the keys that answer the question of the current item."""
@@ -414,23 +410,17 @@ def sound_file(clips: Sequence[SoundClip], start: int, end: int) -> bytes:
     return wav_bytes(samples, rate)
 
 
-def listen(
-    clips: Sequence[SoundClip],
-    start: int,
-    end: int,
-    play: Callable[[Float32, int], None] = play_sound,
-) -> tuple[float, str]:
+def listen(clips: Sequence[SoundClip], start: int, end: int) -> tuple[float, str]:
     """Start playback of the kept sound of a span of time.
 
-    `play` plays samples of a rate, and raises `LogError` if that is not possible. Return the length
-    of the sound in seconds, 0 if nothing plays, and a line for the reviewer: the length, or why
-    there is no sound.
+    Return the length of the sound in seconds, 0 if nothing plays, and a line for the reviewer: the
+    length, or why there is no sound.
     """
     rate, samples = sound_of(clips, start, end)
     if not len(samples):
         return 0.0, _NO_SOUND
     try:
-        play(samples, rate)
+        play_sound(samples, rate)
     except LogError as error:
         return 0.0, str(error)
     seconds = len(samples) / rate

@@ -25,7 +25,7 @@ from hearthlog.models.features.installed import feature_set
 from hearthlog.models.features.window_inputs import Inputs, WindowStatistics
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.models.modelfile.registry import find_model
-from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
@@ -38,16 +38,10 @@ _MOST = 5_000_000
 
 
 @dataclass(frozen=True)
-class JudgeableSpans:
-    """Spans in time order, without overlaps."""
+class JudgeableSpans(Events):
+    """Spans in time order (nanoseconds of UTC), without overlaps."""
 
-    starts: Int64  # [shape=(n,)], in nanoseconds of UTC
-    ends: Int64  # likewise
-    labels: Int64  # [shape=(n,)]; indices of classes
     sources: Int64  # [shape=(n,)]; equal for spans cut from the same segment
-
-    def __len__(self) -> int:
-        return len(self.starts)
 
     def take(self, rows: Int64) -> "JudgeableSpans":
         """Return some of the spans; rows must be in time order, or the result is not."""
@@ -83,7 +77,7 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
     return JudgeableSpans(begins, stops, segments.labels[longest][source], source)
 
 
-def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def border_pieces(spans: JudgeableSpans, silent: Bool) -> Bool:
     """Find spans shorter than a second next to another sound; `silent` labels are silence.
 
     Where one sound changes into the next the label wavers, and a person hears only the two. A sound
@@ -91,10 +85,10 @@ def border_pieces(spans: JudgeableSpans, silent: NDArray[np.bool_]) -> NDArray[n
     """
     touching = spans.starts[1:] == spans.ends[:-1]
     sounds = ~silent[spans.labels]
-    beside = np.zeros(len(spans), bool)
-    beside[1:] |= touching & sounds[:-1]
-    beside[:-1] |= touching & sounds[1:]
-    return beside & (spans.ends - spans.starts < _FLICKER)
+    is_next = np.zeros(len(spans), bool)
+    is_next[1:] |= touching & sounds[:-1]
+    is_next[:-1] |= touching & sounds[1:]
+    return is_next & (spans.ends - spans.starts < _FLICKER)
 
 
 def without(segments: Events, reviewed: Spans) -> Events:
@@ -103,14 +97,13 @@ def without(segments: Events, reviewed: Spans) -> Events:
     return Events(*spans, segments.labels[rows])
 
 
-def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, NDArray[np.float64]]:
+def other_labels(spans: JudgeableSpans, others: Events) -> tuple[Int64, Float64]:
     """Compare spans with another labelling.
 
     Return its main label in each span, -1 for none, and the share of each span with a different
     label, 0 to 1.
     """
-    own = Events(spans.starts, spans.ends, spans.labels)
-    pieces = overlay([own, others]).in_all()
+    pieces = overlay([spans, others]).in_all()
     row, label = pieces.rows[0], others.labels[pieces.rows[1]]
     lengths = pieces.ends - pieces.starts
     apart = np.where(label != spans.labels[row], lengths, 0)
@@ -249,7 +242,8 @@ def span_sounds(
         recorded = _read(sources, name, start - _BEFORE, end)
         if recorded is not None:
             if space is None or not space.is_of(recorded):
-                space = _space_of_features(recorded)
+                width = recorded["values"].shape[1]
+                space = _Space(None, WindowStatistics(BLOCK_FRAMES, np.asarray, width))
             means = _means(recorded, spans.starts[part], spans.ends[part], space)
             if means.shape[1] != points.shape[1]:
                 points = np.full((len(spans), means.shape[1]), np.nan)
@@ -336,11 +330,6 @@ def _space(model: Model) -> _Space | None:
         return None
     inputs = features.inputs[description.inputs]
     return _Space(features, inputs, arrays["scaler_mean"], arrays["scaler_scale"], gamma)
-
-
-def _space_of_features(recorded: Columns) -> _Space:
-    width = recorded["values"].shape[1]
-    return _Space(None, WindowStatistics(BLOCK_FRAMES, np.asarray, width))
 
 
 def _groups(spans: JudgeableSpans) -> Iterator[tuple[int, int]]:

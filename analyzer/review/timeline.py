@@ -1,7 +1,7 @@
 """Timeline: lanes and plots of some logs on a time grid, and the clock of the home."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, tzinfo
 from enum import Enum, auto
@@ -14,7 +14,7 @@ from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.local_time import home_zone, local_time
 from hearthlog.models.classes import in_words, ordered
-from hearthlog.schemas.arrays import Float32, Float64, Int16, Int64
+from hearthlog.schemas.arrays import Float32, Float64, Indices, Int16, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import scenario_name
 
@@ -44,7 +44,7 @@ class TimelineGrid:
         edges = self.edges
         return edges[:-1] + (edges[1:] - edges[:-1]) // 2
 
-    def find(self, times: Int64) -> NDArray[np.intp]:
+    def find(self, times: Int64) -> Indices:
         """Find the share with each time (ns of UTC), 0 to count - 1, or the nearest one."""
         places = (times - self.start) * (self.count / (self.end - self.start))
         return np.clip(places.astype(np.int64), 0, self.count - 1)
@@ -122,9 +122,19 @@ class LabelledSpans(NamedTuple):
         return len(self.starts)
 
 
+def labelled_spans(rows: Iterable[tuple[int, int, str]] = ()) -> LabelledSpans:
+    """Collect spans, each given as its start, end and text, in time order."""
+    rows = list(rows)
+    return LabelledSpans(
+        np.array([start for start, _, _ in rows], np.int64),
+        np.array([end for _, end, _ in rows], np.int64),
+        np.array([text for _, _, text in rows], object),
+    )
+
+
 def no_spans() -> LabelledSpans:
     """Return an empty `LabelledSpans`."""
-    return LabelledSpans(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, object))
+    return labelled_spans()
 
 
 class Style(Enum):
@@ -268,8 +278,8 @@ def spectrogram(
         window = max(round(clip.rate * _WINDOW_SECONDS), 2)
         middles = (times[inside] - clip.start) * (clip.rate / NANOSECONDS)
         places = middles.astype(np.int64)[:, np.newaxis] + np.arange(window) - window // 2
-        known = (places >= 0) & (places < len(clip.samples))
-        frames = np.where(known, clip.samples[np.clip(places, 0, len(clip.samples) - 1)], 0)
+        exists = (places >= 0) & (places < len(clip.samples))
+        frames = np.where(exists, clip.samples[np.clip(places, 0, len(clip.samples) - 1)], 0)
         bins = np.abs(np.fft.rfft(frames * np.hanning(window))) ** 2
         frequencies = np.linspace(_HIGHEST, 0.0, rows)
         nearest = np.rint(frequencies * window / clip.rate).astype(np.int64)

@@ -50,6 +50,7 @@ from hearthlog.analyzer.review.timeline import (
     SoundClip,
     Timeline,
     TimelineGrid,
+    labelled_spans,
     no_spans,
 )
 from hearthlog.models.classifiers.network_names import MOST_AHEAD_FRAMES
@@ -206,10 +207,6 @@ class _Microphone:
         return LabelledSpans(starts[order], ends[order], spans.texts[order])
 
 
-def _one_span(start: int, end: int, text: str) -> LabelledSpans:
-    return LabelledSpans(np.array([start]), np.array([end]), np.array([text], object))
-
-
 def _shares(means: Mapping[tuple[str, ...], GridMeans], grid: TimelineGrid) -> Iterator[Plot]:
     """Yield the grid shares as frames, without empty shares."""
     for names, part in means.items():
@@ -237,11 +234,7 @@ def _runs(parts: Iterable[Plot], after: int, step: int) -> Iterator[LabelledSpan
 def _trouble_spans(states: Sequence[MicrophoneHealth], end: int) -> LabelledSpans:
     """Hold each trouble until the next message that ends or replaces it."""
     changes = [(state.time, state.text or None) for state in states]
-    spans = [span for span in lasting(changes, end) if span[0] < span[1]]
-    if not spans:
-        return no_spans()
-    starts, ends, texts = zip(*spans, strict=True)
-    return LabelledSpans(np.array(starts), np.array(ends), np.array(texts, object))
+    return labelled_spans(span for span in lasting(changes, end) if span[0] < span[1])
 
 
 def _join_clips(parts: list[SoundClip]) -> list[SoundClip]:
@@ -435,11 +428,11 @@ class _Reader:
                 if mark.start < self._grid.end and mark.end > self._grid.start:
                     microphone = self._microphone(mark.microphone)
                     own = microphone.spans.setdefault(review_labelling(scenario), [])
-                    own.append(_one_span(mark.start, mark.end, mark.label))
+                    own.append(labelled_spans([(mark.start, mark.end, mark.label)]))
                     microphone.reviewed.setdefault(scenario, [])
             for one in reviewed:
                 own = self._microphone(one.microphone).reviewed.setdefault(scenario, [])
-                own.append(_one_span(one.start, one.end, one.chosen))
+                own.append(labelled_spans([(one.start, one.end, one.chosen)]))
 
     def _read_messages(self, file: TimedFile, types: Mapping[str, Sequence[str]]) -> None:
         for topics, end, every in self._parts(file):

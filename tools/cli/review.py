@@ -245,7 +245,7 @@ def _show(
 
     def announce(text: str) -> None:
         print(printable(text), flush=True)
-        viewer.say(text)
+        viewer.announce(text)
 
     def look_closely(start: int, end: int) -> None:
         if not items:

@@ -43,9 +43,9 @@ LINES, CLIP, WORDS, SPECTRUM = "events", "clip", "words", "spectrum"
 HOURS, HOURS_NAME = "Hour", "words/hours"
 NOTHING = "words/nothing"  # an empty text
 CLOSE_UP = "/close_up"  # suffix of a microphone's name
-ASKED, ASKED_NAME = "asked", "words/asked_name"
+REQUESTED, REQUESTED_NAME = "asked", "words/asked_name"
 QUESTION, ANSWERS = "words/question", "words/asked"
-_ASKED, _COVERED, _ASKED_STROKES = SELECTED_COLOUR, (95, 92, 84), 600  # strokes of a band
+_REQUESTED, _COVERED, _REQUESTED_STROKES = SELECTED_COLOUR, (95, 92, 84), 600  # strokes of a band
 _SELECTED_PLACE = 0.65, 0.35  # the lower edge of the row is out of sight
 
 _THICKNESS = 0.5  # of a strip, in lanes, without the width of its lines
@@ -71,9 +71,10 @@ class DrawnLane:
             if not part <= wanted:
                 canvas.hide(entity)
                 del self._parts[entity]
-        fresh = wanted.difference(*self._parts.values())
-        parts = self._divide(fresh).items()
-        for text, strips in sorted(parts, key=lambda part: (-_length(part[1]), part[0])):
+        fresh: dict[str, set[_Strip]] = {}
+        for strip in wanted.difference(*self._parts.values()):
+            fresh.setdefault(strip[2], set()).add(strip)
+        for text, strips in sorted(fresh.items(), key=lambda part: (-_length(part[1]), part[0])):
             layer = 0 if text == REVIEWED else 1  # the viewer draws in name order
             entity = f"{self._root}/{layer}/{self._count:06}"
             times = np.array(sorted(strip[:2] for strip in strips))
@@ -81,13 +82,6 @@ class DrawnLane:
             canvas.draw_strips(entity, self._places, spans, text, lane.colours[text])
             self._parts[entity] = strips
             self._count += 1
-
-    @staticmethod
-    def _divide(strips: Iterable[_Strip]) -> dict[str, set[_Strip]]:
-        found: dict[str, set[_Strip]] = {}
-        for strip in strips:
-            found.setdefault(strip[2], set()).add(strip)
-        return found
 
 
 class LanePlace(NamedTuple):
@@ -172,9 +166,9 @@ def _draw_hours(timeline: Timeline, canvas: Canvas) -> None:
 def write_checked(timeline: Timeline, checked: Checked, canvas: Canvas) -> None:
     """Write next to the recorder's classes how many of their sounds were right in this home."""
     for lane, place in placed_lanes(timeline):  # other lanes are below the classes
-        known = checked.get((lane.microphone, lane.name))
-        if lane.labelling == LIVE and known is not None:
-            canvas.write(place.name, f"{lane.name} · {known.right}/{known.labelled} right")
+        check = checked.get((lane.microphone, lane.name))
+        if lane.labelling == LIVE and check is not None:
+            canvas.write(place.name, f"{lane.name} · {check.right}/{check.labelled} right")
 
 
 def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
@@ -197,7 +191,7 @@ class RequestedSpan(DrawnLane):
     """The row of the requested span; a selected span is drawn on it, and brighter."""
 
     def __init__(self) -> None:
-        super().__init__(f"{ASKED}/selected", *_SELECTED_PLACE)
+        super().__init__(f"{REQUESTED}/selected", *_SELECTED_PLACE)
         self._number, self._span, self._text = 0, (0, 0), ""
 
     def ask(self, start: int, end: int, question: Question, canvas: Canvas) -> None:
@@ -206,14 +200,14 @@ class RequestedSpan(DrawnLane):
             canvas.hide(self._entity)
         self._number += 1
         self._span, self._text = (start, end), question.text
-        self._colour(_ASKED, canvas)
+        self._colour(_REQUESTED, canvas)
         middle = np.array([(start + end) // 2])
-        canvas.add_bands(self._entity, middle, np.ones((1, 1)), end - start, _ASKED_STROKES)
+        canvas.add_bands(self._entity, middle, np.ones((1, 1)), end - start, _REQUESTED_STROKES)
         keys = " · ".join(f"**{_plain(one.cap)}** {_plain(one.text)}" for one in question.keys)
         where = f"{_plain(question.keys_in)}: " if question.keys_in else ""
         canvas.write(QUESTION, f"# {_plain(question.text)}", rr.MediaType.MARKDOWN)
         canvas.write(ANSWERS, f"{_plain(question.place)}\\\n{where}{keys}", rr.MediaType.MARKDOWN)
-        canvas.write(ASKED_NAME, "Asked about")
+        canvas.write(REQUESTED_NAME, "Asked about")
 
     def show(self, lane: Lane, canvas: Canvas) -> None:
         """Draw a selected span, unless it is the requested one."""
@@ -221,12 +215,12 @@ class RequestedSpan(DrawnLane):
         if (*starts.tolist(), *ends.tolist()) == self._span:
             spans = no_spans()
         super().show(lane._replace(spans=spans), canvas)
-        self._colour(_COVERED if len(spans) else _ASKED, canvas)
-        canvas.write(ASKED_NAME, "Light: selected" if len(spans) else "Asked about")
+        self._colour(_COVERED if len(spans) else _REQUESTED, canvas)
+        canvas.write(REQUESTED_NAME, "Light: selected" if len(spans) else "Asked about")
 
     @property
     def _entity(self) -> str:
-        return f"{ASKED}/{self._number}"
+        return f"{REQUESTED}/{self._number}"
 
     def _colour(self, shade: Colour, canvas: Canvas) -> None:
         canvas.configure(self._entity, Style.BANDS, [self._text], [shade])
@@ -321,7 +315,7 @@ APPLICATION = "hearthlog"
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
 _LANE, _CLOSE_LANE, _AROUND_LANES = 29, 27, 50
-_LEVEL_HEIGHT, _PLOT_HEIGHT, _ASKED_HEIGHT = 90, 140, 28
+_LEVEL_HEIGHT, _PLOT_HEIGHT, _REQUESTED_HEIGHT = 90, 140, 28
 _QUESTION_HEIGHT = 62  # of a heading, with the space that the viewer leaves above it
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
@@ -331,7 +325,7 @@ _HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 42
 _SPECTRUM_SHAPE = (64, 2240)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 # Widths of a text and a plot, until that of the window is known; the hours have no axis.
-COLUMNS, ASKED_COLUMNS, HOUR_COLUMNS, _QUESTION_COLUMNS = (2, 10), (2, 12), (2, 11), (3, 7)
+COLUMNS, REQUESTED_COLUMNS, HOUR_COLUMNS, _QUESTION_COLUMNS = (2, 10), (2, 12), (2, 11), (3, 7)
 Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
 
@@ -435,11 +429,12 @@ def review_layout(
     for plot in timeline_plots(timeline):
         plots[plot.microphone].append(plot)
     places = placed_lanes(timeline, marking=marking and not close_up)
+    sampled = "" if timeline.every == 1 else f"; a sample: one part in {timeline.every}"
     stacks: dict[str, list[Row]] = {}
     for name, microphone in timeline.microphones.items():
         own = [(lane.labelling, place) for lane, place in places if lane.microphone == name]
         count = len({place.height for _, place in own})
-        views = _lane_views(microphone, own, count, _note(timeline))
+        views = _lane_views(microphone, own, count, f"{clock.name}{sampled}")
         height = (_CLOSE_LANE if close_up else _LANE) * count + _AROUND_LANES
         rows: list[Row] = [(height, rrb.Tabs(*views, lines_view()))]
         more = _plot_views(microphone, plots[name], timeline, close_up=close_up)
@@ -460,17 +455,12 @@ def review_layout(
     )
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
     words = rrb.Horizontal(_text(QUESTION), _text(ANSWERS), column_shares=_QUESTION_COLUMNS)
-    question: list[Row] = [(_QUESTION_HEIGHT, words), (_ASKED_HEIGHT, _requested_view())]
+    question: list[Row] = [(_QUESTION_HEIGHT, words), (_REQUESTED_HEIGHT, _requested_view())]
     homes = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []
     everything = [*(question if close_up else hours), homes]
     share = max(own[close_up][0] for own in stacks.values()) / sum(part for part, _ in everything)
     return TimelineBlueprint(everything, panel, start, end, lanes_share=share)
-
-
-def _note(timeline: Timeline) -> str:
-    sampled = "" if timeline.every == 1 else f"; a sample: one part in {timeline.every}"
-    return f"{timeline.clock.name}{sampled}"
 
 
 def _lane_views(
@@ -483,12 +473,12 @@ def _lane_views(
         entities = [lanes_entity(microphone.name, each) for each in dict.fromkeys((labelling, ""))]
         names = [place.name for own, place in places if own in {labelling, ""}]
         lanes = _time_series(words, entities, (0.0, count * LANE_HEIGHT))
-        beside = rrb.Vertical(
+        texts = rrb.Vertical(
             *(_text(name) for name in names), _text(NOTHING), row_shares=[*[1.0] * count, BELOW]
         )
         by = f" by {words}" if words else ""
         title = f"What was heard{by}: {note}"
-        views.append(rrb.Horizontal(beside, lanes, column_shares=COLUMNS, name=title))
+        views.append(rrb.Horizontal(texts, lanes, column_shares=COLUMNS, name=title))
     return views
 
 
@@ -536,8 +526,8 @@ def _spectrum_view(microphone: str) -> rrb.Container:
 
 
 def _requested_view() -> rrb.Container:
-    lane = _time_series("Which span is asked", [ASKED], (0.0, 1.0))
-    return rrb.Horizontal(_text(ASKED_NAME), lane, column_shares=ASKED_COLUMNS)
+    lane = _time_series("Which span is asked", [REQUESTED], (0.0, 1.0))
+    return rrb.Horizontal(_text(REQUESTED_NAME), lane, column_shares=REQUESTED_COLUMNS)
 
 
 def _close_up(plot: Plot, clock: str) -> rrb.Container:
@@ -546,14 +536,14 @@ def _close_up(plot: Plot, clock: str) -> rrb.Container:
     before, after = (Boundary.cursor_relative(seconds=seconds) for seconds in _NEAR)
     near = rr.VisibleTimeRange(clock, start=before, end=after)
     view.properties["VisibleTimeRanges"] = rrb.VisibleTimeRanges(near)
-    return _beside([plot], view, ", close up")
+    return _with_text([plot], view, ", close up")
 
 
 def _all(plots: Sequence[Plot]) -> rrb.Container:
-    return _beside(plots, plot_view(plots, [plot_entity(plot) for plot in plots]))
+    return _with_text(plots, plot_view(plots, [plot_entity(plot) for plot in plots]))
 
 
-def _beside(plots: Sequence[Plot], view: rrb.View, note: str = "") -> rrb.Container:
+def _with_text(plots: Sequence[Plot], view: rrb.View, note: str = "") -> rrb.Container:
     """Put a view of plots with one title next to a text that explains them."""
     labelling = f": {labelling_in_words(plots[0].labelling)}" if plots[0].kind is SHARES else ""
     return rrb.Horizontal(

@@ -33,10 +33,10 @@ from hearthlog.analyzer.review.timeline import (
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
     APPLICATION,
-    ASKED_COLUMNS,
     BELOW,
     COLUMNS,
     HOUR_COLUMNS,
+    REQUESTED_COLUMNS,
     SHARED_AXIS,
     DrawnLane,
     RequestedSpan,
@@ -134,7 +134,7 @@ class Viewer(ABC):
         `HearthlogError` if there is none.
         """
 
-    def say(self, text: str) -> None:  # noqa: B027 - lines are printed in the terminal, too
+    def announce(self, text: str) -> None:  # noqa: B027 - lines are printed in the terminal, too
         """Show a line in the page of the viewer, if it has one."""
 
     def close(self) -> None:
@@ -305,7 +305,7 @@ class Viewer(ABC):
             shares = {path: _container(blueprint, path) for path in blueprint}
             for columns, left in (
                 (COLUMNS, _RULER_LEFT - _SCALE_WIDTH),
-                (ASKED_COLUMNS, _RULER_LEFT - _DIGIT_WIDTH),
+                (REQUESTED_COLUMNS, _RULER_LEFT - _DIGIT_WIDTH),
                 (HOUR_COLUMNS, _RULER_LEFT),
             ):
                 own = [*map(float, columns)]
@@ -518,14 +518,14 @@ def open_window(port: int | None = None, data: str | None = None) -> WindowViewe
     return _opened(port, "--connect", data, "--memory-limit", _MEMORY)
 
 
-def open_hidden(port: int | None = None, size: tuple[int, int] = (1920, 1080)) -> WindowViewer:
+def open_hidden(size: tuple[int, int] = (1920, 1080)) -> WindowViewer:
     """Run the viewer without a window, for pictures of a width and height.
 
-    Raise `DataError` if the viewer is not installed, or the port is in use.
+    Raise `DataError` if the viewer is not installed.
     """
     width, height = size
     window = "--window-size", f"{width}x{height}"
-    return _opened(port, "--expect-data-soon", "--headless", *window)
+    return _opened(None, "--expect-data-soon", "--headless", *window)
 
 
 def _opened(port: int | None, *more: str) -> WindowViewer:

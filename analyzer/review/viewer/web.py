@@ -298,7 +298,7 @@ class _PageViewer(Viewer):
     ) -> None:
         self._relay.keys, self._relay.press, self._relay.sound = keys, press, sound
 
-    def say(self, text: str) -> None:
+    def announce(self, text: str) -> None:
         self._relay.texts.put(text)
 
     def close(self) -> None:
