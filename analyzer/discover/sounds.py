@@ -190,8 +190,9 @@ def read_log_sounds(
         is_finite: Bool = np.isfinite(described).min(axis=1, initial=True)
         lost = int((~is_finite).sum())
         spans = spans.rows(is_finite)
-        heard = mean_embeddings(columns.get(topic(name, "embedding")), spans.starts, spans.ends)
-        yield LogSounds(name, names, spans, described[is_finite], *heard, lost)
+        embedded = columns.get(topic(name, "embedding"))
+        embeddings = mean_embeddings(embedded, spans.starts, spans.ends)
+        yield LogSounds(name, names, spans, described[is_finite], *embeddings, lost)
 
 
 def lost_text(log: Path, lost: int) -> str:
@@ -319,8 +320,8 @@ def discover(
         described = sounds.descriptors[drawn], sounds.embedding, sounds.embeddings[drawn]
         groups = new_groups(sounds.features, *described)
     points, embedded = groups.points(sounds.descriptors, sounds.embeddings)
-    heard, of = is_embedded(embedded), np.full(count, NO_CLUSTER)
-    for own, by_embedding in ((heard, True), (~heard, False)):
+    has_embedding, of = is_embedded(embedded), np.full(count, NO_CLUSTER)
+    for own, by_embedding in ((has_embedding, True), (~has_embedding, False)):
         _assign(of, own, groups, points, embedded)
         inside = drawn[own[drawn]]
         inside_embedded = embedded[inside] if by_embedding else None

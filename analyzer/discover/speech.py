@@ -387,19 +387,19 @@ def _turns(stamps: Int64, voice: Int64) -> tuple[Int64, Int64, Int64]:
     return stamps[first], stamps[last] + FRAME_NANOSECONDS, voice[first]
 
 
-def find_voices(speech: HomeSpeech, known: HomeVoices | None) -> tuple[HomeVoices, Int64]:
+def find_voices(speech: HomeSpeech, earlier: HomeVoices | None) -> tuple[HomeVoices, Int64]:
     """Find the voices of a home in its conversations.
 
     Voices of an earlier run stay unchanged; None for the first run. Return also the home voice row
     of each conversation voice; `NO_CLUSTER` if none matches. Raise `DataError` if there are no
     earlier voices and too little speech to separate voices.
     """
-    if known is None and speech.seconds < LEAST_SECONDS:
+    if earlier is None and speech.seconds < LEAST_SECONDS:
         raise DataError(
             f"{speech.seconds:.0f} s of speech are too few to tell voices apart: it takes "
             f"{LEAST_SECONDS:.0f} s"
         )
-    voices = known or HomeVoices(np.empty(0, np.int64), no_evidence())
+    voices = earlier or HomeVoices(np.empty(0, np.int64), no_evidence())
     while True:
         of = recognised(speech.voices, voices.evidence)
         added = with_new_voices(voices, speech.voices.rows(of == NO_CLUSTER))

@@ -146,7 +146,8 @@ def summarise(
     sounds: "HomeSounds", groups: "Groups", of: Int64, points: Float64, zone: tzinfo
 ) -> list[GroupSummary]:
     """Summarise the groups of some sounds, largest first."""
-    apart = _typical_distance(points)
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1) if len(points) else [0.0]
+    apart = float(np.median(distances))
     found = []
     for row, number in enumerate(groups.numbers.tolist()):
         rows = np.flatnonzero(of == row)
@@ -213,12 +214,6 @@ def _examples(occurrences: Occurrences, rows: Int64) -> list[Example]:
         )
         for row in rows[:_SHOWN]
     ]
-
-
-def _typical_distance(points: Float64) -> float:
-    if not len(points):
-        return 0.0
-    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
 
 
 _USUAL = 0.8  # share of the sounds within the busiest hours

@@ -231,12 +231,12 @@ class HomeVoices(Clusters):
     evidence: VoiceEvidence
 
 
-def recognised(evidence: VoiceEvidence, known: VoiceEvidence) -> Int64:
+def recognised(evidence: VoiceEvidence, earlier: VoiceEvidence) -> Int64:
     """Return the existing voice of each row if one is likelier than two, else `NO_CLUSTER`."""
     best = np.zeros(len(evidence.counts))
     of = np.full(len(best), NO_CLUSTER)
-    for row in range(len(known.counts)):
-        ratio = same_voice(known.rows(np.array([row])), evidence)
+    for row in range(len(earlier.counts)):
+        ratio = same_voice(earlier.rows(np.array([row])), evidence)
         better = ratio > best
         best[better], of[better] = ratio[better], row
     return of

@@ -7,12 +7,11 @@ from itertools import repeat
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.findings import Findings, Level
 from hearthlog.models.classifiers.network_names import MOST_AHEAD_FRAMES
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
@@ -145,7 +144,7 @@ class ColumnChecks:
     def _report(
         self,
         rule: str,
-        wrong: NDArray[np.bool_],
+        wrong: Bool,
         what: Callable[[int], str],
         level: Level = "error",
     ) -> None:
@@ -252,7 +251,7 @@ class ColumnChecks:
         )
         free = [CLOCK_SET in each or each.startswith(LOG_DAMAGED) for each in reasons]
         frames = durations.astype(np.float64) / FRAME_NANOSECONDS
-        differ: NDArray[np.bool_] = np.abs(frames - lost.astype(np.float64)) > 1
+        differ: Bool = np.abs(frames - lost.astype(np.float64)) > 1
         self._report(
             "gap-duration",
             differ & ~np.array(free, bool) & (durations >= 0),

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import printable
 from hearthlog.schemas.frames import millisecond_text
 
@@ -82,8 +82,8 @@ class Findings:
     def rows(  # noqa: PLR0913
         self,
         rule: str,
-        wrong: NDArray[np.bool_],
-        times: NDArray[np.int64],
+        wrong: Bool,
+        times: Int64,
         what: Callable[[int], str],
         level: Level = "error",
         *,

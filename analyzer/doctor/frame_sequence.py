@@ -3,7 +3,6 @@
 from collections.abc import Callable, Collection
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor.column_checks import (
     DIRECTION,
@@ -18,7 +17,7 @@ from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.models.classifiers.classifier import LabelTiming
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
 from hearthlog.models.embedding.projection import WINDOW_FRAMES
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 # ns. Behind a sound server, stamps follow block arrival, with up to 45 % error at first.
@@ -117,7 +116,8 @@ class FrameSequence:
             return
         runs = self._check_features(features, gaps)
         if STATISTICS not in self._thinned:
-            self._check_same(features, statistics, STATISTICS, self._with_statistics(features))
+            expects = None if self._every is None else features[:, 1] % self._every == 0
+            self._check_same(features, statistics, STATISTICS, expects)
         ends = _at_ends(directions, BLOCK_FRAMES - 1)
         self._check_same(features, ends, DIRECTION, None)
         ends = _at_ends(embeddings, WINDOW_FRAMES - 1)
@@ -138,7 +138,7 @@ class FrameSequence:
             self._pending[kind] = [rows[~done]]
         return rows[done]
 
-    def _check_features(self, rows: Int64, gaps: Int64) -> NDArray[np.bool_]:
+    def _check_features(self, rows: Int64, gaps: Int64) -> Bool:
         """Compare frame numbers, stamps and gaps; return at which frames the sound starts anew."""
         following = np.searchsorted(rows[:, 2], gaps[:, 0])
         waiting = following == len(rows)
@@ -182,7 +182,7 @@ class FrameSequence:
         last[following] = gaps[:, 0]
         return ((count > 0) & ~np.isin(last, self._damages[:, 0])) | (rows[:, 1] == 0)
 
-    def _check_steps(self, rows: Int64, has_previous: NDArray[np.bool_], steps: Int64) -> None:
+    def _check_steps(self, rows: Int64, has_previous: Bool, steps: Int64) -> None:
         """Check that frame numbers and stamps are continuous, and that gaps explain every jump.
 
         `steps` [shape=(4, n)] are increments of the frame number and of the stamp (ns), number of
@@ -217,7 +217,7 @@ class FrameSequence:
             lambda i: f"frame {frames[i]} comes {elapsed[i] / 1e6:.3f} ms after the one before",
         )
 
-    def _are_damaged(self, times: Int64) -> NDArray[np.bool_]:
+    def _are_damaged(self, times: Int64) -> Bool:
         """Whether the log is damaged at, or right after, each log time."""
         ends, starts, _ = self._damages.T
         place = np.searchsorted(ends, times, "right")
@@ -242,18 +242,13 @@ class FrameSequence:
             self._findings.error("stamp-rate", what, DISTRUST, time=int(times[-1]))
             self._run = int(frames[-1]), int(stamps[-1])
 
-    def _with_statistics(self, features: Int64) -> NDArray[np.bool_] | None:
-        if self._every is None:
-            return None
-        return features[:, 1] % self._every == 0
-
     def _with_label(
         self,
         features: Int64,
         labels: Int64,
-        known_start: NDArray[np.bool_],
+        known_start: Bool,
         timing: LabelTiming,
-    ) -> NDArray[np.bool_]:
+    ) -> Bool:
         """Return which frames end a window without a gap.
 
         Rows of `labels` must have the numbers of window ends, not of the labelled frames.
@@ -269,7 +264,7 @@ class FrameSequence:
         return features[:, 1] >= first_end
 
     def _check_labels(
-        self, features: Int64, labels: Int64, runs: NDArray[np.bool_], timing: LabelTiming
+        self, features: Int64, labels: Int64, runs: Bool, timing: LabelTiming
     ) -> None:
         self._check_label_stamps(features, labels, timing.delay)
         ends = _at_ends(labels, timing.delay)
@@ -286,9 +281,7 @@ class FrameSequence:
             lambda i: f"the label of frame {labels[i, 1]} has another stamp than its features",
         )
 
-    def _check_same(
-        self, features: Int64, rows: Int64, kind: str, expects: NDArray[np.bool_] | None
-    ) -> None:
+    def _check_same(self, features: Int64, rows: Int64, kind: str, expects: Bool | None) -> None:
         """Compare messages of another kind with the features of the same frames."""
         times, frames, _ = rows.T
         expected = features if expects is None else features[expects]
@@ -351,9 +344,7 @@ class FrameSequence:
         self._segment = int(times[-1]), int(ends[-1])
         self._gap_ends = self._gap_ends[self._gap_ends > ends[-1]]
 
-    def _report(
-        self, rule: str, wrong: NDArray[np.bool_], times: Int64, what: Callable[[int], str]
-    ) -> None:
+    def _report(self, rule: str, wrong: Bool, times: Int64, what: Callable[[int], str]) -> None:
         self._findings.rows(rule, wrong, times, lambda row: f"{self._name}: {what(row)}")
 
 
@@ -362,11 +353,11 @@ def _at_ends(rows: Int64, delay: int) -> Int64:
     return np.stack([rows[:, 0], rows[:, 1] + delay, rows[:, 0]], axis=1)
 
 
-def _has_other_stamp(rows: Int64, features: Int64) -> NDArray[np.bool_]:
+def _has_other_stamp(rows: Int64, features: Int64) -> Bool:
     """Whether each row has another stamp than the features of its frame, if there are some."""
     order = np.argsort(features[:, 1], kind="stable")
-    known = np.flatnonzero(np.isin(rows[:, 1], features[:, 1]))
-    at = order[np.searchsorted(features[order, 1], rows[known, 1])]
+    found = np.flatnonzero(np.isin(rows[:, 1], features[:, 1]))
+    at = order[np.searchsorted(features[order, 1], rows[found, 1])]
     wrong = np.zeros(len(rows), bool)
-    wrong[known] = features[at, 2] != rows[known, 2]
+    wrong[found] = features[at, 2] != rows[found, 2]
     return wrong

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
@@ -19,12 +18,12 @@ from hearthlog.analyzer.logs.spans import (
     pieces,
     ranges,
 )
-from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 
 COLLAR = NANOSECONDS // 5
 _PART_OF_LENGTH = 0.5
-_DAY = 24 * 3600 * NANOSECONDS
+DAY = 86_400 * NANOSECONDS
 _MOST_PAIRS = 20_000_000
 
 
@@ -43,7 +42,7 @@ class Events:
         """Return the spans of one label."""
         return self.taken(np.flatnonzero(self.labels == label))
 
-    def taken(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> "Events":
+    def taken(self, rows: Indices | Bool) -> "Events":
         """Return a selection of the spans, by mask, or by row numbers in their new order."""
         return Events(self.starts[rows], self.ends[rows], self.labels[rows])
 
@@ -179,7 +178,7 @@ def false_alarms_per_day(
     are as from `laid_out`.
     """
     alarms = (_false_alarms(reference.of(i), predicted.of(i)) for i in range(len(classes)))
-    return {name: n * _DAY / duration for name, n in zip(classes, alarms, strict=True)}
+    return {name: n * DAY / duration for name, n in zip(classes, alarms, strict=True)}
 
 
 def _false_alarms(reference: Events, predicted: Events) -> int:
@@ -195,13 +194,8 @@ def _scores(counts: list[tuple[int, int, int]], classes: Sequence[str]) -> Detec
     every = _detection(right, reference, predicted)
     per_class = {name: _detection(*c) for name, c in zip(classes, counts, strict=True)}
     f1_scores = [d.f1 for d in per_class.values() if d.f1 is not None]
-    return DetectionScores(
-        every.f1,
-        every.precision,
-        every.recall,
-        float(np.mean(f1_scores)) if f1_scores else None,
-        per_class,
-    )
+    macro = float(np.mean(f1_scores)) if f1_scores else None
+    return DetectionScores(every.f1, every.precision, every.recall, macro, per_class)
 
 
 def _detection(right: int, reference: int, predicted: int) -> Detection:
@@ -214,7 +208,6 @@ def _detection(right: int, reference: int, predicted: int) -> Detection:
     )
 
 
-DAY = 86_400 * NANOSECONDS
 _MINUTE = 60 * NANOSECONDS
 
 
@@ -226,7 +219,7 @@ class LabelRuns(NamedTuple):
     a: Int64  # shape (n,), indices of classes
     b: Int64
 
-    def taken(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "LabelRuns":
+    def taken(self, which: Bool | Indices) -> "LabelRuns":
         """Return a selection of the runs, by mask, or by row numbers in their new order."""
         return LabelRuns(*(column[which] for column in self))
 

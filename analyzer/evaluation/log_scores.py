@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hearthlog.analyzer.activity.event_counts import events_of
 from hearthlog.analyzer.errors import DataError
@@ -26,7 +25,7 @@ from hearthlog.analyzer.marks.label_files import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.models.classes import SILENCE
-from hearthlog.schemas.arrays import Int64
+from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
@@ -99,9 +98,9 @@ def evaluate_labelling(
     return LogEvaluation(
         scores=scores,
         detections=detect(named, output, classes, spans.length),
-        reference_seconds=_seconds(covered.length),
-        evaluated_seconds=_seconds(spans.length),
-        ambiguous_seconds=_seconds(ambiguous * FRAME_NANOSECONDS),
+        reference_seconds=covered.length / NANOSECONDS,
+        evaluated_seconds=spans.length / NANOSECONDS,
+        ambiguous_seconds=ambiguous * FRAME_NANOSECONDS / NANOSECONDS,
         unknown_labels=unknown,
         events=_event_counts(reference, predicted, spans),
     )
@@ -131,14 +130,8 @@ def _frames(
     """
     end = int(reference.ends.max())
     block = max(_BLOCK, -(-end // _MOST_BLOCKS))
-    times = np.unique(
-        np.concatenate(
-            [
-                *(reference.starts, reference.ends, predicted_events.starts, predicted_events.ends),
-                np.arange(0, end + block, block),
-            ]
-        )
-    )
+    edges = [times for each in (reference, predicted_events) for times in (each.starts, each.ends)]
+    times = np.unique(np.concatenate([*edges, np.arange(0, end + block, block)]))
     target, several = _single(reference, times, len(classes))
     predicted, _ = _single(predicted_events, times, len(classes))
     # A frame belongs to the interval that contains its middle.
@@ -149,7 +142,7 @@ def _frames(
     return score(target[rows], predicted[rows], group, classes, weight[rows]), ambiguous
 
 
-def _single(events: Events, times: Int64, classes: int) -> tuple[Int64, NDArray[np.bool_]]:
+def _single(events: Events, times: Int64, classes: int) -> tuple[Int64, Bool]:
     """Return the label between successive times, and where there are several.
 
     -1 means no label; the number of classes means a label outside the classes.
@@ -165,10 +158,6 @@ def _single(events: Events, times: Int64, classes: int) -> tuple[Int64, NDArray[
         label[active] = value
         count += active
     return label, count > 1
-
-
-def _seconds(nanoseconds: int) -> float:
-    return nanoseconds / NANOSECONDS
 
 
 def _between(labelling: Labelling) -> str:

@@ -67,8 +67,8 @@ def evaluate_method(
 def _mixed(data: Dataset, method: Method, folds: Sequence[Fold], decisions: Float64) -> Float64:
     """Return the probabilities of the mix of a classifier and heads."""
     inverse = inverse_temperature(decisions, data.target)
-    known = np.array([name != UNKNOWN for name in data.classes])[data.target]
-    way = Tried(folds, inverse * decisions, known)
+    used = np.array([name != UNKNOWN for name in data.classes])[data.target]
+    way = Tried(folds, inverse * decisions, used)
     return softmax(best_mix(data, head_inputs_of(method.network), [way]).left_out[0])
 
 

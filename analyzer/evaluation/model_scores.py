@@ -24,6 +24,7 @@ from hearthlog.analyzer.training.manifest import (
     SkippedClip,
     example_of,
     scenario_of,
+    why_skipped,
 )
 from hearthlog.analyzer.training.scores import (
     Bin,
@@ -89,10 +90,8 @@ def evaluate_model(
     recordings = clip_recordings(clips, scenario, progress, features, embedder=embedder)
     data = cut_recordings(listener.overhear(recordings, scenario), scenario, features)
     if not len(data):
-        reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
-        raise DataError(
-            f"no clip has a segment to test on ({reasons[:300]}{example_of(data.left_out)})"
-        )
+        reasons = why_skipped(data.skipped)
+        raise DataError(f"no clip has a segment to test on ({reasons}{example_of(data.left_out)})")
     probabilities = segment_probabilities(
         classifier,
         of_segments(classifier.inputs, data.windows, data.floor),
@@ -320,20 +319,13 @@ def compare_models(
     features = first.feature_set
     data = cut_recordings(recordings, scenario, features)
     if not len(data):
-        reasons = "; ".join(f"{count}: {reason}" for reason, count in data.skipped.items())
-        raise DataError(f"there is no segment to compare on ({reasons[:300] or 'no marks'})")
-    inputs = [of_segments(one.inputs, data.windows, data.floor) for one in (first, second)]
+        reasons = why_skipped(data.skipped) or "no marks"
+        raise DataError(f"there is no segment to compare on ({reasons})")
     sources = [learned_groups(model, data) for model in (a, b)]
     learned = np.isin(data.group, np.concatenate(sources))
     kept = np.ones(len(data), bool) if learned.all() else ~learned
     target, group = data.target[kept], data.group[kept]
-    sightings = list(compress(data.sightings, kept))
-    probabilities = [
-        _probabilities(
-            one, i[kept], evidence_of(one, sightings), _by_heads(one, data, kept), data.classes
-        )
-        for one, i in zip((first, second), inputs, strict=True)
-    ]
+    probabilities = [_probabilities(one, data, kept) for one in (first, second)]
     judged = [
         ComparedModel(
             name=model.name,
@@ -364,17 +356,11 @@ def check_features(a: Model, b: Model) -> None:
         )
 
 
-def _by_heads(classifier: Classifier, data: Dataset, kept: Bool) -> Float64 | None:
+def _probabilities(classifier: Classifier, data: Dataset, kept: Bool) -> Float64:
+    """Return the probabilities of some segments, in the order of the classes of the data."""
+    inputs = of_segments(classifier.inputs, data.windows, data.floor)[kept]
+    evidence = evidence_of(classifier, list(compress(data.sightings, kept)))
     by_heads = heads_of_segments(classifier, data)
-    return None if by_heads is None else by_heads[kept]
-
-
-def _probabilities(
-    classifier: Classifier,
-    inputs: Float32,
-    evidence: Float64 | None,
-    by_heads: Float64 | None,
-    classes: Sequence[str],
-) -> Float64:
-    order = [classifier.classes.index(name) for name in classes]
+    by_heads = None if by_heads is None else by_heads[kept]
+    order = [classifier.classes.index(name) for name in data.classes]
     return segment_probabilities(classifier, inputs, evidence, by_heads)[:, order]

@@ -28,7 +28,13 @@ from hearthlog.analyzer.training.dataset import (
     cut_recordings,
     learned_groups,
 )
-from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, SkippedClip, example_of
+from hearthlog.analyzer.training.manifest import (
+    LabelledClip,
+    Scenario,
+    SkippedClip,
+    example_of,
+    why_skipped,
+)
 from hearthlog.analyzer.training.scores import Scores
 from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
@@ -273,9 +279,8 @@ def evaluate_scenes(  # noqa: PLR0913, PLR0917
     used = {scenario.find(label) for label in by_label}
     wanted = [name for name in scenario.classes if name not in {UNKNOWN, scenario.find(SILENCE)}]
     if not by_label:
-        reasons = "; ".join(f"{count}: {reason}" for reason, count in sorted(skipped.items()))
         raise DataError(
-            f"no clip can be laid into a scene ({reasons[:300]}{example_of(left_out)}); "
+            f"no clip can be laid into a scene ({why_skipped(skipped)}{example_of(left_out)}); "
             f"give clips of {', '.join(wanted)[:300]}"
         )
     laid = [clip for same in by_label.values() for clip in same]

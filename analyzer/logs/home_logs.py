@@ -28,7 +28,7 @@ from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 
 _TAIL = 60 * NANOSECONDS  # a complete day may lack this much at its end
-
+_RECENT = 14 * 86_400 * NANOSECONDS
 _MOST_DAYS = 366  # of a log
 
 
@@ -64,6 +64,12 @@ class HomeLogs:
             and (start is None or entry.end > start)
             and (end is None or entry.start < end)
         ]
+
+    def recent(self) -> list[HomeLog]:
+        """List the logs that begin at most two weeks before the last one."""
+        logs = self.between()
+        newest = max((log.start for log in logs), default=0)
+        return [log for log in logs if newest - log.start <= _RECENT]
 
     def latest_models(self) -> list[LabelledBy]:
         """List the models that labelled the latest log of each recorder, without duplicates.

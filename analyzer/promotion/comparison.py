@@ -282,7 +282,7 @@ class Trial:
     quiet: PairedAccuracy = NOTHING_KNOWN  # silences of the minutes drawn at random
 
 
-def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> Trial:
+def compare_on_trial(folders: Sequence[Path]) -> Trial:
     """Compare the latest candidate with the champion that labelled next to it last.
 
     Raise `DataError` if no candidate labelled in these logs, or both models not long enough for
@@ -300,7 +300,7 @@ def compare_on_trial(folders: Sequence[Path], microphone: str | None = None) -> 
     key = ("model_sha256", "candidate_sha256")
     logs = [log for log, one in tried if all(one.get(k) == last.get(k) for k in key)]
     sources = find_labellings(*logs)
-    name = sources.microphone(microphone)
+    name = sources.microphone(None)
     try:
         live, candidate = (sources.read(name, each) for each in (LIVE, CANDIDATE))
     except LogError as error:

@@ -9,7 +9,7 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.event_scores import Events, LabellingDifference
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-from hearthlog.analyzer.logs.spans import Spans, joined
+from hearthlog.analyzer.logs.spans import Spans, union
 from hearthlog.analyzer.promotion.recent_time import (
     LogSpan,
     RecentLog,
@@ -178,22 +178,20 @@ KnownSounds = list[tuple[RecentLog, list[ReferenceSound]]]
 
 def reference_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSounds:
     """Read the sounds of known label of each log."""
-    known, paths = [], [log.path for log in logs]
+    references, paths = [], [log.path for log in logs]
     for place, log in enumerate(logs, 1):
         try:
-            known.append((log, reference(log.path, paths[place:])))
+            references.append((log, reference(log.path, paths[place:])))
         except (DataError, LogError) as error:
             losses.append(str(error))
-    return known
+    return references
 
 
-def learned_by(before: Model, after: Model, known: KnownSounds) -> Spans:
+def learned_by(before: Model, after: Model, references: KnownSounds) -> Spans:
     """Return the training time of two models together."""
-    chosen = [(s.start, s.end) for _, sounds in known for s in sounds if not s.random]
+    chosen = [(s.start, s.end) for _, sounds in references for s in sounds if not s.random]
     marked = spans_of(chosen)
-    both = [learned_time(model, marked) for model in (before, after)]
-    starts, ends = (np.concatenate(edges) for edges in zip(*both, strict=True))
-    return joined(starts, ends)
+    return union(learned_time(before, marked), learned_time(after, marked))
 
 
 def unlearned_sample(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:

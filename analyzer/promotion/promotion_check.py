@@ -116,11 +116,11 @@ def _silence_lost(evidence: HomeComparison) -> Iterator[str]:
 def _not_better(evidence: HomeComparison, champion: str) -> Iterator[str]:
     """Check for fewer correct sounds, or for no more although much changes."""
     right, changes = evidence.random, evidence.changes
-    known, both = less_right(right, champion), right.plus(evidence.quiet)
+    counts, both = less_right(right, champion), right.plus(evidence.quiet)
     changed = changes.minutes.sum() - np.trace(changes.minutes)
     much = max(_CHANGED * _sound(evidence), _CHANGED_MINUTES)
     if is_worse(right):
-        yield known
+        yield counts
     elif is_worse(evidence.quiet):
         quiet = evidence.quiet
         yield (
@@ -128,9 +128,9 @@ def _not_better(evidence: HomeComparison, champion: str) -> Iterator[str]:
             f"{quiet.after} silent, {champion} {quiet.before}"
         )
     elif both.sounds and both.lost >= both.gained and changed > much:
-        known = known if right.sounds else "nothing sounds in the minutes drawn at random"
+        counts = counts if right.sounds else "nothing sounds in the minutes drawn at random"
         yield (
-            f"{known}, and {changes.words(changed)} would change: `hearthlog review logs --queue` "
+            f"{counts}, and {changes.words(changed)} would change: `hearthlog review logs --queue` "
             "asks for more such minutes, then promote it again"
         )
 
@@ -221,16 +221,10 @@ def _takes_silence(evidence: HomeComparison, new: str) -> bool:
 
 def _taken(evidence: HomeComparison, new: str) -> Iterator[tuple[str, int, int]]:
     """Count the first model's correct sounds and those a new class takes: total and by class."""
-    right = {
-        name: Counter(
-            {
-                after: number
-                for (true, before, after), number in evidence.known.items()
-                if true == before == name
-            }
-        )
-        for name in sorted({true for true, _, _ in evidence.known} - {new, UNKNOWN})
-    }
+    right: dict[str, Counter[str]] = {}
+    for (true, before, after), number in sorted(evidence.known.items()):
+        if true == before and true not in {new, UNKNOWN}:
+            right.setdefault(true, Counter())[after] += number
     sounds = [counts for name, counts in right.items() if name != SILENCE]
     yield "sounds of other classes", sum(c.total() for c in sounds), sum(c[new] for c in sounds)
     for name, counts in right.items():
@@ -283,7 +277,7 @@ def judge(
     champion = find_champion(folder, home, model)
     evidence, reasons = None, list[str]()
     if champion is None:
-        reasons = [f"there are no labels in {_names(home)} to compare its own with"]
+        reasons = [f"there are no labels in {', '.join(map(str, home))} to compare its own with"]
     elif other := other_features(champion, model):
         reasons = [other]
     elif champion.sha256 != model.sha256:
@@ -376,7 +370,3 @@ def judged_against(folder: Path, model: Model, home: Sequence[Path]) -> Judgemen
     champion = find_champion(folder, home, model)
     sha256 = "" if champion is None else champion.sha256
     return judgement if judgement.champion == sha256 else None
-
-
-def _names(home: Sequence[Path]) -> str:
-    return ", ".join(map(str, home))

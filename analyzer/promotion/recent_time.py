@@ -13,7 +13,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labellings, find_labellings
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, remains, without
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, remains, without
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import SILENCE, UNDECIDED, class_name
 from hearthlog.models.classifiers.model import Model
@@ -25,7 +25,6 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, parse_topic, relabelling
 
 _DAY = 86_400 * NANOSECONDS
-_RECENT = 14 * _DAY
 _LOUD = 36, 75 * NANOSECONDS  # number and length of the spans to label
 _QUIET = 16, 120 * NANOSECONDS
 _AROUND = 10 * NANOSECONDS  # around a sound
@@ -54,17 +53,15 @@ class LogSpan(NamedTuple):
 def recent_logs(folders: Iterable[Path]) -> list[RecentLog]:
     """Return the logs of the last two weeks of a home, in order of time."""
     try:
-        entries = find_home_logs(folders).between()
+        entries = find_home_logs(folders).recent()
     except LogError:  # no log at all
         return []
-    newest = max((entry.start for entry in entries), default=0)
     logs = []
     for entry in entries:
-        if newest - entry.start <= _RECENT:
-            with suppress(LogError, OSError):
-                span = time_span(entry.path)
-                if span is not None and span[1] > span[0]:
-                    logs.append(RecentLog(entry.path, *span))
+        with suppress(LogError, OSError):
+            span = time_span(entry.path)
+            if span is not None and span[1] > span[0]:
+                logs.append(RecentLog(entry.path, *span))
     return logs
 
 
@@ -98,8 +95,7 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
     """Return the time of logs outside the training set, in the order of the logs."""
     parts = []
     for log in logs:
-        span = Spans(np.array([log.start]), np.array([log.end]))
-        rest = without(span, cut(learned, log.start, log.end))
+        rest = without(one(log.start, log.end), cut(learned, log.start, log.end))
         times = zip(rest.starts.tolist(), rest.ends.tolist(), strict=True)
         parts += [LogSpan(log.path, *span) for span in times if span[1] - span[0] >= _SHORTEST_PART]
     return parts
@@ -111,9 +107,9 @@ def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list
     loud: list[LogSpan] = []
     quiet: list[LogSpan] = []
     for part in parts:
-        span = Spans(np.array([part.start]), np.array([part.end]))
         inside = cut(near, part.start, part.end)
-        for chosen, spans in ((loud, inside), (quiet, without(span, inside))):
+        rest = without(one(part.start, part.end), inside)
+        for chosen, spans in ((loud, inside), (quiet, rest)):
             times = zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
             chosen += [part._replace(start=start, end=end) for start, end in times]
     return [*_weighted(loud, *_LOUD, seed), *_weighted(quiet, *_QUIET, seed)]
@@ -184,7 +180,8 @@ def reference(log: Path, following: Sequence[Path] = ()) -> list[ReferenceSound]
     They are sorted by start. Raise `LogError` if its review layer is damaged, or the reviewed
     labelling is missing.
     """
-    marks, drawn = read_marks(log), _drawn(read_reviewed(log))
+    marks = read_marks(log)
+    drawn = [span for span in read_reviewed(log) if span.chosen == RANDOM]
     labellings = find_labellings(log, *following[:_FOLLOWING]) if drawn else Labellings([])
     inside = [sound for span in drawn for sound in _true(labellings, span, marks)]
     others = [
@@ -206,10 +203,10 @@ def left_alone(log: Path) -> list[ReferenceSound]:
         marks = read_marks(log)
         spans = [span for span in read_reviewed(log) if span.chosen != RANDOM]
         labellings = find_labellings(log) if spans else Labellings([])
+        marked = {(mark.start, mark.end) for mark in marks}
+        edges = {edge for mark in marked for edge in mark}
         for span in spans:
             with suppress(DataError, LogError):
-                marked = {(mark.start, mark.end) for mark in marks}
-                edges = {edge for mark in marked for edge in mark}
                 sounds += [
                     sound._replace(random=False)
                     for sound in _parts(labellings, span, marks)
@@ -243,21 +240,17 @@ def _true(
 def _parts(
     labellings: Labellings, span: ReviewedSpan, marks: Iterable[Mark]
 ) -> Iterator[ReferenceSound]:
-    known = partial(ReferenceSound, random=True, microphone=span.microphone)
+    sound = partial(ReferenceSound, random=True, microphone=span.microphone)
     own = [m for m in marks if m.microphone == span.microphone and _inside(m, span)]
     for mark in own:
         if class_name(mark.label) not in UNDECIDED:
-            yield known(max(mark.start, span.start), min(mark.end, span.end), mark.label)
+            yield sound(max(mark.start, span.start), min(mark.end, span.end), mark.label)
     corrects = LIVE if span.corrects == LIVE else relabelling(span.corrects)
     name = labellings.find(span.microphone, corrects)
     labels = labellings.read(span.microphone, name, span.start, span.end).labelling
     rest, row = remains(labels, spans_of([(mark.start, mark.end) for mark in own]))
     for start, end, label in zip(rest.starts, rest.ends, labels.labels[row], strict=True):
-        yield known(int(start), int(end), str(label))
-
-
-def _drawn(reviewed: Iterable[ReviewedSpan]) -> list[ReviewedSpan]:
-    return [span for span in reviewed if span.chosen == RANDOM]
+        yield sound(int(start), int(end), str(label))
 
 
 def _inside(mark: Mark, span: ReviewedSpan) -> bool:

@@ -188,9 +188,9 @@ def unknown_bias(decisions: Float64, target: Indices, classes: Sequence[str]) ->
     bias = np.zeros(len(classes))
     if UNKNOWN in classes:
         unknown = classes.index(UNKNOWN)
-        known = target != unknown
-        best = np.delete(decisions[known], unknown, axis=1).max(axis=1)
-        margin = best - decisions[known, unknown]
+        others = target != unknown
+        best = np.delete(decisions[others], unknown, axis=1).max(axis=1)
+        margin = best - decisions[others, unknown]
         margin = margin[np.isfinite(margin)]
         if len(margin):
             bias[unknown] = np.clip(np.quantile(margin, KNOWN_LOST), -100.0, 100.0)

@@ -368,9 +368,14 @@ def _taught(padded: Float64, count: int, hop: int) -> Indices:
     enough = min(_FILLED * _WINDOW, _FILLED_BY_SHORT * count)
     power = np.concatenate([[0.0], np.cumsum(np.square(padded))])
     middle = power[middles + _HALF + _MIDDLE] - power[middles + _HALF - _MIDDLE]
-    chosen = middles[(filled >= enough) & (middle > _BELOW_CLIP * middle.mean())]
-    kept = np.linspace(0, len(chosen) - 1, min(len(chosen), _MOST_WINDOWS)).round().astype(np.intp)
-    return chosen[kept]
+    loud = middle > _BELOW_CLIP * middle.mean()
+    return spread(middles[(filled >= enough) & loud], _MOST_WINDOWS)
+
+
+def spread(values: Indices, most: int | None) -> Indices:
+    """Choose `most` values [shape=(n,)] at even distances; None for all."""
+    count = len(values) if most is None else min(len(values), most)
+    return values[np.linspace(0, len(values) - 1, count).round().astype(np.intp)]
 
 
 def _embedded(padded: Float64, middles: Indices, embed: Embeds, version: int) -> ClipEmbeddings:

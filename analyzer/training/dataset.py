@@ -21,6 +21,7 @@ from hearthlog.analyzer.training.clips import (
     RoomCopy,
     in_room,
     read_clip,
+    spread,
 )
 from hearthlog.analyzer.training.direction_samples import DirectionSample
 from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, SkippedClip
@@ -408,12 +409,6 @@ def _segments(recording: Recording, features: FeatureSet) -> tuple[str, Indices]
     loudest = max(SILENCE_POWER, power.mean(dtype=np.float64) * _BELOW_CLIP)
     loud = starts[windows.mean(axis=1, dtype=np.float64) > loudest]
     return ("" if len(loud) else "nowhere above -60 dBFS"), spread(loud, recording.most)
-
-
-def spread(values: Indices, most: int | None) -> Indices:
-    """Choose `most` values [shape=(n,)] at even distances; None for all."""
-    count = len(values) if most is None else min(len(values), most)
-    return values[np.linspace(0, len(values) - 1, count).round().astype(np.intp)]
 
 
 def _thinned(key: Indices, weight: Float64) -> Indices:

@@ -9,12 +9,7 @@ import numpy as np
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import SECTORS, Directions, sectors_of
-from hearthlog.models.classifiers.model import (
-    FORMAT,
-    FORMAT_OF_DIRECTIONS,
-    MOST_ARRAYS,
-    Model,
-)
+from hearthlog.models.classifiers.model import FORMAT, FORMAT_OF_DIRECTIONS, MOST_ARRAYS, Model
 from hearthlog.schemas.arrays import Float64, Indices, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
@@ -71,12 +66,12 @@ def with_directions(
 
 def _weights(target: Indices, sightings: Sequence[DirectionSample], classes: int) -> Float64:
     """Return the log likelihood ratio of sectors: given a class against given any class."""
-    sounds = _sounds(target, sightings)
+    of_sounds, hours, shares = _sounds(target, sightings)
     likely = np.full((classes, SECTORS), 1 / SECTORS)
-    counts = np.bincount(sounds.target, minlength=classes)
+    counts = np.bincount(of_sounds, minlength=classes)
     for number in np.flatnonzero(counts):
-        own = sounds.target == number
-        likely[number] = _likelihood(sounds.shares[own], sounds.hours[own])
+        own = of_sounds == number
+        likely[number] = _likelihood(shares[own], hours[own])
     anything = likely[counts > 0].mean(axis=0)
     weights = np.clip(_WITNESSES * np.log(likely / anything), -_MOST, _MOST)
     return weights * (counts / (counts + _DOUBT))[:, np.newaxis]
@@ -97,22 +92,19 @@ def evidence_of(
     return evidence if len(evidence) else None
 
 
-class _Sounds(NamedTuple):
-    """Sounds of one class each, with their directions and hours."""
+def _sounds(
+    target: Indices, sightings: Sequence[DirectionSample]
+) -> tuple[Indices, Int64, Float64]:
+    """Merge recordings of a class within ten seconds; marking style must not change the count.
 
-    target: Indices
-    hours: Int64
-    shares: Float64
-
-
-def _sounds(target: Indices, sightings: Sequence[DirectionSample]) -> _Sounds:
-    """Merge recordings of a class within ten seconds; marking style must not change the count."""
+    Return the class, the hour and the directions of each sound.
+    """
     times = np.array([one.start for one in sightings], np.int64) // _ONE_SOUND
     joined, row = np.unique(np.stack([target, times]), axis=1, return_inverse=True)
     shares = np.zeros((joined.shape[1], SECTORS))
     np.add.at(shares, row.ravel(), np.stack([one.shares for one in sightings]))
     shares /= np.bincount(row.ravel())[:, np.newaxis]
-    return _Sounds(joined[0], joined[1] * _ONE_SOUND // _HOUR, shares)
+    return joined[0], joined[1] * _ONE_SOUND // _HOUR, shares
 
 
 def _likelihood(shares: Float64, hours: Int64) -> Float64:

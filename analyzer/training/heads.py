@@ -319,8 +319,8 @@ def _candidates(
     rejecting = rejecting_head(taken, data.classes)
     names = names_head(taken, data.classes)
     by_rejecting = [] if rejecting is None else [rejecting]
-    known = [n for n, name in enumerate(data.classes) if name not in {SILENCE, UNKNOWN}]
-    if names is not None and (_sources(data)[known] < FEWEST_SOURCES).any():
+    own = [n for n, name in enumerate(data.classes) if name not in {SILENCE, UNKNOWN}]
+    if names is not None and (_sources(data)[own] < FEWEST_SOURCES).any():
         weighted = names.model_copy(update={"weight": _NAMES_WEIGHT})
         yield taken.inputs, [*by_rejecting, weighted], 0.0
     else:
@@ -370,8 +370,8 @@ def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | Non
     None without a class `unknown`, or if no other class has a name.
     """
     first, groups = taken.inputs[-1].start, taken.groups
-    known = [name for name in classes if name not in {SILENCE, UNKNOWN}]
-    named = {group for name in known for group in _groups_of(name)} & set(groups)
+    own = [name for name in classes if name not in {SILENCE, UNKNOWN}]
+    named = {group for name in own for group in _groups_of(name)} & set(groups)
     others = set(groups) - named - {SILENCE}
     if UNKNOWN not in classes or not named or not others:
         return None
@@ -380,7 +380,7 @@ def rejecting_head(taken: HeadInputs, classes: Sequence[str]) -> NamesHead | Non
     return NamesHead(
         weight=_REJECTING_WEIGHT,
         slope=_NAMES_SLOPE,
-        classes={**dict.fromkeys(known, inside), UNKNOWN: outside},
+        classes={**dict.fromkeys(own, inside), UNKNOWN: outside},
         bias={UNKNOWN: _REJECTING_BIAS},
     )
 

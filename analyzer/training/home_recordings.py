@@ -20,8 +20,8 @@ from hearthlog.analyzer.logs.sound_vectors import (
     embeddings_of,
 )
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
-from hearthlog.analyzer.training.clips import AS_IT_IS, ClipEmbeddings
-from hearthlog.analyzer.training.dataset import Recording, spread
+from hearthlog.analyzer.training.clips import AS_IT_IS, ClipEmbeddings, spread
+from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.direction_samples import sighting_of
 from hearthlog.models.classes import SILENCE, UNDECIDED, UNKNOWN, class_name
 from hearthlog.models.classifiers.evidence import NOWHERE, Directions

@@ -170,21 +170,23 @@ def _with_new_classes(
     A label that the scenario maps to `unknown` becomes a class like any other, and is trained as
     unknown until then.
     """
-    known = scenario_of(model).with_classes(base_classes(model))
-    as_unknown = set(known.classes.get(UNKNOWN, ())) - {OTHER_NEGATIVE}
-    listed = {*known.classes, *known.class_of} - as_unknown
+    scenario = scenario_of(model).with_classes(base_classes(model))
+    as_unknown = set(scenario.classes.get(UNKNOWN, ())) - {OTHER_NEGATIVE}
+    listed = {*scenario.classes, *scenario.class_of} - as_unknown
     others = [one for one in marked if not meant_by(one.label, listed)]
     labels: dict[str, set[str]] = {}
     for one in others:
         labels.setdefault(class_name(one.label), set()).add(one.label)
     every = {name: tuple(sorted(same)) for name, same in sorted(labels.items())}
-    amounts = cut_recordings(others, Scenario(known.name, every), features).amounts if every else {}
+    amounts = (
+        cut_recordings(others, Scenario(scenario.name, every), features).amounts if every else {}
+    )
     notes: list[str] = []
     learned: dict[str, tuple[str, ...]] = {}
     unlearned: set[str] = set()
     for name, amount in amounts.items():
         seconds = max(_FEWEST_SECONDS - amount.seconds, 0.0)
-        room = len(known.classes) + len(learned) < MOST_CLASSES
+        room = len(scenario.classes) + len(learned) < MOST_CLASSES
         if room and not seconds and amount.sources >= _FEWEST_DAYS:
             learned[name] = every[name]
             continue
@@ -200,14 +202,14 @@ def _with_new_classes(
         else:
             unlearned |= set(every[name])
         notes.append(f"{count} {'mark' if count == 1 else 'marks'} of {name}: {what}")
-    return known.with_trained(learned), notes + _lumped(marked, known), unlearned
+    return scenario.with_trained(learned), notes + _lumped(marked, scenario), unlearned
 
 
-def _lumped(marked: Sequence[Recording], known: Scenario) -> list[str]:
+def _lumped(marked: Sequence[Recording], scenario: Scenario) -> list[str]:
     """List the marks that are trained under another class name, such as `other`."""
     counts: Counter[tuple[str, str]] = Counter()
     for one in marked:
-        name = known.find(one.label, marked=True)
+        name = scenario.find(one.label, marked=True)
         if name in {OTHER, UNKNOWN} and (name == OTHER or class_name(one.label) == OTHER_NEGATIVE):
             counts[class_name(one.label), name] += class_name(one.label) != name
     return [

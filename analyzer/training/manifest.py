@@ -53,6 +53,11 @@ def left_out_lines(left_out: Sequence[SkippedClip]) -> list[str]:
     return lines
 
 
+def why_skipped(skipped: Mapping[str, int]) -> str:
+    """Format the reasons for skipped recordings, with their numbers."""
+    return "; ".join(f"{count}: {reason}" for reason, count in skipped.items())[:300]
+
+
 def example_of(left_out: Sequence[SkippedClip]) -> str:
     """Format the first skipped clip, to follow the reasons; empty if there is none."""
     return f", such as {left_out[0].clip}" if left_out else ""

@@ -10,7 +10,8 @@ import numpy as np
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, labelling_of
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
-from hearthlog.analyzer.training.dataset import CONFIRMED, HOP_FRAMES, Recording, spread
+from hearthlog.analyzer.training.clips import spread
+from hearthlog.analyzer.training.dataset import CONFIRMED, HOP_FRAMES, Recording
 from hearthlog.analyzer.training.direction_samples import evidence_of
 from hearthlog.analyzer.training.home_recordings import (
     HomeSound,
@@ -240,7 +241,6 @@ def _quiet_windows(recording: Recording, floor: Float64, classifier: Classifier)
     return quiet[places]
 
 
-_RECENT = 14 * 86_400 * NANOSECONDS
 _SILENT_LOGS = 4  # logs to read for silence
 _SILENT_PART = 900 * NANOSECONDS  # of each
 _LOGS = 6  # logs to read for other classes
@@ -255,7 +255,7 @@ def unreviewed_silence(
 
     The scenario is empty for the sounds of the home. Raise `LogError` if there is no log.
     """
-    recent = _recent(folders)
+    recent = [entry.path for entry in find_home_logs(folders).recent()]
     for place in np.linspace(len(recent) - 1, 0, min(len(recent), _SILENT_LOGS)).round():
         log = recent[int(place)]
         yield from _labelled(log, model, {SILENCE}, _SILENT_PART, scenario)
@@ -269,7 +269,7 @@ def unreviewed_sounds(
     The logs are those of the last two weeks with the longest labelled time of these classes. The
     scenario is empty for the sounds of the home. Raise `LogError` if there is no log.
     """
-    recent = _recent(folders)
+    recent = [entry.path for entry in find_home_logs(folders).recent()]
     amounts = np.array([_labelled_time(log, names, scenario) for log in recent], np.int64)
     most = np.argsort(-amounts, kind="stable")[:_LOGS]
     candidates = [
@@ -278,12 +278,6 @@ def unreviewed_sounds(
         for one in _labelled(recent[place], model, names, _PART, scenario)
     ]
     return chosen(candidates, model, least=_VERY_SURE, fewest=0)
-
-
-def _recent(folders: Sequence[Path]) -> list[Path]:
-    entries = find_home_logs(folders).between()
-    newest = max((entry.start for entry in entries), default=0)
-    return [entry.path for entry in entries if newest - entry.start <= _RECENT]
 
 
 def _labelled(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.arrays import Float64, Indices, Int64
 
 RESAMPLES = 1000
 _BINS = 15
@@ -156,7 +156,7 @@ def reliability(probabilities: NDArray[np.floating], target: Integers) -> list[B
 
 def _binned(
     probabilities: NDArray[np.floating], target: Integers
-) -> tuple[NDArray[np.intp], Float64, Float64]:
+) -> tuple[Indices, Float64, Float64]:
     confidence = probabilities.max(axis=1).astype(np.float64)
     right = (probabilities.argmax(axis=1) == target).astype(np.float64)
     return np.minimum((confidence * _BINS).astype(np.intp), _BINS - 1), confidence, right

@@ -272,10 +272,10 @@ def _metrics(data: Dataset, decision: Float64, inverse: float, folds: int) -> Me
     )
     confusion = confusion_matrix(data.target, predicted, labels=numbers)
     occurs = np.bincount(data.target, minlength=len(data.classes)) > 0
-    known = [number for number in numbers if data.classes[number] != UNKNOWN and occurs[number]]
+    scored = [number for number in numbers if data.classes[number] != UNKNOWN and occurs[number]]
     return Metrics(
         folds=folds,
-        macro_f1=float(f1[known].mean()),
+        macro_f1=float(f1[scored].mean()),
         expected_calibration_error=calibration_error(softmax(inverse * decision), data.target),
         classes={
             name: ClassMetrics(
@@ -296,8 +296,8 @@ def _mixture(
 ) -> Mixture:
     """Train heads for a classifier, given its decision values for held-out segments."""
     folds, decisions = sources
-    known = np.array([name != UNKNOWN for name in data.classes])[data.target]
-    of_sources, of_collections = Tried(folds, inverse * decisions, known), None
+    used = np.array([name != UNKNOWN for name in data.classes])[data.target]
+    of_sources, of_collections = Tried(folds, inverse * decisions, used), None
     folds, left_out = collections
     if left_out is not None:
         of_collections = Tried(folds, inverse * left_out, trained_elsewhere(data, folds))

@@ -100,20 +100,14 @@ def as_room(kind: ClassifierKind) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True, eq=False)
 class LearnedMachine:
     """A classifier that decides with the recorder's own code, of trained classes [shape=(c,)]."""
 
-    def __init__(
-        self,
-        machine: Machine,
-        classes: Indices,
-        arrays: Mapping[str, NDArray[Any]],
-        parameters: Mapping[str, Any],
-    ) -> None:
-        self.machine = machine
-        self.classes = classes
-        self._arrays = arrays
-        self._parameters = parameters
+    machine: Machine
+    classes: Indices
+    _arrays: Mapping[str, NDArray[Any]]
+    _parameters: Mapping[str, Any]
 
     def decide(self, inputs: Float32, classes: int) -> Float64:
         """Return decision values; see `Learned.decide`."""
