@@ -1,5 +1,8 @@
 """Errors of the analyzer."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from hearthlog.schemas.errors import HearthlogError
 
 
@@ -13,3 +16,12 @@ class WorkerError(HearthlogError):
 
 class LostClusterError(WorkerError):
     """The connection to the Dask cluster is lost, with all unfinished tasks."""
+
+
+@contextmanager
+def collect_errors(messages: list[str], *kinds: type[Exception]) -> Iterator[None]:
+    """Suppress errors of some kinds, and add their messages to a list."""
+    try:
+        yield
+    except kinds as error:
+        messages.append(str(error))

@@ -15,7 +15,7 @@ import safetensors
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError, collect_errors
 from hearthlog.analyzer.logs.home_logs import HomeLog
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.spans import Timed
@@ -221,8 +221,6 @@ def read_each(
 ) -> None:
     """Read logs one by one, and add the errors of those that cannot be read to the losses."""
     for number, entry in enumerate(entries, 1):
-        try:
+        with collect_errors(losses, LogError):
             read(entry)
-        except LogError as error:
-            losses.append(str(error))
         progress(number / len(entries))

@@ -30,7 +30,7 @@ from hearthlog.analyzer.discover.groups import (
     is_embedded,
     new_groups,
 )
-from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError, collect_errors
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.selection import checked_array_names
 from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
@@ -433,10 +433,8 @@ def name_groups(  # noqa: PLR0913, PLR0917
     for count, (log, *_) in enumerate(logs, 1):
         spans: dict[int, list[MarkedSpan]] = {}
         if log in inside:
-            try:
+            with collect_errors(losses, LogError):
                 spans = _spans(log, groups, looked, losses)
-            except LogError as error:
-                losses.append(str(error))
         for number, label in names.items():
             made, left = _mark(
                 log, spans.get(number, []), reason_of(groups, number), label, reviewer

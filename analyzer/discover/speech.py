@@ -225,8 +225,7 @@ def read_speech(
     `progress` receives the share of the logs read, 0 to 1.
     """
     reader = _Reader(start, end)
-    entries = home.between(start or 0, end or NEVER)
-    read_each(entries, reader.read, reader.losses, progress)
+    read_each(home.between(start, end), reader.read, reader.losses, progress)
     return reader.speech(home.losses)
 
 

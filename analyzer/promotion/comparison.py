@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.activity.event_counts import beta_quantile
-from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError, collect_errors
 from hearthlog.analyzer.evaluation.event_scores import compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
 from hearthlog.analyzer.logs.spans import Spans, rows_at
@@ -309,11 +309,9 @@ def compare_on_trial(folders: Sequence[Path]) -> Trial:
     difference = compare_labellings(live, candidate)
     known: list[ReferenceSound] = []
     for place, log in enumerate(logs, 1):
-        try:
+        with collect_errors(losses, LogError):
             sounds = reference(log, logs[place:])
             known += [sound for sound in sounds if sound.microphone == name]
-        except LogError as error:
-            losses.append(str(error))
     sounding = [sound for sound in known if class_name(sound.label) != SILENCE]
     sides = [unified(side.labelling) for side in (live, candidate)]
     return Trial(
@@ -344,12 +342,9 @@ def _records(folders: Sequence[Path], losses: list[str]) -> Iterable[tuple[Path,
         for log in find_logs(folder):
             if is_layer(log):
                 continue
-            try:
-                with LogFile(log) as file:
-                    for record in read_provenance(file):
-                        yield log, dict(record)
-            except LogError as error:
-                losses.append(str(error))
+            with collect_errors(losses, LogError), LogFile(log) as file:
+                for record in read_provenance(file):
+                    yield log, dict(record)
 
 
 def _right_on_trial(

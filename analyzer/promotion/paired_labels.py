@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError, collect_errors
 from hearthlog.analyzer.evaluation.event_scores import Events, LabellingDifference
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.analyzer.logs.spans import Spans, union
@@ -180,10 +180,8 @@ def reference_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSound
     """Read the sounds of known label of each log."""
     references, paths = [], [log.path for log in logs]
     for place, log in enumerate(logs, 1):
-        try:
+        with collect_errors(losses, DataError, LogError):
             references.append((log, reference(log.path, paths[place:])))
-        except (DataError, LogError) as error:
-            losses.append(str(error))
     return references
 
 
@@ -207,11 +205,9 @@ def label_parts(
     `progress` receives the completed share of the parts, 0 to 1.
     """
     for i, part in enumerate(parts):
-        try:
+        frames = NO_FRAMES
+        with collect_errors(losses, LogError):
             frames = models.label(part)
-        except LogError as error:
-            losses.append(str(error))
-            frames = NO_FRAMES
         progress((i + 1) / len(parts))
         yield frames
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError, collect_errors
 from hearthlog.analyzer.evaluation.event_scores import LabellingDifference
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
@@ -238,10 +238,8 @@ def find_kept_sound(
     for layer in find_logs(near):
         if log_name(layer).layer != AUDIO_LAYER:
             continue
-        try:
+        with collect_errors(losses, LogError):
             layers[layer] = kept_time([layer], topic, start, end)
-        except LogError as error:
-            losses.append(str(error))
     return KeptSoundLayers(layers, topic, union(*layers.values()))
 
 

@@ -10,7 +10,7 @@ from time import time_ns
 
 import numpy as np
 
-from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.errors import DataError, collect_errors
 from hearthlog.analyzer.logs.clips import read_clips
 from hearthlog.analyzer.logs.layers import (
     Coverage,
@@ -296,10 +296,8 @@ def read_timeline(
     every = -(-sum(file.size for file in files if not file.layer) // _WHOLE_BYTES)
     reader = _Reader(grid, max(every, 1))
     for number, file in enumerate(files):
-        try:
+        with collect_errors(losses, LogError, DataError):
             reader.read(file)
-        except (LogError, DataError) as error:
-            losses.append(str(error))
         progress((number + 1) / len(files))
     collected = {name: one for name, one in sorted(reader.microphones.items()) if not one.is_empty}
     if not collected:

@@ -49,7 +49,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
 from hearthlog.analyzer.review.viewer.process import ViewerProcess, check_display
 from hearthlog.analyzer.review.viewer.recording import name_recording
 
-_PANEL, _AXIS = "/time_panel", "ScalarAxis"
+_PANEL, _AXIS, _CONTAINER = "/time_panel", "ScalarAxis", "ContainerBlueprint"
 _WAIT_SECONDS = 60
 _FLUSH_SECONDS = 30.0
 _SIZE_SECONDS = 3.0
@@ -229,7 +229,8 @@ class Viewer(ABC):
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         blueprint = self._blueprint()
-        moved = [path for path, span in self._axes.items() if _scalars(blueprint, path) != span]
+        ranges = {path: _component(blueprint, path, _AXIS).get("range") for path in self._axes}
+        moved = [path for path, span in self._axes.items() if ranges[path] != span]
         for path in moved:
             blueprint.setdefault(path, {}).setdefault(_AXIS, {})["range"] = self._axes[path]
         is_changed = bool(moved)
@@ -283,8 +284,7 @@ class Viewer(ABC):
         return self._selection_in(self._blueprint())
 
     def _selection_in(self, blueprint: Blueprint) -> tuple[int, int] | None:
-        panel = blueprint.get(_PANEL, {}).get("TimePanelBlueprint", {})
-        span = _span(panel.get("time_selection"))
+        span = _span(_component(blueprint, _PANEL, "TimePanelBlueprint").get("time_selection"))
         return span and (self._clock.utc(span[0]), self._clock.utc(span[1]))
 
     def cursor(self) -> int | None:
@@ -299,10 +299,10 @@ class Viewer(ABC):
         """Remember the layout as it was opened."""
         with suppress(ConnectionError, TimeoutError):
             blueprint = self._blueprint()
-            found = {path: _scalars(blueprint, path) for path in blueprint}
+            found = {path: _component(blueprint, path, _AXIS).get("range") for path in blueprint}
             self._axes = {path: span for path, span in found.items() if span is not None}
             self._opening = _view(blueprint)
-            shares = {path: _container(blueprint, path) for path in blueprint}
+            shares = {path: _component(blueprint, path, _CONTAINER) for path in blueprint}
             for columns, left in (
                 (COLUMNS, _RULER_LEFT - _SCALE_WIDTH),
                 (REQUESTED_COLUMNS, _RULER_LEFT - _DIGIT_WIDTH),
@@ -346,11 +346,11 @@ class Viewer(ABC):
         viewport = size.height - TOP_BAR - min(max(size.height / 4, least), most)
         lanes = viewport * self._lanes_share - _TAB_BAR - _AXIS_HEIGHT
         for path, left in self._columns.items():
-            _container(blueprint, path)["col_shares"] = [left, size.width - left]
+            _component(blueprint, path, _CONTAINER)["col_shares"] = [left, size.width - left]
         for path in self._names:
-            heights = _container(blueprint, path)["row_shares"]
+            heights = _component(blueprint, path, _CONTAINER)["row_shares"]
             below = _AXIS_HEIGHT * (len(heights) - 1) / max(lanes, _AXIS_HEIGHT)
-            _container(blueprint, path)["row_shares"] = [*heights[:-1], below]
+            _component(blueprint, path, _CONTAINER)["row_shares"] = [*heights[:-1], below]
 
     def show(self, start: int, end: int, margin: int, *, select: bool = True) -> None:
         """Show a span with a margin (ns), put the cursor on its start; select the span or nothing.
@@ -400,19 +400,14 @@ def _set_view(blueprint: Blueprint, start: int, end: int) -> None:
     blueprint[f"/{SHARED_AXIS}"] = {"TimeAxis": {"view_range": bounds}}
 
 
-def _container(blueprint: Blueprint, path: str) -> dict[str, Any]:
-    """Return a container of a blueprint; empty for anything else."""
-    return blueprint.get(path, {}).get("ContainerBlueprint", {})
+def _component(blueprint: Blueprint, path: str, name: str) -> dict[str, Any]:
+    """Return a component of an entity of a blueprint; empty without one."""
+    return blueprint.get(path, {}).get(name, {})
 
 
 def _view(blueprint: Blueprint) -> Any:
     """Return the range of the time axes in a blueprint; None without one."""
-    return blueprint.get(f"/{SHARED_AXIS}", {}).get("TimeAxis", {}).get("view_range")
-
-
-def _scalars(blueprint: Blueprint, path: str) -> Any:
-    """Return the vertical range of a view in a blueprint; None without one."""
-    return blueprint.get(path, {}).get(_AXIS, {}).get("range")
+    return _component(blueprint, f"/{SHARED_AXIS}", "TimeAxis").get("view_range")
 
 
 def _span(selection: Any) -> tuple[int, int] | None:
