@@ -247,7 +247,7 @@ def test_a_page_that_is_closed_leaves_no_error_in_the_terminal(capfd):
             wanted = f"GET {address.path}text HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n"
             page.sendall(wanted.encode())
             patiently(threading.active_count, lambda count: count > before)
-        viewer.say("nobody reads this")
+        viewer.announce("nobody reads this")
         patiently(threading.active_count, lambda count: count <= before)
     assert "Traceback" not in capfd.readouterr().err
 

@@ -16,7 +16,8 @@ from sklearn.metrics import f1_score
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.adaptation import HomeLandmarks
-from hearthlog.analyzer.training.dataset import Dataset, spread
+from hearthlog.analyzer.training.clips import spread
+from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.home_recordings import HOME_WEIGHT
 from hearthlog.analyzer.training.landmark_method import LandmarkMethod
 from hearthlog.analyzer.training.method import Examples, Method, prepare
