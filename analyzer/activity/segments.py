@@ -235,7 +235,7 @@ class SegmentCollector:
     def add_written(self, times: Int64) -> None:
         """Add times at which the recorder wrote, ascending, in nanoseconds of UTC."""
         spans = joined(times, times, _PAUSE)
-        for start, end in zip(spans.starts.tolist(), spans.ends.tolist(), strict=True):
+        for start, end in spans.pairs():
             self.add_written_span(start, end)
 
     def add_written_span(self, start: int, end: int) -> None:

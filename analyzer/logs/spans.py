@@ -1,6 +1,6 @@
 """Set operations on arrays of time spans: union, intersection, difference, overlay, lengths."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -27,6 +27,10 @@ class Spans(NamedTuple):
     def length(self) -> int:
         """Total length of the spans, in nanoseconds."""
         return int((self.ends - self.starts).sum())
+
+    def pairs(self) -> Iterator[tuple[int, int]]:
+        """Yield the start and the end of each span."""
+        return zip(self.starts.tolist(), self.ends.tolist(), strict=True)
 
 
 class Timed(Protocol):

@@ -204,7 +204,7 @@ def _places(
     for log, microphone, sounds in by_microphone:
         times = spans_of([(s.start, s.end) for s in sounds], _NEAR)
         rows = rows_at(times, np.array([s.start for s in sounds], np.int64))
-        for row, (start, end) in enumerate(zip(*(edge.tolist() for edge in times), strict=True)):
+        for row, (start, end) in enumerate(times.pairs()):
             inside = [sound for sound, own in zip(sounds, rows, strict=True) if own == row]
             places.append((LogSpan(log, start, end, microphone), inside))
     # Random minutes first, then the latest.

@@ -96,8 +96,8 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
     parts = []
     for log in logs:
         rest = without(one(log.start, log.end), cut(learned, log.start, log.end))
-        times = zip(rest.starts.tolist(), rest.ends.tolist(), strict=True)
-        parts += [LogSpan(log.path, *span) for span in times if span[1] - span[0] >= _SHORTEST_PART]
+        spans = (span for span in rest.pairs() if span[1] - span[0] >= _SHORTEST_PART)
+        parts += [LogSpan(log.path, *span) for span in spans]
     return parts
 
 
@@ -110,8 +110,7 @@ def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list
         inside = cut(near, part.start, part.end)
         rest = without(one(part.start, part.end), inside)
         for chosen, spans in ((loud, inside), (quiet, rest)):
-            times = zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
-            chosen += [part._replace(start=start, end=end) for start, end in times]
+            chosen += [part._replace(start=start, end=end) for start, end in spans.pairs()]
     return [*_weighted(loud, *_LOUD, seed), *_weighted(quiet, *_QUIET, seed)]
 
 
@@ -232,8 +231,7 @@ def _true(
     for part in _parts(labellings, span, marks):
         parts.setdefault(class_name(part.label), []).append(part)
     for same in parts.values():
-        spans = spans_of([(part.start, part.end) for part in same])
-        for start, end in zip(*(edge.tolist() for edge in spans), strict=True):
+        for start, end in spans_of([(part.start, part.end) for part in same]).pairs():
             yield same[0]._replace(start=start, end=end)
 
 

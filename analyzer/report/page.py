@@ -175,7 +175,7 @@ def _description(timeline: DayTimeline) -> str:
     zone, spans = timeline.day.zone, timeline.day.missing
     gaps = [
         f"{clock_text(start, zone)} to {clock_text(end, zone)}"
-        for start, end in zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
+        for start, end in spans.pairs()
         if end - start >= HOUR
     ]
     text = f"{'; '.join(parts) or 'Nothing was heard'}."

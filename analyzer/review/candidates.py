@@ -162,10 +162,7 @@ def complete_minutes(labelling: Labelling) -> RecordedMinutes:
     if not len(labelling):
         return RecordedMinutes(np.empty(0, np.int64), np.empty(0, bool))
     stretches = joined(labelling.starts, labelling.ends, _UNLABELLED)
-    numbers = [
-        np.arange(-(-start // MINUTE), end // MINUTE)
-        for start, end in zip(stretches.starts.tolist(), stretches.ends.tolist(), strict=True)
-    ]
+    numbers = [np.arange(-(-start // MINUTE), end // MINUTE) for start, end in stretches.pairs()]
     starts = np.concatenate(numbers) * MINUTE
     names = {name: class_name(name) != SILENCE for name in set(labelling.labels)}
     loud = np.array([names[name] for name in labelling.labels], bool)

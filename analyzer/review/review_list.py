@@ -106,7 +106,7 @@ def queued(queue: ReviewQueue, microphone: str, a: str, b: str = "") -> list[Rev
 def random_minutes(minutes: Spans, side: NamedLabelling, microphone: str) -> list[ReviewSpan]:
     """List minutes drawn at random, in their order."""
     spans = []
-    for start, end in zip(minutes.starts.tolist(), minutes.ends.tolist(), strict=True):
+    for start, end in minutes.pairs():
         parts, rows, _ = pieces(side.labelling, one(start, end))
         labels, row = np.unique(side.labelling.labels[rows].astype(str), return_inverse=True)
         label = str(labels[np.bincount(row, parts.ends - parts.starts).argmax()])
@@ -345,10 +345,9 @@ def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:
     if span.reason != RANDOM:
         return [Mark(span.microphone, span.start, span.end, span.proposed_label)]
     parts, rows, _ = pieces(labelling, one(span.start, span.end))
-    times = zip(parts.starts.tolist(), parts.ends.tolist(), strict=True)
     return [
         Mark(span.microphone, *each, label)
-        for each, label in zip(times, labelling.labels[rows].tolist(), strict=True)
+        for each, label in zip(parts.pairs(), labelling.labels[rows].tolist(), strict=True)
     ]
 
 

@@ -282,7 +282,7 @@ def _print(
         print(f"{in_words(name)} {span.words}: {len(own) - apart or 'none'}{television}{by_hand}")
     pauses = [
         f"{local_time(start, zone):{form[:-3]}} to {local_time(end, zone):{form[:-3]}}"
-        for start, end in zip(missing.starts.tolist(), missing.ends.tolist(), strict=True)
+        for start, end in missing.pairs()
         if end - start >= _MENTIONED
     ]
     if pauses:

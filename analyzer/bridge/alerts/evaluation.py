@@ -128,8 +128,7 @@ def more_than_conditions(rule: MoreThan, activity: HomeActivity, until: int) -> 
         return f"{rule.words}: {times} in the last {window}, more than {rule.count}"
 
     spans = _too_many(rule, events) if rule.minutes is None else _too_long(rule, events, until)
-    edges = zip(spans.starts.tolist(), spans.ends.tolist(), strict=True)
-    return [Condition(*span, text) for span in edges]
+    return [Condition(*span, text) for span in spans.pairs()]
 
 
 def _too_many(rule: MoreThan, events: SoundEvents) -> Spans:

@@ -167,7 +167,7 @@ def _gaps(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> list[tuple
     gaps = microphone.not_listened(day.start, min(day.end, home.moment.now))
     long = gaps.ends - gaps.starts >= _SILENT
     shown = joined(gaps.starts[long], gaps.ends[long], BIN - 1)  # two minutes and more apart
-    return [*zip(shown.starts.tolist(), shown.ends.tolist(), strict=True)]
+    return [*shown.pairs()]
 
 
 def _lane(
