@@ -178,7 +178,7 @@ class _Sums:
 HEAD_WEIGHT = 1.0
 MACHINE_WEIGHT = 0.75
 _SUREST = 4.0  # maximum inverse temperature: without errors the sample was too small
-_NAMES_WEIGHT = 0.5  # weight of names next to both heads
+_WEIGHT_NEXT_TO_HEADS = 0.5  # of names, next to both heads
 _NAMES_WEIGHT, _NAMES_SLOPE = 1.25, 0.2  # of a step of a quarter of a logit
 _NAMES_BIAS = {FLUSHING_WATER: 2.5, OTHER: 1.5}  # classes that names alone miss
 _FOR_NAMES = 0.02  # F1: folds share recordists and rooms with the training set, not with names
@@ -321,7 +321,7 @@ def _candidates(
     by_rejecting = [] if rejecting is None else [rejecting]
     own = [n for n, name in enumerate(data.classes) if name not in {SILENCE, UNKNOWN}]
     if names is not None and (_sources(data)[own] < FEWEST_SOURCES).any():
-        weighted = names.model_copy(update={"weight": _NAMES_WEIGHT})
+        weighted = names.model_copy(update={"weight": _WEIGHT_NEXT_TO_HEADS})
         yield taken.inputs, [*by_rejecting, weighted], 0.0
     else:
         yield taken.inputs, [], 0.0
