@@ -36,6 +36,7 @@ from hearthlog.analyzer.bridge.page.sounds import (
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import languages, preferred_language, words_of
+from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time, today
 from hearthlog.analyzer.marks.marks import Mark
@@ -816,6 +817,24 @@ def test_a_loud_sound_that_the_model_is_unsure_of_needs_a_look_on_its_day_and_la
         past = json.loads(served.request("GET", f"/day?{date}")[2])
         (entry,) = past["events"]
         assert (entry["words"], entry["look"]) == ("Perhaps shouting", True)
+
+
+def test_doubtful_sounds_of_one_moment_are_one_entry_that_names_their_classes():
+    others = [event(12, "music"), event(20, "music")]
+    moment = [event(0, "music"), event(0.1, "unknown"), event(0.5, "speech"), event(1.5, "music")]
+    doubts = {
+        each.id: DoubtfulSound(each.label, each.start, each.end, 40.0, {}) for each in moment
+    }
+    folded = bouts([*moment, *others], doubts)
+    assert [[*bout.events] for bout in folded] == [others[1:], others[:1], moment]
+    shown = ShownBouts(folded[0].end, UTC, words_of("en"), lambda _: "", is_alone=True)
+    entry = shown.describe(folded[-1])
+    assert entry["words"] == "A loud sound"
+    assert entry["sure"] == "loud, and the model is not sure: perhaps music or talking"
+    assert (entry["times"], entry["length"]) == ("", ""), "they are parts of one sound"
+    assert entry["colour"] == colour_on_paper("unknown"), "it is of no class"
+    later = event(3, "speech")
+    assert len(bouts([*moment, later], doubts | {later.id: doubts[moment[0].id]})) == 2
 
 
 def test_at_most_four_doubtful_entries_need_a_look_and_these_are_the_loudest():

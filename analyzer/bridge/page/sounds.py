@@ -1,6 +1,6 @@
 """List of sounds on the page: events of one class folded, what needs a look, and their sound."""
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -20,19 +20,24 @@ from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import Words, clock, room
 from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, find_logs, log_name
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic
 
 _PAUSE = 300 * NANOSECONDS  # longest between two events of a bout
+_MOMENT = 60 * NANOSECONDS  # longest between two doubtful events of a bout
 _MOST_OF_BOUT = 50  # events
 _MOST_DOUBTFUL = 4  # bouts of a day
 
 
 class Bout(NamedTuple):
-    """Events of one class at one microphone, with pauses of five minutes at most."""
+    """Events of one class at one microphone, with pauses of five minutes at most.
+
+    Doubtful events have pauses of a minute at most, and may be of several classes: a model that is
+    not sure of a sound changes between them.
+    """
 
     events: Sequence[SoundEvent]  # the oldest first; its id is that of the bout
     doubts: Sequence[DoubtfulSound] = ()  # the same events if they are in doubt and need a look
@@ -46,6 +51,19 @@ class Bout(NamedTuple):
     def last(self) -> SoundEvent:
         """The newest event."""
         return self.events[-1]
+
+    @property
+    def end(self) -> int:
+        """End of the last event to end."""
+        return max(event.end for event in self.events)
+
+    @property
+    def labels(self) -> list[str]:
+        """The different labels, the longest in all first."""
+        seconds: Counter[str] = Counter()
+        for event in self.events:
+            seconds[event.label] += event.seconds
+        return [label for label, _ in seconds.most_common()]
 
     @property
     def is_important(self) -> bool:
@@ -71,11 +89,14 @@ def bouts(events: Iterable[SoundEvent], doubts: Doubts = MappingProxyType({})) -
 
 def _folded(events: Sequence[SoundEvent], doubts: Doubts) -> list[Bout]:
     found: list[list[SoundEvent]] = []
-    going: dict[tuple[str, str, bool], list[SoundEvent]] = {}
+    going: dict[tuple[str, str], list[SoundEvent]] = {}
     for event in sorted(events, key=lambda event: event.start):
-        key = event.microphone, event.label, event.id in doubts
+        is_doubtful = event.id in doubts
+        key = event.microphone, "" if is_doubtful else event.label
+        pause = _MOMENT if is_doubtful else _PAUSE
         own = going.get(key)
-        if own and event.start - own[-1].end <= _PAUSE and len(own) < _MOST_OF_BOUT:
+        is_near = own and event.start - max(each.end for each in own) <= pause
+        if own and is_near and len(own) < _MOST_OF_BOUT:
             own.append(event)
         else:
             going[key] = [event]
@@ -122,10 +143,11 @@ class ShownBouts(NamedTuple):
 
     def describe(self, bout: Bout) -> Any:
         """Return a bout for JSON."""
-        words, first, last = self.words, bout.first, bout.last
+        words, first = self.words, bout.first
+        is_mixed = len(bout.labels) > 1  # events that are no count of one sound
         count = len(bout.events)
         time = words.when(first.start, self.now, self.zone, is_past=self.is_past)
-        end = clock(last.end, self.zone)
+        end = clock(bout.end, self.zone)
         if count > 1 and end != clock(first.start, self.zone):
             time = words.text("range", first=time, last=end)
         corrections = [text for text in map(self.correction, bout.events) if text]
@@ -134,10 +156,10 @@ class ShownBouts(NamedTuple):
             "id": first.id,
             "label": first.label,
             "words": self._heading(bout),
-            "colour": colour_on_paper(first.label),
-            "times": words.times(count) if count > 1 else "",
+            "colour": colour_on_paper(UNKNOWN if bout.doubts else first.label),
+            "times": words.times(count) if count > 1 and not is_mixed else "",
             "time": time,
-            "length": length,
+            "length": "" if is_mixed else length,
             "sure": self._sureness(bout),
             "beside": self._beside(bout),
             "doubtful": bool(bout.doubts),
@@ -161,7 +183,14 @@ class ShownBouts(NamedTuple):
         if not bout.doubts:
             return self._sureness_of(bout.events)
         is_loud = any(doubt.is_loud for doubt in bout.doubts)
-        return self.words.text("doubt.why loud" if is_loud else "doubt.why")
+        text = self.words.text("doubt.why loud" if is_loud else "doubt.why")
+        if perhaps(bout.doubts, self.hidden):
+            return text
+        labels = (self.common_names.get(label, label) for label in bout.labels)
+        names = [name for name in dict.fromkeys(labels) if class_name(name) != UNKNOWN]
+        classes = [self.words.inside(self.words.class_words(name)) for name in names]
+        listed = self.words.listed(classes, "or")
+        return self.words.text("doubt.labels", why=text, classes=listed) if names else text
 
     def _sureness_of(self, events: Sequence[SoundEvent]) -> str:
         """Return how many of some events are not sure; whether the likeliest is if none are."""
