@@ -390,6 +390,7 @@ def test_hours_that_no_log_has_are_hatched_and_no_0_is_said_of_them():
     home = home_at(9, tiled((-3, -2)), tiled((7, 9)))
     (room,) = picture_of(home)["rooms"]
     assert room["gaps"] == [(0, round(9 / 24, 4))]
+    assert room["unheard"] == "Not listening: 22:00 to 07:00."
     assert [lane["counts"] for lane in room["lanes"]] == [[None, 0]] * len(room["lanes"])
     assert {lane["count"] for lane in room["lanes"]} == {None}
     (microphone,) = home.microphones  # what MQTT publishes
@@ -949,6 +950,26 @@ def test_at_1366_the_sounds_stand_beside_the_picture(phone, lived):
     assert right < phone.of(edges.format("#sounds", "left"))
 
 
+def test_a_long_list_begins_short_and_counts_lie_over_the_line_of_now(phone, tmp_path):
+    with serving(tmp_path) as home:
+        for number in range(8):
+            home.log.write_segment(("music", "speech")[number % 2], 90 - 10 * number, 4)
+        home.log.hears("silence")
+        phone.open(home)
+        phone.shows("#all-events", "Show all 8")
+        drawn = "[...document.querySelectorAll('#events > li')].filter((e) => e.offsetHeight).length"
+        assert phone.of(drawn) == 6
+        phone.of("document.getElementById('all-events').click()")
+        assert phone.of(drawn) == 8
+        assert phone.of("document.activeElement.closest('li').matches(':nth-child(7)')")
+        order = "document.querySelector('.moment').compareDocumentPosition({}) & 4"
+        assert phone.of(order.format("document.querySelector('.lane')"))
+        assert phone.of("document.getElementById('key-beside').hidden"), "nothing is drawn so"
+        pictures = [name for role, name in phone.tree() if name.startswith("Sounds, ")]
+        assert len(pictures) == 1
+        assert "from 22:00 of the evening before. Not listening: 22:00 to" in pictures[0]
+
+
 _SHIFTS = """
 window.moved = [];
 new PerformanceObserver((list) => moved.push(...list.getEntries().map(({ value, sources }) =>
@@ -1026,6 +1047,8 @@ def test_a_german_phone_is_shown_a_page_that_fits(phone, lived, scheme):
         phone.shows("#heard", "Ruhe")
         phone.of(f"{lane('Husten')}.dispatchEvent(new MouseEvent('click'))")
         phone.shows(".panel", "Husten überall ausblenden")
+        names = phone.of("[...document.querySelectorAll('tbody th')].map((e) => e.textContent)")
+        assert "Haushalts\N{SOFT HYPHEN}geräusche" in names
         assert phone.of(PALE_TEXTS) == []
         assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
     finally:

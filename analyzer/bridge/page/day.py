@@ -33,6 +33,7 @@ IMPORTANT = frozenset({COUGHING, CRYING, YELLING, PHONE_RING})  # classes that n
 _HOUR = 3600 * NANOSECONDS
 _LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
 _MOST_TIMES = 40  # of a count
+_MOST_GAPS = 6  # in words
 _SILENT = 60 * NANOSECONDS  # shortest gap that is drawn
 _DIGITS = 4  # decimals of a position in the day, 0 to 1
 
@@ -146,9 +147,11 @@ def picture_of(home: HomeDay) -> Any:
 def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
     times_of_day = home.times_of_day()
     known = [_is_known(microphone, part, day, home.moment.now) for part in times_of_day]
+    gaps = _gaps(microphone, day, home)
     return {
         "room": room(microphone.name),
-        "gaps": [(day.place(a), day.place(b)) for a, b in _gaps(microphone, day, home)],
+        "gaps": [(day.place(a), day.place(b)) for a, b in gaps],
+        "unheard": _gaps_in_words(gaps, home),
         "lanes": [
             _lane(label, sounds, home, [*zip(times_of_day, known, strict=True)])
             for label, sounds in home.sounds(microphone, 0).items()
@@ -168,6 +171,18 @@ def _gaps(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> list[tuple
     long = gaps.ends - gaps.starts >= _SILENT
     shown = joined(gaps.starts[long], gaps.ends[long], BIN - 1)  # two minutes and more apart
     return [*shown.pairs()]
+
+
+def _gaps_in_words(gaps: Sequence[tuple[int, int]], home: HomeDay) -> str:
+    """Return the gaps in words, as the text alternative of the picture; empty without gaps."""
+    words = home.words
+    spans = [
+        words.text("range", first=clock(start, home.zone), last=clock(end, home.zone))
+        for start, end in gaps[:_MOST_GAPS]
+    ]
+    if len(gaps) > _MOST_GAPS:
+        spans.append(words.text("picture.more", count=len(gaps) - _MOST_GAPS))
+    return words.text("picture.unheard", spans=words.listed(spans)) if spans else ""
 
 
 def _lane(

@@ -13,6 +13,13 @@ export function count(key, number) {
   return say(`${key}.${number === 1 ? "one" : "other"}`, { count: number.toLocaleString(language) });
 }
 
+const BREAKS = texts["page.breaks"].split(" ").map((word) => [word.replaceAll("|", ""), word.replaceAll("|", "\u00ad")]);
+
+// A name whose long words may be broken: a browser may have no dictionary of the language.
+export function breakable(words) {
+  return BREAKS.reduce((text, [word, broken]) => text.replace(word, broken), words);
+}
+
 // The name of a class as it is written inside of a sentence.
 export function inside(words) {
   return texts["page.nouns"] === "lower case" ? words.toLowerCase() : words;

@@ -1,5 +1,5 @@
 // A day as one picture, its counts, and the times behind a lane or a count.
-import { draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
+import { breakable, draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
 import { showEntries } from "./sounds.js";
 
 const LANE = 36, NAME = 15, GAP = 3, HOURS = 20; // pixels
@@ -16,7 +16,7 @@ export function marks(bars, width, hours, top, height) {
     if (bars[i] !== "0") {
       const head = foot - height * (0.2 + 0.8 * bars[i] / 9);
       path += `M${(i * step).toFixed(1)} ${foot}V${head.toFixed(1)}h${
-        Math.max((end - i) * step, 2).toFixed(1)}V${foot}Z`;
+        Math.max((end - i) * step, 3).toFixed(1)}V${foot}Z`;
     }
     i = end;
   }
@@ -38,7 +38,7 @@ function choose(chosen) {
   close();
   if (same) return;
   const close_ = make("button", { type: "button", class: "quiet back" });
-  open = { ...chosen, heading: make("p", { class: "what" }), list: make("ol", { class: "sounds times" }), items: new Map(),
+  open = { ...chosen, heading: make("p", { class: "what" }), list: make("ol", { class: "sounds times", role: "list" }), items: new Map(),
     note: make("p", { class: "about" }), hide: close_ };
   close_.addEventListener("click", () => hideClass(open.data().it.label));
   open.panel = make("div", { class: "panel" }, open.heading, open.list, open.note, close_);
@@ -107,7 +107,7 @@ function beginRow(room, label, columns) {
 }
 
 function showRow(row, it, where, columns) {
-  if (!row.name.firstChild) row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour), make("span", {}, it.words)));
+  if (!row.name.firstChild) row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour), make("span", {}, breakable(it.words))));
   it.counts.forEach((value, index) => {
     row.cells[index].className = value ? "" : "none";
     write(row.counts[index], value === null ? say("not known") : String(value));
@@ -128,7 +128,7 @@ function beginRoom(name, isAlone) {
   room.group = draw("g");
   room.ground = draw("rect", { class: "ground", rx: 6 });
   room.svg = draw("svg", { class: "picture", role: "group" }, room.ground, room.nights, room.unheard,
-    room.future, room.group, room.moment, room.hours);
+    room.future, room.moment, room.group, room.hours); // the counts lie over the line of now
   room.heads = make("tr");
   room.body = make("tbody");
   room.caption = make("caption", { class: "hidden" });
@@ -138,14 +138,14 @@ function beginRoom(name, isAlone) {
   return room;
 }
 
-function showRoom(room, { gaps, lanes }, day) {
+function showRoom(room, { gaps, unheard, lanes }, day) {
   room.lanes = lanes;
   room.sounded = lanes.filter(({ bars, pale }) => bars || pale);
   const width = Math.max(Math.floor(room.svg.getBoundingClientRect().width), 100);
   const height = Math.max(room.sounded.length, 1) * LANE, whole = height + HOURS;
   set(room.svg, "viewBox", `0 0 ${width} ${whole}`);
   set(room.svg, "height", whole);
-  set(room.svg, "aria-label", [room.where, day.title].filter(Boolean).join(", "));
+  set(room.svg, "aria-label", [say("picture", { day: [room.where, day.title].filter(Boolean).join(", ") }), unheard].filter(Boolean).join(" "));
   for (const [name, value] of [["width", width], ["height", height]]) set(room.ground, name, value);
   set(room.nights, "d", spans(day.nights, width, height));
   set(room.unheard, "d", spans(gaps, width, height));
@@ -204,6 +204,8 @@ export function showDay(day) {
   shown = day;
   if (isNew) close();
   place("legend").hidden = !day.rooms.length;
+  place("key-unheard").hidden = !day.rooms.some(({ gaps }) => gaps.length);
+  place("key-beside").hidden = !day.rooms.some(({ lanes }) => lanes.some(({ pale }) => pale));
   const key = JSON.stringify(day.rooms.map(({ room }) => room));
   if (key !== roomsOf) {
     close();

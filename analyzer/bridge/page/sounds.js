@@ -1,7 +1,9 @@
 // Lists of sounds: what they were, what they really were, and their kept sound.
-import { ask, count, inside, keep, make, place, say, send, swatch, write } from "./elements.js";
+import { ask, breakable, count, inside, keep, make, place, say, send, swatch, write } from "./elements.js";
 
 const REST = 8000; // milliseconds without a touch, after which a list may change
+const SEPARATOR = "\u00a0· "; // ends a line, and begins none
+const BRIEF = 6; // sounds that are shown at first
 const AGAIN = 60000; // after which it is asked again whether sound was kept
 let classes = [], isSoundAllowed = false;
 const lists = { look: new Map(), events: new Map(), recurring: new Map() }; // items by ids
@@ -170,7 +172,7 @@ function beginBout(entry) {
   });
   item.entry = entry;
   item.isReviewable = true;
-  item.what.append(...(entry.isSingle ? [entry.time] : [swatch(entry.colour), entry.words]), item.often = make("span", { class: "often" }));
+  item.what.append(...(entry.isSingle ? [entry.time] : [swatch(entry.colour), breakable(entry.words)]), item.often = make("span", { class: "often" }));
   item.play = playButton(() => item.entry.ids, () => `${item.entry.words}, ${item.entry.time}`);
   item.details.before(item.play);
   return item;
@@ -178,8 +180,8 @@ function beginBout(entry) {
 
 function showBout(item, entry) {
   item.entry = entry;
-  write(item.often, entry.times ? ` · ${entry.times}` : "");
-  write(item.about, entry.isSingle ? entry.about : [entry.time, entry.length, entry.sure, entry.beside, entry.room].filter(Boolean).join(" · "));
+  write(item.often, entry.times ? `${SEPARATOR}${entry.times}` : "");
+  write(item.about, entry.isSingle ? entry.about : [entry.time, entry.length, entry.sure, entry.beside, entry.room].filter(Boolean).join(SEPARATOR));
   if (entry.said || !item.isAnswered) showAnswer(item, entry.said); // the log has an answer later
   write(item.hint, ` (${[entry.words, entry.time, entry.room].filter(Boolean).join(", ")})`);
 }
@@ -199,6 +201,8 @@ function showList(events) {
   arrange(place("events"), lists.events, others, beginBout, showBout);
   place("looked-at").hidden = !look.length;
   place("no-events").hidden = events.length > 0;
+  write(place("all-events"), say("all", { count: others.length }));
+  place("all-events").hidden = others.length <= BRIEF || !place("events").classList.contains("brief");
   showPlayable(events.flatMap(({ ids }) => ids));
 }
 
@@ -259,6 +263,13 @@ place("new-sounds").addEventListener("click", () => {
   showLatest(true);
   const section = place("sounds");
   if (section.getBoundingClientRect().top < 0) section.scrollIntoView();
+});
+
+place("all-events").addEventListener("click", () => {
+  const next = place("events").children[BRIEF]; // where one reads on
+  place("events").classList.remove("brief");
+  place("all-events").hidden = true;
+  next.querySelector("summary").focus();
 });
 
 // Classes that are hidden
