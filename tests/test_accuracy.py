@@ -445,7 +445,8 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     logs = write_day(tmp_path / "home", DAY, coughs)
     page = tmp_path / "before.html"
     make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), page)
-    assert "How often, as labelled" in page.read_text()
+    assert "<h2>What was heard, as labelled</h2>" in page.read_text()
+    assert '<th scope="col">How long</th>' in page.read_text(), "the title has it"
     assert "90 % intervals" not in page.read_text()
     for hour in range(8, 14):
         check(logs, at(f"{hour:02}:00"), [(5, 7, "objects_activity")] if hour % 2 else [])
@@ -456,6 +457,7 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     text = page.read_text()
     assert "In 6 minutes of this day and the 28 days before" in text
     assert "3 of 6" in text
+    assert "<h2>What was heard</h2>" in text
     assert "How long, as labelled" in text
     assert re.search(r"talking, in all</td><td[^>]*>[^<]+, as labelled<", text)
     assert re.search(r"\d+ to \d+ \(8 labelled\)", text)

@@ -45,7 +45,7 @@ from hearthlog.analyzer.report.timeline import (
 )
 from hearthlog.analyzer.report.wording import (
     clock_text,
-    date_in_words,
+    dates_in_words,
     day_in_words,
     several_in_words,
     short_day,
@@ -130,7 +130,7 @@ def day_page(account: Account) -> str:
         title=title,
         headline=day_headline(day),
         gist=list(gist_of_day(account, day)),
-        overview=[("What was heard", _sounds(account, day))],
+        overview=[(f"What was heard{_labelled(account)}", _sounds(account, day))],
         parts=[_part(account, section, day) for section in sections(account.classes)],
     )
 
@@ -138,7 +138,7 @@ def day_page(account: Account) -> str:
 def week_page(account: Account) -> str:
     """Return the page of a week."""
     first, last = account.days[0].day, account.days[-1].day
-    spoken = f"{date_in_words(first)} to {date_in_words(last)}"
+    spoken = dates_in_words(first, last)
     names = [name for name in account.classes if name != SILENCE and _occurs(account, name)]
     drawn = occurring_classes(account.days)
     days = [(short_day(day.day), timeline_of(day, drawn)) for day in account.days]
@@ -150,7 +150,10 @@ def week_page(account: Account) -> str:
         headline=week_headline(account.days),
         gist=list(gist_of_week(account)),
         overview=[
-            ("How often it was heard", _week(account, list(map(event_figure, names)))),
+            (
+                f"How often it was heard{_labelled(account)}",
+                _week(account, list(map(event_figure, names))),
+            ),
             (
                 "How long it was heard, as labelled",
                 _week(account, list(map(minutes_figure, names))),
@@ -161,6 +164,11 @@ def week_page(account: Account) -> str:
             for section in sections(account.classes)
         ],
     )
+
+
+def _labelled(account: Account) -> str:
+    """Return the end of a title above figures that are all as labelled."""
+    return "" if account.checked else ", as labelled"
 
 
 def _description(timeline: DayTimeline) -> str:
@@ -253,8 +261,8 @@ def _scenario_text(minutes: float, day: DayMetrics) -> str:
 
 def _sounds(account: Account, day: DayMetrics) -> PageTable:
     """Return how often, when and how long each class was heard."""
-    often = "How often" if account.checked else "How often, as labelled"
-    heads = ["Sound", often, "When, as labelled", "How long, as labelled"]
+    labelled = ", as labelled" * account.checked  # else the title of the table has it
+    heads = ["Sound", "How often", f"When{labelled}", f"How long{labelled}"]
     rows = []
     for name in account.classes:
         figure, lasting = event_figure(name), minutes_figure(name)
@@ -263,7 +271,7 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
             cells = [Cell(""), Cell(""), _cell(account, lasting, day)]
         elif _occurs(account, name) and (value is not None or uncounted):
             cell = _cell(account, figure, day)
-            notes = [f"{_NOT_COUNTED}: {uncounted}"] * bool(uncounted) + [cell.note] * bool(
+            notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{uncounted}"] * bool(uncounted) + [cell.note] * bool(
                 cell.note
             )
             starts = counted_events(day, name, day.span)
@@ -293,7 +301,7 @@ def _times(day: DayMetrics, starts: Int64) -> str:
     """Return the times of a few events, else the first and the last."""
     if len(starts) <= _FEW:
         return times_in_words(starts, day.zone)
-    return " to ".join(clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max()))
+    return "\N{NO-BREAK SPACE}to ".join(clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max()))
 
 
 def _occurs(account: Account, name: str) -> bool:
@@ -339,8 +347,7 @@ def _part(account: Account, section: FigureSection, day: DayMetrics) -> PageSect
     if len(known) < len(section.figures):
         more = "more" if known else "anything"
         remarks.append(f"Too little was recorded to tell {more}.")
-    head = "This day" if account.checked else "This day, as labelled"
-    return PageSection(section, PageTable(["", head], rows), remarks)
+    return PageSection(section, PageTable(["", "This day"], rows, "figures"), remarks)
 
 
 def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
@@ -380,7 +387,7 @@ def _week(account: Account, figures: Sequence[ReportFigure]) -> PageTable:
         values = [figure.value(day) if day.coverage.length else None for day in account.days]
         uncounted = [day.beside_television(figure.name) * figure.counts for day in account.days]
         usual = _dense(account.usually(figure)) if account.comparable else ""
-        notes = [f"{_NOT_COUNTED}: {sum(uncounted)}"] * any(uncounted)
+        notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{sum(uncounted)}"] * any(uncounted)
         notes += [f"usually {usual} a day"] * bool(usual)
         colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(

@@ -1,5 +1,6 @@
 """Wording of days, times, classes and anomalies."""
 
+from collections import Counter
 from dataclasses import replace
 from datetime import date, tzinfo
 
@@ -44,6 +45,13 @@ def date_in_words(day: date) -> str:
     return f"{day.day} {_MONTHS[day.month - 1]} {day.year}"
 
 
+def dates_in_words(first: date, last: date) -> str:
+    """Format two dates, with what they share once: `2 to 8 March 2026`."""
+    day, month, year = date_in_words(first).split()
+    shared = (first.year != last.year) + (first.month != last.month or first.year != last.year)
+    return f"{' '.join([day, month, year][: 1 + shared])} to {date_in_words(last)}"
+
+
 def short_day(day: date) -> str:
     """Format a day: `Sun 1 Mar`."""
     return f"{_WEEKDAYS[day.weekday()][:3]} {day.day} {_MONTHS[day.month - 1][:3]}"
@@ -72,9 +80,14 @@ def clock_text(nanoseconds: int, zone: tzinfo) -> str:
 
 def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
     """List times of day (nanoseconds of UTC, any order), `most` of them, and how many more."""
-    shown = [clock_text(start, zone) for start in np.sort(starts)[:most].tolist()]
-    more = len(starts) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more else "")
+    shown = Counter(clock_text(start, zone) for start in np.sort(starts)[:most].tolist())
+    more = len(starts) - shown.total()
+    texts = [text if n == 1 else f"{text} ({_often(n)})" for text, n in shown.items()]
+    return ", ".join(texts) + (f" and {more} more" if more else "")
+
+
+def _often(number: int) -> str:
+    return "twice" if number == 2 else f"{number} times"
 
 
 WEEK = 7.0  # days: a shorter return period counts as usual

@@ -230,7 +230,9 @@ def report_statements(
         for part in sections(day.home.classes)
         for figure in part.figures
     }
-    for title, heads, cells in page.rows:
+    for full, plain, cells in page.rows:
+        title, labelled, _ = full.partition(", as labelled")
+        heads = [head + labelled for head in plain]
         if title == "What was heard":
             yield from _heard(heads, cells, day, truth)
         elif (title, cells[0]) in figures:
