@@ -823,9 +823,7 @@ def test_a_loud_sound_that_the_model_is_unsure_of_needs_a_look_on_its_day_and_la
 def test_doubtful_sounds_of_one_moment_are_one_entry_that_names_their_classes():
     others = [event(12, "music"), event(20, "music")]
     moment = [event(0, "music"), event(0.1, "unknown"), event(0.5, "speech"), event(1.5, "music")]
-    doubts = {
-        each.id: DoubtfulSound(each.label, each.start, each.end, 40.0, {}) for each in moment
-    }
+    doubts = {each.id: DoubtfulSound(each.label, each.start, each.end, 40.0, {}) for each in moment}
     folded = bouts([*moment, *others], doubts)
     assert [[*bout.events] for bout in folded] == [others[1:], others[:1], moment]
     shown = ShownBouts(folded[0].end, UTC, words_of("en"), lambda _: "", is_alone=True)
@@ -957,7 +955,9 @@ def test_a_long_list_begins_short_and_counts_lie_over_the_line_of_now(phone, tmp
         home.log.hears("silence")
         phone.open(home)
         phone.shows("#all-events", "Show all 8")
-        drawn = "[...document.querySelectorAll('#events > li')].filter((e) => e.offsetHeight).length"
+        drawn = (
+            "[...document.querySelectorAll('#events > li')].filter((e) => e.offsetHeight).length"
+        )
         assert phone.of(drawn) == 6
         phone.of("document.getElementById('all-events').click()")
         assert phone.of(drawn) == 8

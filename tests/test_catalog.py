@@ -732,10 +732,17 @@ def test_the_command_writes_the_catalogue_and_shows_the_homes(fleet, capfd):
     assert done.stderr == ""
     assert "north/anna" in done.stdout
     assert "2 homes" in done.stdout
+    head = done.stdout.splitlines()[0].split()
+    assert head[:3] == ["home", "logs", "unfinished"]
+    assert "damaged" not in head, "no file is"
     (cut,) = find_logs(fleet / "bert")
     assert f"unfinished: {cut.relative_to(fleet).as_posix()}" in done.stdout
     cut.unlink()
-    assert run(capfd, "catalog", fleet).returncode == 0
+    done = run(capfd, "catalog", fleet)
+    assert done.returncode == 0
+    assert "unfinished" not in done.stdout.splitlines()[0]
+    gaps = sum(home.gaps for home in homes(read_catalog(fleet)))
+    assert ("no log has a gap" in done.stdout) == (not gaps)
     assert {row.home for row in read_catalog(fleet).rows()} == {"north/anna"}
 
 

@@ -578,7 +578,9 @@ def test_times_of_up_to_five_sounds_are_written_and_of_more_the_first_and_the_la
     assert rows["Coughing"] == ["2", "11:00 (twice)", "under 1 min"]
     assert rows["Telephone ringing"] == ["3", "09:58, 10:08, 15:26", "under 1 min"]
     assert rows["Talking"] == ["6", "08:00 to 08:50", "under 1 min"]
-    assert list(rows)[1:4] == ["Coughing", "Telephone ringing", "Talking"], "what matters comes first"
+    assert list(rows)[1:4] == ["Coughing", "Telephone ringing", "Talking"], (
+        "what matters comes first"
+    )
 
 
 def test_a_hidden_class_is_not_among_those_that_a_model_does_not_know(tmp_path):

@@ -271,9 +271,9 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
             cells = [Cell(""), Cell(""), _cell(account, lasting, day)]
         elif _occurs(account, name) and (value is not None or uncounted):
             cell = _cell(account, figure, day)
-            notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{uncounted}"] * bool(uncounted) + [cell.note] * bool(
+            notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{uncounted}"] * bool(uncounted) + [
                 cell.note
-            )
+            ] * bool(cell.note)
             starts = counted_events(day, name, day.span)
             cells = [
                 cell._replace(note=", ".join(notes)),
@@ -301,7 +301,9 @@ def _times(day: DayMetrics, starts: Int64) -> str:
     """Return the times of a few events, else the first and the last."""
     if len(starts) <= _FEW:
         return times_in_words(starts, day.zone)
-    return "\N{NO-BREAK SPACE}to ".join(clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max()))
+    return "\N{NO-BREAK SPACE}to ".join(
+        clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max())
+    )
 
 
 def _occurs(account: Account, name: str) -> bool:

@@ -27,6 +27,7 @@ _AROUND = 600 * NANOSECONDS
 _RIGHT = "."
 _CAPS = {_RIGHT: "Enter", "p": "Space"}
 _NO_SOUND = "no sound of this span was kept"
+_ANSWERS = {"a", "c", _RIGHT, "n", "b", "q"}
 _CLASS_KEYS = "1234567890eghijklorsvwxy"
 _SELECT = "drag a span on the time ruler, or press [ at its start and ] at its end"
 
@@ -123,6 +124,15 @@ class ReviewSession:
         ]
         return [*own, Key("q", "quit")]
 
+    @property
+    def key_lines(self) -> list[str]:
+        """All keys as three lines: answers, sounds, and those for spans and marks."""
+        lines: dict[str, list[str]] = {"answers": [], "sounds": [], "spans and marks": []}
+        for one in self.keys:
+            named = "sounds" if one.colour is not None else "spans and marks"
+            lines["answers" if one.key in _ANSWERS else named].append(f"{one.cap} {one.text}")
+        return [f"{what}: {', '.join(texts)}" for what, texts in lines.items()]
+
     def _labels(self) -> dict[str, str]:
         """Return the class of each key that names one."""
         classes = [name for name in self.classes if name not in {UNKNOWN, TELEVISION}]
@@ -193,8 +203,9 @@ class ReviewSession:
             if same in actions:
                 actions[same][1]()
             elif key.strip():
-                keys = ", ".join(f"{one.cap} {one.text}" for one in self.keys)
-                self.announce(f"{key!r} does nothing; the keys are: {keys}")
+                for line in self.key_lines:
+                    self.announce(line)
+                self.announce(f"{key!r} does nothing: press one of these keys")
         except HearthlogError as error:
             self.announce(str(error))
         except (ConnectionError, TimeoutError):

@@ -368,6 +368,7 @@ _HOMES_SHOWN = 40  # one page
 _TO_THE_MINUTE = len("2026-03-01T08:00")
 _COUNTS = "logs", "layers", "unfinished", "damaged"
 _FIGURES = "MB", "hours", "gaps", "gap minutes", "from (UTC)", "to (UTC)"
+_IF_ANY = frozenset({"layers", "unfinished", "damaged", "gaps", "gap minutes"})
 
 
 def catalog(
@@ -462,16 +463,26 @@ def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
 def _print_homes(
     homes: Sequence["HomeTotals"], labels: Sequence["LabelAmount"], unfinished: Sequence[str]
 ) -> None:
-    print_table(("home", *_COUNTS, *_FIGURES), _home_rows(homes))
+    rows = list(_home_rows(homes))
+    columns = [
+        column
+        for column in zip(("home", *_COUNTS, *_FIGURES), *rows, strict=True)
+        if column[0] not in _IF_ANY or any(map(float, column[1:]))
+    ]
+    head, *shown = zip(*columns, strict=True)
+    print_table(head, shown)
     if len(homes) > _HOMES_SHOWN:
         print(f"and {len(homes) - _HOMES_SHOWN} more homes (--json lists all)")
-    print_table(("labels", "model", "label", "minutes", "events"), _label_sums(labels), words=3)
+    if homes and not {"unfinished", "damaged", "gaps"} & {*head}:
+        print("no file is unfinished or damaged, and no log has a gap")
+    print()
+    print_table(("labels", "model", "sound", "minutes", "events"), _label_sums(labels), words=3)
     print_lines(first_of("unfinished", unfinished))
 
 
 def _home_rows(homes: Sequence["HomeTotals"]) -> Iterator[Sequence[str]]:
     for home in homes[:_HOMES_SHOWN]:
-        yield _home_row(home.home or "-", [home])
+        yield _home_row(home.home or "this folder", [home])
     if len(homes) > 1:
         yield _home_row(number(len(homes), "home"), homes)
 
@@ -486,8 +497,8 @@ def _home_row(name: str, homes: Sequence["HomeTotals"]) -> Sequence[str]:
         f"{sum(home.hours for home in homes):.2f}",
         str(sum(home.gaps for home in homes)),
         f"{sum(home.gap_seconds for home in homes) / 60:.2f}",
-        (moment(min(starts, default=None)) or "")[:_TO_THE_MINUTE],
-        (moment(max(ends, default=None)) or "")[:_TO_THE_MINUTE],
+        (moment(min(starts, default=None)) or "")[:_TO_THE_MINUTE].replace("T", " "),
+        (moment(max(ends, default=None)) or "")[:_TO_THE_MINUTE].replace("T", " "),
     ]
 
 

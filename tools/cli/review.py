@@ -37,6 +37,7 @@ from hearthlog.tools.cli.terminal import (
     share_done,
     show_page,
     suggest_training,
+    wrapped,
     wrong_use,
 )
 
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.review.review_list import ReviewSpan, SoundFile
     from hearthlog.analyzer.review.review_queue import ReviewItem
     from hearthlog.analyzer.review.session import ReviewSession
-    from hearthlog.analyzer.review.timeline import Key, SoundClip, Timeline
+    from hearthlog.analyzer.review.timeline import SoundClip, Timeline
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
 _QUEUE = "--queue"
@@ -244,7 +245,7 @@ def _show(
         shown.reviewed_scenarios.setdefault(marking.scenario, no_spans())  # else it has no lane
 
     def announce(text: str) -> None:
-        print(printable(text), flush=True)
+        print(wrapped(printable(text), sys.stdout), flush=True)
         viewer.announce(text)
 
     def look_closely(start: int, end: int) -> None:
@@ -281,7 +282,7 @@ def _show(
         if not items and grid.end - grid.start <= MOST_FRAMES:
             look_closely(grid.start, grid.end)
         viewer.write_checked(timeline, class_precision(timeline, find_home_logs(logs)))
-        _print_keys(session.keys)
+        _print_keys(session)
         if session.run(keys):
             suggest_training(logs, marking.scenario, "what is marked")
     if not marking.scenario:
@@ -295,10 +296,10 @@ def _playable(session: "ReviewSession", clips: "Sequence[SoundClip]") -> bytes:
     return sound_file(clips, *session.span_to_play())
 
 
-def _print_keys(keys: "Sequence[Key]") -> None:
+def _print_keys(session: "ReviewSession") -> None:
     """Print the keys: on a terminal in columns, with the colours of their classes."""
     if not sys.stdout.isatty():
-        print(printable(", ".join(f"{one.cap} {one.text}" for one in keys)), flush=True)
+        print(*map(printable, session.key_lines), sep="\n", flush=True)
         return
     from rich.columns import Columns
     from rich.console import Console
@@ -309,7 +310,7 @@ def _print_keys(keys: "Sequence[Key]") -> None:
             (f" {one.cap} ", "reverse" if one.colour is None else f"black on rgb{one.colour}"),
             f" {printable(one.text)}",
         )
-        for one in keys
+        for one in session.keys
     ]
     Console(highlight=False).print(Columns(cells, equal=True, column_first=True, padding=(0, 3)))
 

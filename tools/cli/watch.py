@@ -183,7 +183,7 @@ def watch(
     ] = None,
     minutes: Annotated[
         int | None,
-        typer.Option(min=1, max=120, help="Seconds to show.", show_default=str(_MINUTES)),
+        typer.Option(min=1, max=120, help="Minutes to show.", show_default=str(_MINUTES)),
     ] = None,
     timezone: Timezone = None,
 ) -> None:

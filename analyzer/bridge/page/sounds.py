@@ -1,6 +1,6 @@
 """List of sounds on the page: events of one class folded, what needs a look, and their sound."""
 
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -60,10 +60,10 @@ class Bout(NamedTuple):
     @property
     def labels(self) -> list[str]:
         """The different labels, the longest in all first."""
-        seconds: Counter[str] = Counter()
+        seconds: dict[str, float] = {}
         for event in self.events:
-            seconds[event.label] += event.seconds
-        return [label for label, _ in seconds.most_common()]
+            seconds[event.label] = seconds.get(event.label, 0.0) + event.seconds
+        return sorted(seconds, key=lambda label: -seconds[label])
 
     @property
     def is_important(self) -> bool:
