@@ -180,6 +180,7 @@ def test_names_are_mixed_in_where_a_class_has_hardly_any_source():
     way = Tried(group_folds(data), np.zeros((len(data), len(data.classes))), known)
     mix = best_mix(data, HEARING, [way]).mix
     assert [HEARING.names[one] for one in mix.names[-1].classes["coughing"]] == ["coughing"]
+    assert mix.names[-1].weight == 0.5, "next to both heads; alone, names weigh 1.25"
 
 
 def bathroom(noise):
