@@ -200,7 +200,7 @@ def prefetch(
 
 _BLOCK = 1 << 17  # bytes: a store needs little more time for them than for a few
 _KEPT = 4  # blocks
-_ASKED = 8  # concurrent files of a store
+_REQUESTS = 8  # concurrent files of a store
 
 
 def is_local(path: object) -> bool:
@@ -212,7 +212,7 @@ def map_logs(function: Callable[[Path], Result], logs: Sequence[Path]) -> Iterab
     """Apply a function to logs, in order."""
     if all(map(is_local, logs)):
         return map(function, logs)
-    return prefetch(function, logs, _ASKED)
+    return prefetch(function, logs, _REQUESTS)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from scipy.special import betaincinv
 from spliced import run
 
 from hearthlog.analyzer.activity.checked_minutes import ClassCheck, read_checked_minutes
-from hearthlog.analyzer.activity.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.activity.daily_metrics import day_of, metrics_of_home
 from hearthlog.analyzer.activity.event_counts import (
     FEWEST,
     MINUTE,
@@ -335,7 +335,7 @@ def test_a_sparse_television_is_known_by_its_voices(name):
 
 def report_day(root, checks=None):
     data = read_home(find_home_logs([root]), "live", 0, day_span(DAY, UTC))
-    return day_of(whole_home(data, checks), DAY, UTC)
+    return day_of(metrics_of_home(data, checks), DAY, UTC)
 
 
 def test_coughs_beside_a_television_are_counted_apart(tmp_path):

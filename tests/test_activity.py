@@ -14,7 +14,7 @@ from livehome import rule
 from spliced import run
 
 from hearthlog.analyzer.activity.checked_minutes import read_checked_minutes
-from hearthlog.analyzer.activity.daily_metrics import day_of, home_sound, whole_home
+from hearthlog.analyzer.activity.daily_metrics import day_of, home_sound, metrics_of_home
 from hearthlog.analyzer.activity.day_profile import COUNT, LENGTH, Profiles
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import read_home
@@ -67,7 +67,7 @@ def logs(tmp_path_factory):
 def day_metrics(logs, labelling="live"):
     before = day_span(DAY - timedelta(days=1), ZONE)[0]
     data = read_home(find_home_logs([logs]), labelling, before, day_span(DAY, ZONE))
-    return data, day_of(whole_home(data), DAY, ZONE)
+    return data, day_of(metrics_of_home(data), DAY, ZONE)
 
 
 def reported(logs):
@@ -254,7 +254,7 @@ def test_the_catalogue_a_comparison_and_an_evaluation_count_the_events_of_the_re
     hearthlog, (start, end) = partial(run, capfd), day_span(DAY, ZONE)
 
     def counted(labelling="live"):
-        home = whole_home(read_home(find_home_logs([logs]), labelling, 0, (start, end)))
+        home = metrics_of_home(read_home(find_home_logs([logs]), labelling, 0, (start, end)))
         return {name: own for name, own in home.events.items() if name != SILENCE and len(own)}
 
     starts = counted()

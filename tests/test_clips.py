@@ -675,7 +675,7 @@ class Swapped:
         yield from self._day()
         for count, name in enumerate(self._names, 2):
             put_by_hand(self._folder, name)
-            self._asked.ask()
+            self._asked.request()
             deadline = time.monotonic() + 120
             while len([p for p in self._logs.rglob("*.mcap*") if not is_layer(p)]) < count:
                 assert time.monotonic() < deadline

@@ -18,7 +18,7 @@ from homelife import GENERAL, at, midnight, write_day
 from spliced import run
 from waiting import wait_for
 
-from hearthlog.analyzer.activity.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.activity.daily_metrics import day_of, metrics_of_home
 from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
@@ -82,7 +82,7 @@ def day_metrics(logs, day=DAY):
     start, end = day_span(day, ZONE)
     before = day_span(day - timedelta(days=1), ZONE)[0]
     return day_of(
-        whole_home(read_home(find_home_logs([logs]), "live", before, (start, end))), day, ZONE
+        metrics_of_home(read_home(find_home_logs([logs]), "live", before, (start, end))), day, ZONE
     )
 
 

@@ -17,7 +17,7 @@ from logs import read
 from PIL import Image
 from spliced import run
 
-from hearthlog.analyzer.activity.daily_metrics import day_of, whole_home
+from hearthlog.analyzer.activity.daily_metrics import day_of, metrics_of_home
 from hearthlog.analyzer.activity.event_counts import Strata, checked_rates
 from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.activity.values import (
@@ -58,7 +58,7 @@ UTC = ZoneInfo("UTC")
 
 def look(root, day=DAY, zone=UTC, labelling="live"):
     data = read_home(find_home_logs([root]), labelling, 0, day_span(day, zone))
-    return day_of(whole_home(data), day, zone)
+    return day_of(metrics_of_home(data), day, zone)
 
 
 def rows_of(page):
@@ -743,7 +743,7 @@ def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
 def test_a_class_is_only_compared_on_days_on_which_it_would_have_been_heard(flat, flat_page):
     shelf = find_home_logs([flat])
     data = read_home(shelf, "live", 0, day_span(DAY, UTC))
-    day = day_of(whole_home(data), DAY, UTC)
+    day = day_of(metrics_of_home(data), DAY, UTC)
     assert day.comparable("coughing")
     assert not day.comparable("shower"), "the bathroom was heard for 14 hours"
     assert "water taps less often" not in text_of(flat_page)
@@ -767,7 +767,7 @@ def test_a_week_has_its_seven_days_and_their_total(flat, tmp_path):
     assert page.count('<th scope="col">Wed 25</th>') == 5
     assert page.count('<th scope="col">All</th>') == 5
     data = read_home(find_home_logs([flat]), "live", 0, day_span(DAY, UTC))
-    home = whole_home(data)
+    home = metrics_of_home(data)
     days = [day_of(home, DAY - timedelta(days=n), UTC) for n in range(7)]
     total = sum((day.count("shower") for day in days), Count())
     assert rows_of(page)["Shower"][-1] == total.show(total.middle)

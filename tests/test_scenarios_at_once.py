@@ -329,7 +329,7 @@ def test_a_replacement_with_a_class_of_another_model_is_refused(session, tmp_pat
     before = load_model(path)
     keep(path, {"tap_water": "speech"})
     wait_for(lambda: feed().summary.models_refused == 1)
-    requests.ask()
+    requests.request()
     wait_for(lambda: feed().summary.models_refused == 2)
     replace_file(before, path)
     for _ in range(20):

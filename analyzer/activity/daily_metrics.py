@@ -164,7 +164,7 @@ class HomeMetrics:
         return starts[(starts >= span.starts[0]) & (starts < span.ends[0])]
 
 
-def whole_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetrics:
+def metrics_of_home(data: HomeData, checks: CheckedMinutes | None = None) -> HomeMetrics:
     """Combine the one or more microphones of a home.
 
     A span is silent if every microphone labels silence; segments of one class at most ten seconds

@@ -38,7 +38,7 @@ _ASSUMED = {CLOCK: (45.0, 0.0), COUNT: (0.7, 0.0), LENGTH: (0.3, 0.2)}
 _FEWEST_OF_KIND = 6
 _SPREAD = 1.86  # error of a median for a median deviation of 1, times the root of the count
 _TINY = 1e-9
-_HEARD = 0.1  # minimum minutes of a class in half an hour for it to be present
+_PRESENT = 0.1  # minimum minutes of a class in half an hour for it to be present
 _REGULAR = 0.9  # minimum share of days for a regular hour
 _SHORTEST, _LONGEST, _MOST_HOURS = 2, 6, 3
 
@@ -155,7 +155,7 @@ def _regular(minutes: Float64, width: int) -> tuple[Float64, Float64]:
     sums = sliding_window_view(minutes, width, axis=1).sum(axis=-1)
     known = np.maximum(np.isfinite(sums).sum(axis=0), 1)
     amounts = np.nan_to_num(sums)
-    return (amounts >= _HEARD).sum(axis=0) / known, amounts.sum(axis=0) / known
+    return (amounts >= _PRESENT).sum(axis=0) / known, amounts.sum(axis=0) / known
 
 
 def figure_table(

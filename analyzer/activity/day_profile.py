@@ -73,7 +73,7 @@ _NAMELESS = {SILENCE, OTHER, UNKNOWN}
 _AT_NIGHT = (FLUSHING_WATER, TAP_WATER, COUGHING, CRYING, YELLING)
 _LEAST = 0.9  # recorded share of a span for its figures to be present
 _LEAST_FIGURES = 0.5
-_LEAST_BESIDE = 0.9  # recorded share before the first, or after the last, busy half hour
+_LEAST_AROUND = 0.9  # recorded share before the first, or after the last, busy half hour
 _ONE = timedelta(days=1)
 _RISING = 4  # o'clock: earlier activity belongs to the previous day
 _BUSY, _HALF_HOUR = 5, 30 * MINUTE  # number of sounds that start in a busy half hour
@@ -187,7 +187,7 @@ class Profiles:
         time = int(lasts[is_busy][-1] if last else firsts[is_busy][0])
         outside = (time, end) if last else (begin, time)
         covered = cut(self._coverage, *outside).length
-        known = covered >= _LEAST_BESIDE * (outside[1] - outside[0])
+        known = covered >= _LEAST_AROUND * (outside[1] - outside[0])
         return self._clock(time, day) if known else np.nan
 
     def _clock(self, time: int, day: date) -> float:

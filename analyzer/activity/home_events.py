@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.activity.daily_metrics import HomeMetrics, whole_home
+from hearthlog.analyzer.activity.daily_metrics import HomeMetrics, metrics_of_home
 from hearthlog.analyzer.activity.home_data import HomeData, read_home
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelling import in_order
@@ -70,7 +70,7 @@ def read_day_totals(logs: HomeLogs, day: date, zone: tzinfo) -> dict[str, EventT
     """
     start, end = day_span(day, zone)
     data = read_home(logs, LIVE, start - _BEFORE, (start, end))
-    return event_totals(whole_home(data), start, end)
+    return event_totals(metrics_of_home(data), start, end)
 
 
 def marked_classes(data: HomeData) -> list[str]:

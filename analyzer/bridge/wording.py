@@ -14,7 +14,7 @@ from hearthlog.schemas.errors import listed, printable, shortened
 
 _LONGEST = 200  # characters of a text from a log
 _LONGEST_NAME = 60
-_HEARD = {"listening", "reading"}  # diagnostic texts of a working microphone
+_WORKING = {"listening", "reading"}  # diagnostic texts of a working microphone
 _FILES = "hearthlog.analyzer.bridge.page"
 _LANGUAGE = re.compile(r"([a-z]{2,3})\.json")
 _DEFAULT = "en"
@@ -185,4 +185,4 @@ def reason(text: str) -> str:
 
     They are `listening` if the recorder ended or was killed.
     """
-    return "" if text in _HEARD else text
+    return "" if text in _WORKING else text

@@ -303,7 +303,7 @@ _FORMAT_OF_EMBEDDINGS: Final = 2  # refused by versions without embedding suppor
 _SMALL, _LARGE = 1e-6, 1e6  # limits of radii and scales; all other numbers are at most as large
 _ARRAYS = {"mean": 1, "scale": 1, "axes": 2, "examples": 2, "of": 1, "radii": 1}  # of a space
 _EMBEDDED = "embedded_"  # prefix of the arrays of the embedding space
-_WHOLE = {"of", "numbers"}
+_INTEGERS = {"of", "numbers"}
 
 _Name = Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
 
@@ -379,7 +379,7 @@ def _problem(header: _Header, arrays: dict[str, NDArray[Any]]) -> str:
     if arrays.keys() != expected.keys():
         return "it has other arrays"
     for name, dimensions in expected.items():
-        is_integer = name.removeprefix(_EMBEDDED) in _WHOLE
+        is_integer = name.removeprefix(_EMBEDDED) in _INTEGERS
         array, kind = arrays[name], np.int64 if is_integer else np.float64
         if array.ndim != dimensions or array.dtype != kind:
             return f"{name} is not as it has to be"

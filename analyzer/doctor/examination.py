@@ -253,7 +253,7 @@ class ForeignMessages:
 
 
 _TOLERANCE = 0.01  # share of the time between two files, for the error of a sound card's clock
-_BESIDE = 60 * NANOSECONDS  # maximum extent of a layer beyond its log
+_MARGIN = 60 * NANOSECONDS  # maximum extent of a layer beyond its log
 _LEFT = {
     f"{SUFFIX}.damaged": "is what could not be recovered whole; `hearthlog recover` may save more",
     f"{SUFFIX}.recovering": "was left by a recovery that was cut short; the next one makes it anew",
@@ -300,7 +300,7 @@ def _check_layers(files: Sequence[ExaminedFile]) -> None:
     for path in filter(is_layer, spans):
         log, (start, end) = log_of_layer(path), spans[path]
         first, last = spans.get(log, (start, end))
-        if end < first - _BESIDE or last + _BESIDE < start:
+        if end < first - _MARGIN or last + _MARGIN < start:
             findings = next(file.findings for file in files if file.findings.path == path)
             what = f"speaks of a time when {log.name} was not recorded"
             advice = "it belongs to another log; move it beside that"

@@ -70,7 +70,7 @@ class Cell(NamedTuple):
     text: str
     change: str = ""  # how the figure differs from other days
     colour: tuple[int, int, int] | None = None
-    whole: bool = False  # whether line breaks are forbidden
+    unbroken: bool = False  # whether line breaks are forbidden
     note: str = ""  # in small letters below the text
 
 
@@ -243,7 +243,7 @@ def _scenario(account: Account, name: str) -> PageTable:
         [
             Cell(in_words(label), colour=colour_on_paper(label)),
             *(
-                Cell(_scenario_text(found.get(label, 0.0), day), whole=True)
+                Cell(_scenario_text(found.get(label, 0.0), day), unbroken=True)
                 for found, day in zip(days, account.days, strict=True)
             ),
         ]
@@ -332,10 +332,10 @@ def _cell(
     if is_alone and account.checked and not _is_checked(value):
         text += ", as labelled"
     if not account.comparable:
-        return Cell(text, whole=True)
+        return Cell(text, unbroken=True)
     usual = account.usually(figure)
     note = f"usually {usual}" if usual else ""
-    return Cell(text, account.change(figure, day), whole=True, note=note)
+    return Cell(text, account.change(figure, day), unbroken=True, note=note)
 
 
 def _text(value: Value | None) -> str:

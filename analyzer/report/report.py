@@ -16,7 +16,7 @@ from hearthlog.analyzer.activity.daily_metrics import (
     DayMetrics,
     day_of,
     home_sound,
-    whole_home,
+    metrics_of_home,
 )
 from hearthlog.analyzer.activity.day_anomaly import Routines
 from hearthlog.analyzer.activity.day_profile import Profiles
@@ -125,7 +125,7 @@ def read_account(
     data = read_home(logs, labelling, since, close, progress)
     model = _model(logs, close) if labelling == LIVE else ""
     checks = read_checked_minutes(logs, labelling, since, close[1], data.losses).of_model(model)
-    metrics = whole_home(data, checks)
+    metrics = metrics_of_home(data, checks)
     routines = Routines(Profiles(home_sound(data, metrics), zone, night_after=False))
     past = [day_of(metrics, day, zone) for day in earlier]
     now = time.time_ns() if now is None else now

@@ -95,7 +95,7 @@ _MONTH = 30.0
 _SHOWN = 4
 _SINGLE = 3.0  # widths: a single figure this far from usual is reported even on a usual day
 _DAY = 1440.0  # minutes
-_HEARD = 0.05  # minutes
+_LEAST_MINUTES = 0.05  # less is none
 _BUSY = {FIRST: "first busy half hour from", LAST: "last busy half hour until"}
 _NAMES = {STRETCHES: "times with sound", SOUND: "sound", QUIET: "longest quiet stretch"}
 
@@ -173,7 +173,7 @@ def _lasting(figure: DayFigure, minutes: float) -> str:
     name, text = _name(figure), Duration.show(minutes)
     if figure.what == QUIET:
         return f"{name} {text}"
-    return f"{name} for {text}" if minutes >= _HEARD else f"no {name}"
+    return f"{name} for {text}" if minutes >= _LEAST_MINUTES else f"no {name}"
 
 
 def _name(figure: DayFigure) -> str:

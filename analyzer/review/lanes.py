@@ -138,7 +138,7 @@ def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
 
 REVIEWED = "Reviewed"  # name of the lane, and text of spans without a mark
 SELECTED = "Selected"  # name of the lane of the span that a key would mark
-NOT_HEARD = "Not heard"
+UNRECORDED = "Not heard"
 _TROUBLE = "Trouble"
 _RECURRING = "Recurs"
 _VOICES = "Voices"
@@ -279,7 +279,7 @@ def _shared_lanes(
     for scenario, looked_at in {"": microphone.reviewed, **microphone.reviewed_scenarios}.items():
         own = marks.get(review_labelling(scenario), no_spans())
         yield reviewed_lane(microphone.name, scenario, own, looked_at)
-    kinds = (NOT_HEARD, microphone.gaps, GAP), (_TROUBLE, microphone.troubles, _TROUBLED)
+    kinds = (UNRECORDED, microphone.gaps, GAP), (_TROUBLE, microphone.troubles, _TROUBLED)
     for name, spans, shade in kinds:
         if len(spans):
             texts = np.full(len(spans), name, object)

@@ -261,7 +261,7 @@ MOST_FRAMES = 3 * 3600 * NANOSECONDS  # maximum span with all frames kept; a day
 _PART = 3600 * NANOSECONDS
 OFF = "the recorder was off"
 _SHORTEST = 2 * FRAME_NANOSECONDS  # minimum share, so that each contains a frame
-_WHOLE_BYTES = 2 << 30  # maximum size of logs read completely: about three days
+_COMPLETE_BYTES = 2 << 30  # maximum size of logs read completely: about three days
 _OF_LAYERS = (message_types.LABEL, message_types.SEGMENT)
 # Maximum delay from the time of a label to its log time: the labels wait for windows.
 _LATE = (MOST_AHEAD_FRAMES + 1) * FRAME_NANOSECONDS
@@ -293,7 +293,7 @@ def read_timeline(
     last = max(file.last for file in files) + FRAME_NANOSECONDS if end is None else end
     last = max(last, first + _SHORTEST)
     grid = TimelineGrid(first, last, min(MOST_SHARES, (last - first) // _SHORTEST))
-    every = -(-sum(file.size for file in files if not file.layer) // _WHOLE_BYTES)
+    every = -(-sum(file.size for file in files if not file.layer) // _COMPLETE_BYTES)
     reader = _Reader(grid, max(every, 1))
     for number, file in enumerate(files):
         with collect_errors(losses, LogError, DataError):

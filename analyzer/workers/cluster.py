@@ -105,7 +105,7 @@ class Cluster:
         self.version = version("hearthlog")
         self.refused: dict[str, str] = {}  # by address, versions of other workers; kept
         self._versions: dict[str, str] = {}  # by address, of current workers
-        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._queries: dict[str, asyncio.Task[None]] = {}
         self._threads: dict[str, int] = {}  # by address, of usable workers
         self._manned = asyncio.Event()  # set while there are usable workers
         self._watching: asyncio.Task[LostClusterError]
@@ -155,8 +155,8 @@ class Cluster:
         deadline = time.monotonic() + _WORKERS_SECONDS
         while not self._threads and time.monotonic() < deadline:
             await self._look()
-            if self._asking:  # all current workers report their version
-                await asyncio.wait(self._asking.values(), timeout=_SILENT_SECONDS)
+            if self._queries:  # all current workers report their version
+                await asyncio.wait(self._queries.values(), timeout=_SILENT_SECONDS)
             await self._look()
             for worker, has in self.refused.items():
                 raise WorkerError(
@@ -180,9 +180,9 @@ class Cluster:
         workers = identity["workers"]
         for address in self._versions.keys() - workers.keys():
             del self._versions[address]
-        for address in workers.keys() - self._versions.keys() - self._asking.keys():
+        for address in workers.keys() - self._versions.keys() - self._queries.keys():
             # Not awaited: a hanging worker must not hide a hanging scheduler.
-            self._asking[address] = asyncio.create_task(self._ask(address))
+            self._queries[address] = asyncio.create_task(self._query(address))
         self._threads = {
             address: about["nthreads"]
             for address, about in workers.items()
@@ -193,7 +193,7 @@ class Cluster:
         else:
             self._manned.clear()
 
-    async def _ask(self, address: str) -> None:
+    async def _query(self, address: str) -> None:
         try:
             # A function of the standard library, so that a worker without hearthlog can answer.
             (theirs,) = (
@@ -202,7 +202,7 @@ class Cluster:
         except (OSError, ValueError):  # it has left
             return
         finally:
-            del self._asking[address]
+            del self._queries[address]
         if isinstance(theirs, PackageNotFoundError):
             self._versions[address], self.refused[address] = "", "no hearthlog"
         elif isinstance(theirs, str):  # else it could not answer this time

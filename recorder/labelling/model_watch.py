@@ -51,7 +51,7 @@ class ReloadRequests:
         self._queues.append(SimpleQueue())
         return self._queues[-1]
 
-    def ask(self) -> None:
+    def request(self) -> None:
         """Request a check from all watches."""
         for queue in self._queues:
             queue.put(None)

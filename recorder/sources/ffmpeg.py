@@ -274,7 +274,7 @@ _PATIENCE_SECONDS = 15.0  # longer than ffmpeg's timeout: a server may send data
 _SETTLE_SECONDS = 3.0  # until a server has sent its buffered sound
 _READ_BYTES = 1 << 18  # 8 s of sound
 _INT16_BYTES = 2
-_SAID_BYTES = 4000
+_MESSAGE_BYTES = 4000
 
 
 def main() -> None:
@@ -368,7 +368,7 @@ class _Sound:
     def _listen(self) -> None:
         with suppress(BlockingIOError):
             self._error_text = (self._error_text + os.read(self._errors, _READ_BYTES))[
-                -_SAID_BYTES:
+                -_MESSAGE_BYTES:
             ]
 
     def _reason(self) -> str:

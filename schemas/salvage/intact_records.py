@@ -113,13 +113,13 @@ class IntactRecord(NamedTuple):
 
     offset: int
     end: int
-    record: "McapRecord | Whole | None"  # None for a message index
+    record: "McapRecord | IntactPiece | None"  # None for a message index
     corrected: str = ""  # description of the error in its head
     escaped: tuple[str, ...] = ()  # names of records with texts that are not UTF-8
     proved: bool = True  # False: there is no checksum, so its content may be wrong
 
 
-Whole = IntactChunk | LargeChunk | IntactAttachment | UnknownRecord
+IntactPiece = IntactChunk | LargeChunk | IntactAttachment | UnknownRecord
 
 
 def split_content(content: bytes) -> tuple[Int64, Int64]:

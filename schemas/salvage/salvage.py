@@ -26,10 +26,10 @@ from hearthlog.schemas.salvage.intact_records import (
     SHORTEST,
     IntactAttachment,
     IntactChunk,
+    IntactPiece,
     IntactRecord,
     LargeChunk,
     UnknownRecord,
-    Whole,
     chunk_messages,
     find_record_heads,
 )
@@ -43,7 +43,7 @@ _FRAMED = {Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.MESSAGE_INDEX, Opcode.METADAT
 
 _LATE = "log times after the year 2262"
 
-Piece = records.Metadata | records.Message | Whole
+Piece = records.Metadata | records.Message | IntactPiece
 
 
 class _Places(NamedTuple):
@@ -112,7 +112,7 @@ class Salvage:
         return len(self._damages)
 
     def pieces(self) -> Iterator[Piece]:
-        """Read all undamaged pieces: `Metadata`, `Message` or a member of `Whole`, in file order.
+        """Read all undamaged pieces, in file order: `Metadata`, `Message` or an `IntactPiece`.
 
         Chunks have verified checksums and a rebuilt message index. They hold no messages of
         undefined channels: in chunks with such messages, the other messages are yielded one by one.

@@ -80,7 +80,7 @@ def events(
         wrong_use("--start and --end exclude --day and --night")
     if play and as_json:
         wrong_use("--play and --json exclude each other")
-    from hearthlog.analyzer.activity.daily_metrics import whole_home
+    from hearthlog.analyzer.activity.daily_metrics import metrics_of_home
     from hearthlog.analyzer.activity.home_data import read_home
     from hearthlog.analyzer.activity.home_events import event_totals, home_events, marked_classes
     from hearthlog.analyzer.logs.local_time import iso_time, midnight
@@ -90,7 +90,7 @@ def events(
     before = midnight(_date(span.start, zone) - timedelta(days=1), zone)  # of an event that goes on
     with share_done("reading the labels") as progress:
         data = read_home(home_logs, labels, before, span[:2], progress)
-    metrics = whole_home(data)
+    metrics = metrics_of_home(data)
     marked = marked_classes(data)
     classes = _chosen_classes([*metrics.classes, *marked], label or (), data.hidden)
     found = home_events(data, metrics, classes, *span[:2])

@@ -264,7 +264,7 @@ def _look_at_hangup(
     def handle(*_: object) -> None:
         if at_terminal and not sys.stderr.isatty():
             stop.set()
-        reload_requests.ask()
+        reload_requests.request()
         Thread(target=look_at_configuration, daemon=True).start()
 
     signal.signal(signal.SIGHUP, handle)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.activity.daily_metrics import DayMetrics, day_of, whole_home
+from hearthlog.analyzer.activity.daily_metrics import DayMetrics, day_of, metrics_of_home
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import HomeData
 from hearthlog.analyzer.errors import DataError
@@ -120,7 +120,7 @@ def true_day(sounds: Sequence[TrueSound], day: DayMetrics) -> TrueDay:
     labelling = Labelling(*edges, labels[order])
     classes = [*dict.fromkeys([*day.home.classes, *labels.tolist()])]
     data = HomeData({source: labelling}, {source: labelling}, {}, {source: classes})
-    home = whole_home(data)
+    home = metrics_of_home(data)
     apart = np.isin(home.minutes.starts, day.home.minutes.starts[day.home.minutes.television])
     others = [s for s in sounds if s.origin not in _OF_THE_HOME]
     on = joined(*(np.array([s[i] for s in others], np.int64) for i in (0, 1)), _PAUSE)

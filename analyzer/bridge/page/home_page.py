@@ -33,7 +33,7 @@ from hearthlog.analyzer.bridge.page.sounds import (
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scenario_lines
 from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, page_token
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
-from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.analyzer.bridge.wording import Words, clock, preferred_language, room, words_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time
@@ -80,10 +80,10 @@ class HomePage:
     """
 
     def __init__(
-        self, settings: PageSettings, home: RecorderAddress, state: Path, say: Callable[[str], None]
+        self, settings: PageSettings, home: RecorderAddress, state: Path, report: Report
     ) -> None:
         bind = ip_address(settings.bind)
-        self._settings, self._home, self._say = settings, home, say
+        self._settings, self._home, self._report = settings, home, report
         self._started = time.time_ns()
         self._made = -_EVERY_SECONDS
         self._state = HomeState()  # the latest
@@ -108,13 +108,15 @@ class HomePage:
         admission = PageAdmission(settings.bind, settings.port, token, key, names, ingress)
         self._server = PageServer(admission, self, settings.frames)
         if ingress:
-            say(f"the page of the home: port {settings.port}, for the ingress at {ingress} alone")
+            report(
+                f"the page of the home: port {settings.port}, for the ingress at {ingress} alone"
+            )
         else:
-            self._say_address(bind, token, state)
+            self._report_address(bind, token, state)
 
-    def _say_address(self, bind: IPv4Address | IPv6Address, token: str, state: Path) -> None:
+    def _report_address(self, bind: IPv4Address | IPv6Address, token: str, state: Path) -> None:
         """Keep and print the address with the token, without the token where others may read."""
-        settings, say = self._settings, self._say
+        settings, report = self._settings, self._report
         loopback = "::1" if bind.version == 6 else "127.0.0.1"
         opened = loopback if bind.is_unspecified else settings.bind  # 0.0.0.0 opens nowhere
         host = f"[{opened}]" if bind.version == 6 else opened
@@ -128,9 +130,9 @@ class HomePage:
         # Other users may read the journal, so it must not have the token.
         if writes_to_journal():
             full = f"{address}; its full address is in {file.absolute()}"
-        say(f"the page of the home: {full}")
+        report(f"the page of the home: {full}")
         if not bind.is_loopback:
-            say(
+            report(
                 f"the page listens on {settings.bind}: it crosses a network unencrypted, where "
                 "others can read it and its token, unless a container or a firewall keeps the port "
                 "to this machine"
