@@ -524,9 +524,9 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
     if "television" in text:
         day = truth.metrics
     minutes = day.home.minutes.between(span)
-    common = home.microphones[0].common_names
-    known = list(dict.fromkeys(common.get(label, label) for label in home.microphones[0].names))
-    names = [n for n in known if n not in _NO_SOUNDS and _mentions(text, n)]
+    microphone = home.microphones[0]
+    shown = dict.fromkeys(microphone.common_names.get(label, label) for label in microphone.names)
+    names = [n for n in shown if n not in _NO_SOUNDS and _mentions(text, n)]
     if match := re.search(r"[Nn]o ([^.:(]*)\.$", text):
         for name in (n for n in names if _mentions(match[1], n)):
             true = minutes.count(name, None).labelled
