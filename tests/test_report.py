@@ -931,6 +931,10 @@ def needing_look_in(page):
         ),
         (COUGH, "Needs a look, 14:02 and 15:05: the model is not sure; it might be coughing."),
         (
+            (4.0, "music", 0.33, {}, 48.0),
+            "Needs a look, 14:02 and 15:05: loud, and the model is not sure; it might be music.",
+        ),
+        (
             (4.0, "unknown", 0.3, {}, 40.0),
             "Needs a look, 14:02 and 15:05: loud, and the model is not sure.",
         ),

@@ -1,5 +1,6 @@
 """Summary of a report in sentences, with missing coverage and troubles."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -20,13 +21,21 @@ from hearthlog.analyzer.report.wording import (
     short_day,
     too_few_text,
 )
-from hearthlog.models.classes import COUGHING, FLUSHING_WATER, SILENCE, in_words
+from hearthlog.models.classes import (
+    COUGHING,
+    FLUSHING_WATER,
+    SILENCE,
+    UNKNOWN,
+    class_name,
+    in_words,
+)
 from hearthlog.schemas.errors import listed
 
 _MOST = 6  # kinds of gaps or troubles
 _MINUTE = HOUR // 60
 _PAUSE = 20 * _MINUTE  # shorter pauses of a television are not told
 _TIMES = 3
+_MOST_LABELS = 3  # of one doubtful time
 _BREAK = 5 * _MINUTE  # longest pause between doubtful sounds of one time
 _MOST_DOUBTS = 5  # times
 _HALF = 0.5  # hours
@@ -82,12 +91,22 @@ def needing_look(account: Account) -> Iterator[str]:
     shown = sorted(runs, key=lambda run: -max(sound.level_db for sound in run))[:_MOST_DOUBTS]
     lines: dict[str, list[str]] = {}
     for run in sorted(shown, key=lambda run: run[0].start):
-        names = [in_words(name).lower() for name in perhaps(run, account.hidden)]
+        labels = perhaps(run, account.hidden) or _labels_of(run)
+        names = [in_words(name).lower() for name in labels]
         text = "the model is not sure" + (f"; it might be {listed(names, 'or')}" if names else "")
         loud = "loud, and " if any(sound.is_loud for sound in run) else ""
         lines.setdefault(loud + text, []).append(_clocks(account, run[0].start, run[-1].end))
     for text, times in lines.items():
         yield f"Needs a look, {listed(times, 'and')}: {text}."
+
+
+def _labels_of(sounds: Iterable[DoubtfulSound]) -> list[str]:
+    """Return the labels of doubtful sounds, the longest in all first."""
+    lengths = Counter[str]()
+    for sound in sounds:
+        if class_name(sound.label) != UNKNOWN:
+            lengths[sound.label] += sound.end - sound.start
+    return [label for label, _ in lengths.most_common(_MOST_LABELS)]
 
 
 def not_recorded(account: Account) -> Iterator[str]:
