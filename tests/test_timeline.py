@@ -434,7 +434,7 @@ def test_a_damaged_review_layer_is_a_loss_and_its_log_is_shown(tmp_path, folder,
 
 def test_of_logs_that_are_too_large_a_sample_is_read_and_said(folder, timeline, monkeypatch):
     size = sum(log.stat().st_size for log in find_logs(folder))
-    monkeypatch.setattr(reading, "_WHOLE_BYTES", size // 3)
+    monkeypatch.setattr(reading, "_COMPLETE_BYTES", size // 3)
     sample = read_timeline([folder])
     assert sample.every > 1
     assert not sample.microphones["mic"].frames
