@@ -99,7 +99,12 @@ def class_name(label: str) -> str:
 
 
 def ordered(labels: Iterable[str]) -> list[str]:
-    """Return labels without duplicates in the order of all displays, the most important first."""
+    """Return labels without duplicates in the order of all displays, the most important first.
+
+    Classes of a home's own keep their order, in a set that of the alphabet.
+    """
+    if isinstance(labels, (set, frozenset)):
+        labels = sorted(labels)
 
     def place(label: str) -> tuple[int, int]:
         name = class_name(label)

@@ -22,6 +22,7 @@ from hearthlog.models.classes import (
     find_class,
     in_words,
     meant_by,
+    ordered,
     translation,
 )
 from hearthlog.models.classifiers.classifier import Classifier
@@ -188,3 +189,9 @@ def test_a_scenario_with_as_many_classes_as_a_model_may_have_has_no_unknown():
 
 def test_every_class_is_seen_on_paper():
     assert all(min(colour_on_paper(row.name)) < 220 for row in CLASSES)
+
+
+def test_classes_of_a_home_are_in_one_order_whatever_the_order_of_a_set():
+    own = [f"pet_{number}" for number in range(100, 160)]
+    assert ordered({*own, "silence", "coughing"}) == ["coughing", *own, "silence"]
+    assert ordered(["zebra", "ant", "zebra"]) == ["zebra", "ant"]

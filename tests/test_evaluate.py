@@ -35,6 +35,7 @@ from hearthlog.analyzer.training.scores import (
 )
 from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import default_transitions, train_model
+from hearthlog.models.classes import ordered
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
@@ -432,6 +433,8 @@ def test_a_log_is_scored_against_a_label_file_and_against_its_review(recorded, t
     review = hearthlog("evaluate", "log", copy, "--reference", "review", "--json")
     assert review.returncode == 0, review.stderr
     assert json.loads(review.stdout)["confusion"] == found["confusion"]
+    events = json.loads(review.stdout)["events"]
+    assert list(events) == ordered(set(events)), "in one order, whatever the seed of hashes"
     layer = hearthlog(
         "evaluate", "log", copy, "--topic", "/mic/review/segment", "--reference", track, "--json"
     )

@@ -102,7 +102,7 @@ def read_home(
     for source in sorted(parts):
         home.labelled[source] = home.segments[source] = _labelling(home, parts[source])
     marks, reviewed = _reviews(home, logs.between(since, close[1], REVIEW_LAYER), labelling)
-    for source in marks.keys() | reviewed.keys():
+    for source in sorted(marks.keys() | reviewed.keys()):
         labels = home.labelled.setdefault(source, labelling_of_marks([]))
         home.segments[source] = overlaid(labels, labelling_of_marks(marks[source]))
         through: list[Mark | ReviewedSpan] = [*marks[source], *reviewed[source]]
@@ -148,7 +148,7 @@ def _look_closely(home: HomeData, entries: Sequence[HomeLog], close: tuple[int, 
         for topic in (*gaps, *selection.topics_of(message_types.STREAM_INFO, ())):
             microphones |= {microphone_of(topic)} - {""}
         nodes |= dict.fromkeys(record["node"] for record in selection.metadata if "node" in record)
-        for topic in set(gaps) & columns.keys():
+        for topic in sorted(set(gaps) & columns.keys()):
             home.gaps += gaps_of(entry.node, columns[topic])
         if DIAGNOSTICS in columns:
             statuses += statuses_of(columns[DIAGNOSTICS])
@@ -186,7 +186,7 @@ def _segments(
         if entry.layer:
             _lose_unfinished(home, entry, selection)
         segments = topics.intersection(selection.topics_of(message_types.SEGMENT, _FIELDS))
-        for topic in topics & selection.channels.keys() - segments:
+        for topic in sorted(topics & selection.channels.keys() - segments):
             kinds = {
                 "" if schema is None else schema.name for _, schema in selection.channels[topic]
             }

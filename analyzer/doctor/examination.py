@@ -105,7 +105,7 @@ def _examine(file: LocalFile, examined: ExaminedFile, progress: Progress) -> Non
         what = "is unfinished: it was cut off"
         findings.error("cut", what, "`hearthlog recover` completes it")
     records = data.metadata.get(HEARTHLOG_METADATA, [])
-    for text in {unknown_version(record) for record in records} - {""}:
+    for text in sorted({unknown_version(record) for record in records} - {""}):
         findings.warning("newer", text)
     if isinstance(data.checks, MessageChecks):
         data.checks.finish()
@@ -289,7 +289,7 @@ def check_series(files: Sequence[ExaminedFile]) -> None:
     for same in nodes.values():
         same.sort(key=lambda file: (file.span or (0, 0))[0])
         _check_overlaps(same)
-        for microphone in {name for file in same for name in file.frames}:
+        for microphone in sorted({name for file in same for name in file.frames}):
             _check_frames(microphone, [file for file in same if microphone in file.frames])
     _check_layers(files)
 

@@ -24,7 +24,7 @@ from hearthlog.analyzer.logs.spans import Spans, common, joined, pieces
 from hearthlog.analyzer.marks.label_files import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
@@ -118,7 +118,8 @@ def _event_counts(
         return Counter({name: len(events_of(within, name).starts) for name in names})
 
     sides = counts(reference), counts(predicted)
-    return {name: EventCount(*(side[name] for side in sides)) for name in sides[0] | sides[1]}
+    names = ordered(set(sides[0] | sides[1]))
+    return {name: EventCount(*(side[name] for side in sides)) for name in names}
 
 
 def _frames(

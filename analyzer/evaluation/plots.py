@@ -154,7 +154,7 @@ def save_scenes(path: Path, title: str, found: ScenesEvaluation) -> None:
 def _lane(axes: Any, found: ScenesEvaluation, row: int) -> None:
     """Draw ten minutes of a labelled scene."""
     for base, labelling in ((1, found.truth), (0, found.found)):
-        for name in set(labelling.labels) - {SILENCE}:
+        for name in sorted(set(labelling.labels) - {SILENCE}):
             spans = _minutes(labelling, name)
             axes.broken_barh(spans, (base + 0.06, 0.88), facecolor=_rgb(name), linewidth=0)
     axes.set_yticks((1.5, 0.5), ("truth", "labels"))

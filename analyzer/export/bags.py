@@ -271,7 +271,7 @@ def _save_rosbag2(selection: LogSelection, files: OutputFiles, progress: Progres
     topics = [topic for topic, channels in selection.channels.items() if is_for_rosbag2(channels)]
     if selection.channels and not topics:
         raise LogError(_NO_PLACE)
-    for topic in selection.channels.keys() - topics:
+    for topic in sorted(selection.channels.keys() - topics):
         warnings.warn(HearthlogWarning(f"{_NO_PLACE}: left out", topic, each=True), stacklevel=2)
     if len(topics) < len(selection.channels):
         selection = selection.only(topics)

@@ -320,7 +320,7 @@ class Labellings:
                     return  # no earlier: a segment in the span may be logged later
 
     def _topics(self) -> list[TopicName]:
-        names = {name for log in self.logs for name in log.segments}
+        names = sorted({name for log in self.logs for name in log.segments})
         topics = [topic for name in names if (topic := parse_topic(name)) is not None]
         return [topic for topic in topics if topic.kind == "segment"]
 

@@ -124,7 +124,7 @@ def find_class_names(labels: Iterable[str], class_map: Mapping[str, str] | None)
     classes = set(given.values())
     certain: dict[str, str] = {}
     folded: dict[str, str] = {}
-    for label in set(labels):
+    for label in dict.fromkeys(labels):
         mapped = given.get(_spelt(label))
         name = _folded(label)
         if mapped or CLASS_NAME.fullmatch(label):

@@ -349,7 +349,7 @@ def _check(span: Mark | ReviewedSpan, what: str) -> None:
 
 def _subtract(old: Sequence[Mark], new: Sequence[Mark | MarkedSpan]) -> Iterator[Mark]:
     """Yield the parts of old marks outside of new ones."""
-    for microphone in {mark.microphone for mark in old}:
+    for microphone in sorted({mark.microphone for mark in old}):
         own = [mark for mark in new if mark.microphone == microphone]
         starts, ends = [mark.start for mark in own], [mark.end for mark in own]
         for mark in old:
