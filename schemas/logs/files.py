@@ -277,8 +277,11 @@ def look_into(folder: str) -> Inside:
         is_all = not any(entry.is_symlink() for entry in named)
     except OSError:  # ignored, as by Path.rglob
         is_all = False
-    exists = os.path.exists
-    logs = [entry for entry in named if entry.is_file() or not exists(entry)]
+    logs = [
+        entry
+        for entry in named
+        if entry.is_file() or not os.path.exists(entry)  # noqa: PTH110  avoids a Path per file
+    ]
     return Inside(folders, logs, compressed, is_all)
 
 
