@@ -102,7 +102,7 @@ from hearthlog.schemas.messages.message_types import typestore
 typestore()
 
 def stop(*_):
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) not in (signal.default_int_handler, signal.SIG_DFL):
         os.kill(os.getpid(), signal.SIGINT)
 
 def run(command):

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from datetime import date
@@ -284,6 +285,15 @@ def test_recording_imports_nothing_of_the_analyzer_but_its_tables(day, model_fil
     tables = {"hearthlog.analyzer.export.formats", "hearthlog.analyzer.marks.formats"}
     assert analyzer <= {table.rsplit(".", n)[0] for table in tables for n in range(4)}
     assert not {name.partition(".")[0] for name in loaded} & HEAVY
+
+
+@pytest.mark.parametrize("module", ["typer", "getpass"])  # of the entry point, of the subcommand
+def test_ctrl_c_during_the_imports_leaves_no_traceback(hearthlog, tmp_path, module):
+    text = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
+    (tmp_path / f"{module}.py").write_text(text)
+    paths = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
+    result = hearthlog("info", tmp_path, env={"PYTHONPATH": paths})
+    assert (result.returncode, result.stderr) == (-signal.SIGINT, "")
 
 
 def test_the_demo_goes_from_sound_to_a_timeline(hearthlog, tmp_path):

@@ -19,13 +19,29 @@ from hearthlog.schemas.blas import kernel_environment
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.update(kernel_environment())
 
-import typer
-from typer.core import TyperArgument, TyperOption
 
-from hearthlog import __version__
-from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
-from hearthlog.schemas.files import denied_text, is_denied
-from hearthlog.tools.cli.terminal import OutputClosedError, checked_output, print_notice
+@contextmanager
+def _ended_by_interrupt() -> Iterator[None]:
+    """Let Ctrl-C end the process without a traceback while a block imports modules."""
+    ours = threading.current_thread() is threading.main_thread()
+    if not ours or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+with _ended_by_interrupt():
+    import typer
+    from typer.core import TyperArgument, TyperOption
+
+    from hearthlog import __version__
+    from hearthlog.schemas.errors import HearthlogError, HearthlogWarning
+    from hearthlog.schemas.files import denied_text, is_denied
+    from hearthlog.tools.cli.terminal import OutputClosedError, checked_output, print_notice
 
 # In help order; each is a function, or an app of its own, in the module of its name.
 PANELS = {
@@ -140,7 +156,8 @@ def main() -> None:
     if "install_service" not in verbs:  # units are world-readable
         os.umask(0o077)  # data of a home is private
     with _ended_by_signals(), checked_output(), _warnings_shown() as warned:
-        app = make_app(verbs)
+        with _ended_by_interrupt():
+            app = make_app(verbs)
         status = _status_of(lambda: app(prog_name="hearthlog", standalone_mode=False))
         status = _status_of(sys.stdout.flush) or status
     sys.exit(status or (3 if warned else 0))
