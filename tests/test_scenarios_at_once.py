@@ -24,8 +24,7 @@ from spliced import run
 from test_model_changes import MICROPHONE, block, wait_for
 
 from hearthlog.analyzer.activity.live import FIELDS, LiveActivity, is_of_alerts
-from hearthlog.analyzer.activity.segments import read_activity
-from hearthlog.analyzer.activity.sources import is_of_activity
+from hearthlog.analyzer.activity.segments import is_of_activity, read_activity
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.mqtt.home_assistant import discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.activity.events import LONGEST_PAUSE
-from hearthlog.analyzer.activity.segments import SEGMENT_FIELDS, HomeActivity, SegmentCollector
-from hearthlog.analyzer.activity.sources import (
+from hearthlog.analyzer.activity.segments import (
+    SEGMENT_FIELDS,
+    HomeActivity,
+    SegmentCollector,
     is_of_activity,
     is_of_scenario,
     source_microphone,

@@ -14,8 +14,12 @@ import numpy as np
 
 from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE, SET_APART, television_minutes
 from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, SoundEvent
-from hearthlog.analyzer.activity.segments import GrowingSpans
-from hearthlog.analyzer.activity.sources import is_of_activity, is_of_scenario, source_of_topic
+from hearthlog.analyzer.activity.segments import (
+    GrowingSpans,
+    is_of_activity,
+    is_of_scenario,
+    source_of_topic,
+)
 from hearthlog.analyzer.bridge.corrections import EventCorrections
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import Report

@@ -15,7 +15,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from hearthlog.analyzer.activity.sources import is_of_scenario, source_parts
+from hearthlog.analyzer.activity.segments import is_of_scenario, source_parts
 from hearthlog.analyzer.bridge.output import News, Total, Totals
 from hearthlog.analyzer.bridge.secret_files import figures_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress

@@ -154,8 +154,7 @@ def replay(
 
     Exit status 3: a log is damaged or unfinished; its readable part was used.
     """
-    from hearthlog.analyzer.activity.segments import read_activity
-    from hearthlog.analyzer.activity.sources import source_microphone
+    from hearthlog.analyzer.activity.segments import read_activity, source_microphone
     from hearthlog.analyzer.bridge.alerts.evaluation import notifications
     from hearthlog.analyzer.bridge.alerts.rule_checks import (
         hidden_class,

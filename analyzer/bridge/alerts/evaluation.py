@@ -16,8 +16,7 @@ from hearthlog.analyzer.activity.day_profile import (
 )
 from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.events import ANY_SOUND
-from hearthlog.analyzer.activity.segments import HomeActivity
-from hearthlog.analyzer.activity.sources import is_of_scenario
+from hearthlog.analyzer.activity.segments import HomeActivity, is_of_scenario
 from hearthlog.analyzer.activity.values import (
     BASELINE_DAYS,
     Clock,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hearthlog.analyzer.activity.day_anomaly import FEWEST as FEWEST_ROUTINE
 from hearthlog.analyzer.activity.events import ANY_SOUND
-from hearthlog.analyzer.activity.sources import source_microphone, source_name
+from hearthlog.analyzer.activity.segments import source_microphone, source_name
 from hearthlog.analyzer.activity.values import FEWEST as FEWEST_USUAL
 from hearthlog.analyzer.bridge.alerts.rules import (
     MINUTE,

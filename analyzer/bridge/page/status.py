@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity.events import ANY_SOUND, HOLD_SECONDS
-from hearthlog.analyzer.activity.sources import source_microphone, source_parts
+from hearthlog.analyzer.activity.segments import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.wording import ENGLISH, Words, one_line, reason, room
