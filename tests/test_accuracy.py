@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from scipy.special import betaincinv
 from spliced import run
 
-from hearthlog.analyzer.activity.checked_minutes import ClassCheck, read_checked_minutes
+from hearthlog.analyzer.activity.checked_minutes import (
+    UNMEASURED,
+    ClassCheck,
+    measured_sureness,
+    read_checked_minutes,
+    read_sureness,
+)
 from hearthlog.analyzer.activity.daily_metrics import day_of, metrics_of_home
 from hearthlog.analyzer.activity.event_counts import (
     FEWEST,
@@ -26,7 +32,6 @@ from hearthlog.analyzer.activity.event_counts import (
     television_minutes,
 )
 from hearthlog.analyzer.activity.home_data import read_home
-from hearthlog.analyzer.activity.sureness import UNMEASURED, measured_sureness, read_sureness
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span

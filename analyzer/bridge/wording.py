@@ -7,7 +7,7 @@ from datetime import date, timedelta, tzinfo
 from functools import cache
 from importlib.resources import files
 
-from hearthlog.analyzer.activity.sureness import UNMEASURED, Sureness
+from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.models.classes import class_name, in_words
 from hearthlog.schemas.errors import listed, printable, shortened
