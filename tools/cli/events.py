@@ -31,8 +31,7 @@ from hearthlog.tools.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.activity.daily_metrics import HomeMetrics
-    from hearthlog.analyzer.activity.home_events import HomeEvent
+    from hearthlog.analyzer.activity.daily_metrics import HomeEvent, HomeMetrics
     from hearthlog.analyzer.logs.home_logs import HomeLogs
     from hearthlog.analyzer.logs.spans import Spans
 
@@ -80,9 +79,13 @@ def events(
         wrong_use("--start and --end exclude --day and --night")
     if play and as_json:
         wrong_use("--play and --json exclude each other")
-    from hearthlog.analyzer.activity.daily_metrics import metrics_of_home
+    from hearthlog.analyzer.activity.daily_metrics import (
+        event_totals,
+        home_events,
+        marked_classes,
+        metrics_of_home,
+    )
     from hearthlog.analyzer.activity.home_data import read_home
-    from hearthlog.analyzer.activity.home_events import event_totals, home_events, marked_classes
     from hearthlog.analyzer.logs.local_time import iso_time, midnight
 
     home_logs, zone = home_and_zone(logs, timezone)

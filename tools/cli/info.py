@@ -28,7 +28,7 @@ from hearthlog.tools.cli.terminal import (
 if TYPE_CHECKING:
     from collections import Counter
 
-    from hearthlog.analyzer.activity.home_events import EventTotal
+    from hearthlog.analyzer.activity.daily_metrics import EventTotal
     from hearthlog.analyzer.logs.catalog import Catalog, HomeTotals, LabelAmount
     from hearthlog.analyzer.logs.home_logs import HomeLogs
     from hearthlog.analyzer.logs.summary import LogSummary
@@ -144,7 +144,7 @@ def _last_day(
     summary: "LogSummary", logs: "HomeLogs", zone: tzinfo
 ) -> "tuple[date, dict[str, EventTotal]] | None":
     """Return the last complete day and its events; None without any."""
-    from hearthlog.analyzer.activity.home_events import read_day_totals
+    from hearthlog.analyzer.activity.daily_metrics import read_day_totals
     from hearthlog.analyzer.errors import DataError
 
     if not summary.segments:

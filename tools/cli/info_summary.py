@@ -15,8 +15,8 @@ from hearthlog.analyzer.activity.checked_minutes import (
     quiet_weight,
     read_reviewed_labels,
 )
+from hearthlog.analyzer.activity.daily_metrics import EventTotal
 from hearthlog.analyzer.activity.event_counts import FEWEST, SET_APART
-from hearthlog.analyzer.activity.home_events import EventTotal
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.confused_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs

@@ -20,9 +20,8 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness, read_sureness
-from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics
+from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics, event_totals
 from hearthlog.analyzer.activity.event_counts import MINUTE
-from hearthlog.analyzer.activity.home_events import event_totals
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import ShownBouts, bouts, events_between
