@@ -12,7 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from hearthlog import __version__
-from hearthlog.analyzer.extras import missing
+from hearthlog.analyzer.errors import missing
 from hearthlog.recorder.config import Settings
 from hearthlog.tools.cli.main import PANELS, make_app
 

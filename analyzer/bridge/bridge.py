@@ -31,7 +31,7 @@ from hearthlog.analyzer.bridge.settings import (
     RecorderAddress,
 )
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report
-from hearthlog.analyzer.extras import missing, remedy
+from hearthlog.analyzer.errors import missing, remedy
 from hearthlog.analyzer.http import has_password, ip_of, listen, ping, read_ping_address
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.recorder.host import give_back, keep_one_heap, notify

@@ -10,7 +10,7 @@ from time import time_ns
 from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
-from hearthlog.analyzer.extras import remedy
+from hearthlog.analyzer.errors import remedy
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import is_local, store_errors
 from hearthlog.schemas.frames import NANOSECONDS

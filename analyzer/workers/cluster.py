@@ -15,8 +15,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from hearthlog.analyzer.errors import LostClusterError, WorkerError
-from hearthlog.analyzer.extras import remedy
+from hearthlog.analyzer.errors import LostClusterError, WorkerError, remedy
 from hearthlog.schemas.errors import HearthlogWarning
 
 if TYPE_CHECKING:

@@ -69,7 +69,7 @@ def bridge(
         load_bridge_settings,
     )
     from hearthlog.analyzer.bridge.state import BridgeState, state_folder
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
     from hearthlog.models.classes import class_name
     from hearthlog.recorder.config import exposed_passwords
     from hearthlog.recorder.pause_schedule import time_zone

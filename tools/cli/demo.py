@@ -30,7 +30,7 @@ def demo(
     look: Annotated[bool, typer.Option("--open", help="Show the day in Rerun at the end.")] = False,
 ) -> None:
     """Compose a day of a home, record it with the starter model, and draw the result."""
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
 
     require("scipy", "rerun", "rerun_cli")
     from hearthlog.analyzer.review.timeline_reader import read_timeline

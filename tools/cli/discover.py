@@ -88,7 +88,7 @@ def discover(
     from hearthlog.analyzer.discover.clusters import locked_file
     from hearthlog.analyzer.discover.groups import GROUPS
     from hearthlog.analyzer.discover.sounds import CHOICES, Looked
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
     from hearthlog.models.classes import SILENCE
 
     if of not in CHOICES:

@@ -79,7 +79,7 @@ def scenes(
     Exit status 3: a class has no clip, the model was trained on some of the clips, or some
     cannot be read.
     """
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation.scenes import (
@@ -222,7 +222,7 @@ def evaluate_log(
 
     Exit status 3: a log is unfinished, or the reference has labels that the model lacks.
     """
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
 
     require("scipy", "matplotlib")
     from hearthlog.analyzer.evaluation.log_scores import (
@@ -281,7 +281,7 @@ def evaluate_model(
 
     Exit status 3: the model was trained on some of the clips, or some cannot be read.
     """
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation import model_scores as evaluation
@@ -335,7 +335,7 @@ def evaluate_method(
     as_json: Json = False,
 ) -> None:
     """Cross-validate a training method: train on a part of the clips, and test on the rest."""
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
     from hearthlog.analyzer.evaluation.method_scores import evaluate_method as cross_validate

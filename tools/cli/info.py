@@ -399,7 +399,7 @@ def catalog(
     Files that have not changed since the last catalogue are not read again. Exit status 3: a
     file is unfinished or damaged.
     """
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
     from hearthlog.analyzer.logs.catalog import (
         DAMAGED,
         UNFINISHED,

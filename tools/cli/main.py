@@ -225,7 +225,7 @@ def _usage_text(error: typer.TyperException) -> str:
 
 def _message(error: Exception) -> str:
     if isinstance(error, ModuleNotFoundError) and not isinstance(error, HearthlogError):
-        from hearthlog.analyzer.extras import missing
+        from hearthlog.analyzer.errors import missing
 
         return missing(error.name or "")
     if isinstance(error, PermissionError) and is_denied(error.filename or ""):

@@ -104,7 +104,7 @@ def _download(network: "EmbeddingNetwork", path: Path) -> None:
 
 def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
     """Test a network as a recorder would use it; return the problems."""
-    from hearthlog.analyzer.extras import missing
+    from hearthlog.analyzer.errors import missing
     from hearthlog.models.embedding.networks import missing_modules
     from hearthlog.models.errors import ModelError
     from hearthlog.recorder.labelling.embedder_probe import check_pace, probe_network

@@ -208,7 +208,7 @@ def with_model(settings: "Settings") -> "Settings":
 
 def _report_network(settings: "Settings") -> None:
     """Print the benefit of a network and how to get one, unless the configuration decides."""
-    from hearthlog.analyzer.extras import remedy
+    from hearthlog.analyzer.errors import remedy
     from hearthlog.models.embedding.networks import YAMNET, find_network, missing_modules
     from hearthlog.models.modelfile.registry import DEFAULT_MODEL
     from hearthlog.models.starter import BY_FEATURES

@@ -53,7 +53,7 @@ def report(
         wrong_use("--day and --week exclude each other")
     if output is not None and output.suffix != ".html":
         wrong_use(f"--output {output}: a page is named *.html")
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
 
     require("jinja2", *[] if no_picture else ["matplotlib"])
     first = None

@@ -159,7 +159,7 @@ def review(
 
 
 def _require_viewer(queue: str | None) -> None:
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
 
     try:
         require("rerun", "rerun_cli")

@@ -187,7 +187,7 @@ class Questions:
 
     def network(self, given: str | None) -> str:
         """Return what the configuration says of the network; it is downloaded later."""
-        from hearthlog.analyzer.extras import missing
+        from hearthlog.analyzer.errors import missing
         from hearthlog.models.embedding.networks import YAMNET, find_network, missing_modules
 
         if given not in {None, NETWORK, NONE}:
@@ -259,7 +259,7 @@ class Questions:
         self, given: str | None, user: str | None, password_file: Path | None
     ) -> "Broker | None":
         """Return the MQTT broker; None without one."""
-        from hearthlog.analyzer.extras import require
+        from hearthlog.analyzer.errors import require
         from hearthlog.tools.service.configuration_file import Broker, secret_file
 
         now = self.bridge.mqtt
@@ -294,7 +294,7 @@ class Questions:
 
     def alerts(self, given: str | None) -> Path | None:
         """Return the file of addresses for alerts; None without alerts."""
-        from hearthlog.analyzer.extras import require
+        from hearthlog.analyzer.errors import require
         from hearthlog.tools.service.configuration_file import secret_file
 
         now = self.bridge.delivery.urls_file

@@ -103,7 +103,7 @@ def train(
     promote` ends with 1 if the check fails. Exit status 3: clips or manifest rows were left
     out because they cannot be read.
     """
-    from hearthlog.analyzer.extras import require
+    from hearthlog.analyzer.errors import require
     from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
     from hearthlog.schemas.messages.topics import check_scenario_name
 

@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from hearthlog.analyzer.bridge.alerts.rules import Notification
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report, StateEntry
-from hearthlog.analyzer.extras import remedy
+from hearthlog.analyzer.errors import remedy
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.schemas.files import exposed_secret, read_limited
 from hearthlog.schemas.frames import NANOSECONDS

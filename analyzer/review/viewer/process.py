@@ -14,8 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Self
 
-from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.extras import missing
+from hearthlog.analyzer.errors import DataError, missing
 from hearthlog.analyzer.http import free_port, hidden_address
 
 _WAIT_SECONDS = 60

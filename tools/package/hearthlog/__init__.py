@@ -70,7 +70,7 @@ def _imported(module: str) -> ModuleType:
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
-        from hearthlog.analyzer.extras import MissingModuleError, missing  # noqa: PLC0415
+        from hearthlog.analyzer.errors import MissingModuleError, missing  # noqa: PLC0415
 
         raise MissingModuleError(missing(error.name or module)) from error
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.errors import require
 from hearthlog.analyzer.export.exporter import (
     MOST_COLUMNS,
     Table,
@@ -21,7 +22,6 @@ from hearthlog.analyzer.export.exporter import (
     tables_of,
     with_numbers,
 )
-from hearthlog.analyzer.extras import require
 from hearthlog.analyzer.logs.labelling import Labelling, Labellings, find_labellings
 from hearthlog.analyzer.logs.layers import with_layers
 from hearthlog.analyzer.logs.selection import (
