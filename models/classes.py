@@ -1,5 +1,6 @@
 """The classes of sound: one table of their names, colours and durations."""
 
+import hashlib
 import re
 from collections.abc import Collection, Iterable
 from typing import NamedTuple
@@ -133,3 +134,25 @@ def translation(labels: Iterable[str], names: Collection[str]) -> dict[str, str]
     """Return the matching name of each label; the label itself if none or several names match."""
     meant = {label: meant_by(label, names) for label in labels}
     return {label: same[0] if len(same) == 1 else label for label, same in meant.items()}
+
+
+Colour = tuple[int, int, int]
+
+GAP: Colour = (200, 40, 40)
+_WHITE: Colour = (255, 255, 255)
+_LIGHT: Colour = (205, 205, 205)
+
+
+def colour(name: str) -> Colour:
+    """Return the RGB colour of a class, 0 to 255; custom classes get a bright hash of the name."""
+    row = find_class(name)
+    if row is not None:
+        return row.colour
+    red, green, blue, *_ = hashlib.sha256(name.encode()).digest()
+    return 70 + red % 186, 70 + green % 186, 70 + blue % 186
+
+
+def colour_on_paper(name: str) -> Colour:
+    """Return the colour of a class on a white background."""
+    shade = colour(name)
+    return _LIGHT if shade == _WHITE else shade

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from hearthlog.analyzer.colours import colour, colour_on_paper
 from hearthlog.analyzer.report.wording import several_in_words
 from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, Scenario
 from hearthlog.analyzer.training.train import (
@@ -19,6 +18,8 @@ from hearthlog.models.classes import (
     CLASS_NAME,
     CLASSES,
     class_name,
+    colour,
+    colour_on_paper,
     find_class,
     in_words,
     meant_by,

@@ -11,14 +11,13 @@ import pytest
 from conftest import HEARTHLOG
 from viewers import patiently, pixels
 
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.review.lanes import FEATURES, SHARES, features_image
 from hearthlog.analyzer.review.timeline import Key, LabelledSpans, Question, SoundClip
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.drawing import placed_lanes
 from hearthlog.analyzer.review.viewer.viewer import open_hidden
-from hearthlog.models.classes import ordered
+from hearthlog.models.classes import colour, ordered
 
 SECOND = 1_000_000_000
 MARGIN = 20 * SECOND

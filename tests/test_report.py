@@ -29,7 +29,6 @@ from hearthlog.analyzer.activity.values import (
     exactly,
     usual_range,
 )
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
@@ -39,7 +38,7 @@ from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.timeline_plot import save_timelines
-from hearthlog.models.classes import ordered
+from hearthlog.models.classes import colour, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.writer import LogWriter, TopicBatch

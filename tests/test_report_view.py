@@ -13,9 +13,9 @@ from homelife import GENERAL, HOUR, at, write_day
 from shortsounds import DAY, SOUGHT, short_sounds
 from viewers import browsing, pixels
 
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.report.report import Period, make_report
+from hearthlog.models.classes import colour
 
 __all__ = ["short_sounds"]  # fixture
 

@@ -26,7 +26,6 @@ from lossy import LossySource
 from spliced import run
 from viewers import Window, browsing, display, find_ruler, free_port, patiently, reviewing
 
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.layers import Coverage
@@ -38,6 +37,7 @@ from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, revi
 from hearthlog.analyzer.review.session import ReviewSession, sound_file
 from hearthlog.analyzer.review.timeline import SoundClip, sound_of
 from hearthlog.analyzer.review.timeline_reader import read_timeline
+from hearthlog.models.classes import colour
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.log.clips import ClipWriter, KeptSound
 from hearthlog.recorder.recording import record

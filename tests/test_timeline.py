@@ -24,7 +24,6 @@ from rerun.chunk import RrdReader
 from spliced import run, write_log
 from viewers import rerun_home, shown, viewer
 
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
@@ -59,7 +58,7 @@ from hearthlog.analyzer.review.viewer.canvas import ROWS_HEIGHT, Canvas
 from hearthlog.analyzer.review.viewer.drawing import LANE_HEIGHT, DrawnLane
 from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.training.train import train_model
-from hearthlog.models.classes import in_words, ordered
+from hearthlog.models.classes import colour, in_words, ordered
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

@@ -30,7 +30,6 @@ from viewers import (
     viewer,
 )
 
-from hearthlog.analyzer.colours import GAP, colour
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.lanes import SELECTED_COLOUR, SHARES
@@ -40,7 +39,7 @@ from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.review.viewer.viewer import WindowViewer
 from hearthlog.analyzer.review.viewer.web import open_page
-from hearthlog.models.classes import ordered
+from hearthlog.models.classes import GAP, colour, ordered
 from hearthlog.schemas.logs.files import find_logs
 
 __all__ = ["display", "short_sounds", "viewer"]  # fixtures

@@ -22,7 +22,6 @@ from rerun.experimental import ViewerClient
 from viewers import Window, address_of, display
 from waiting import wait_for
 
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.never_tell import write_list
@@ -43,7 +42,7 @@ from hearthlog.analyzer.review.timeline import LogLines, Plot
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import LiveServer
-from hearthlog.models.classes import ordered
+from hearthlog.models.classes import colour, ordered
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns

@@ -9,11 +9,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.evaluation.scenes import ScenesEvaluation
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.training.scores import Bin, Scores
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import SILENCE, colour
 from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import new_file

@@ -9,11 +9,10 @@ from xml.sax.saxutils import quoteattr
 
 from mcap import records
 
-from hearthlog.analyzer.colours import Colour, colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.selection import array_names
-from hearthlog.models.classes import class_name, in_words, ordered
+from hearthlog.models.classes import Colour, class_name, colour, in_words, ordered
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile

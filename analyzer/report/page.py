@@ -11,7 +11,6 @@ import numpy as np
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE, SET_APART
 from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
-from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.spans import common
 from hearthlog.analyzer.report.headline import day_headline, week_headline
 from hearthlog.analyzer.report.report_data import (
@@ -57,6 +56,7 @@ from hearthlog.models.classes import (
     SHOWER,
     SILENCE,
     UNKNOWN,
+    colour_on_paper,
     in_words,
     ordered,
 )

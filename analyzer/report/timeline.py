@@ -8,7 +8,6 @@ import numpy as np
 from hearthlog.analyzer.activity.daily_metrics import DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Duration, UsualRange, usual_range
-from hearthlog.analyzer.colours import Colour, colour_on_paper
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
 from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
@@ -20,7 +19,7 @@ from hearthlog.analyzer.logs.spans import (
     without,
 )
 from hearthlog.analyzer.report.wording import clock_text
-from hearthlog.models.classes import SILENCE, in_words
+from hearthlog.models.classes import SILENCE, Colour, colour_on_paper, in_words
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 
 PHONE_LANES = 12

@@ -15,7 +15,6 @@ from hearthlog.analyzer.activity.checked_minutes import (
     checked_minutes,
     read_reviewed_labels,
 )
-from hearthlog.analyzer.colours import GAP, Colour, colour
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, microphone_states
 from hearthlog.analyzer.logs.selection import checked_array_names
@@ -36,9 +35,12 @@ from hearthlog.analyzer.review.timeline import (
     no_spans,
 )
 from hearthlog.models.classes import (
+    GAP,
     OF_EVERY_SCENARIO,
     SILENCE,
+    Colour,
     class_name,
+    colour,
     in_words,
     ordered,
     translation,

@@ -9,7 +9,6 @@ from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Protocol
 
-from hearthlog.analyzer.colours import colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import play_sound, wav_bytes
 from hearthlog.analyzer.logs.local_time import local_time
@@ -17,7 +16,7 @@ from hearthlog.analyzer.marks.marks import PERSON, RANDOM, Mark
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_queue import ReviewItem
 from hearthlog.analyzer.review.timeline import Key, LabelledSpans, Question, SoundClip, sound_of
-from hearthlog.models.classes import TELEVISION, UNKNOWN, in_words
+from hearthlog.models.classes import TELEVISION, UNKNOWN, colour, in_words
 from hearthlog.schemas.errors import HearthlogError, LogError
 from hearthlog.schemas.frames import NANOSECONDS
 

@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.local_time import home_zone, local_time
-from hearthlog.models.classes import in_words, ordered
+from hearthlog.models.classes import Colour, in_words, ordered
 from hearthlog.schemas.arrays import Float32, Float64, Indices, Int16, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import scenario_name

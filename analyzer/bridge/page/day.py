@@ -14,7 +14,6 @@ from hearthlog.analyzer.bridge.home_state import (
     LiveMicrophone,
 )
 from hearthlog.analyzer.bridge.wording import ENGLISH, Words, clock, room
-from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.local_time import (
     EVENING,
     MORNING,
@@ -25,7 +24,7 @@ from hearthlog.analyzer.logs.local_time import (
     local_time,
 )
 from hearthlog.analyzer.logs.spans import joined
-from hearthlog.models.classes import COUGHING, CRYING, PHONE_RING, YELLING, ordered
+from hearthlog.models.classes import COUGHING, CRYING, PHONE_RING, YELLING, colour_on_paper, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 
 BIN = 120 * NANOSECONDS  # as in the picture of the report

@@ -18,9 +18,8 @@ from hearthlog.analyzer.bridge.page.day import IMPORTANT
 from hearthlog.analyzer.bridge.page.doubts import Doubts
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import Words, clock, room
-from hearthlog.analyzer.colours import colour_on_paper
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
+from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, colour_on_paper
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, find_logs, log_name

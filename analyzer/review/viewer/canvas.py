@@ -9,10 +9,9 @@ import rerun as rr
 import soundfile
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.logs.spans import Spans
 from hearthlog.analyzer.review.timeline import HomeClock, LogLines, Plot, SoundClip, Style
-from hearthlog.models.classes import in_words
+from hearthlog.models.classes import Colour, in_words
 from hearthlog.schemas.arrays import Float64, Int64
 
 _STROKE_WIDTH = 2.0  # pixels

@@ -8,7 +8,6 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hearthlog.analyzer.colours import Colour, colour
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING
 from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.analyzer.review.lanes import (
@@ -35,7 +34,7 @@ from hearthlog.analyzer.review.timeline import (
     spectrogram,
 )
 from hearthlog.analyzer.review.viewer.canvas import ROWS_HEIGHT, Canvas
-from hearthlog.models.classes import in_words, ordered
+from hearthlog.models.classes import Colour, colour, in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 

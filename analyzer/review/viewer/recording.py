@@ -13,7 +13,6 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from hearthlog.analyzer.colours import Colour
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.review.current_sounds import (
@@ -55,7 +54,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
     tabs,
     write_checked,
 )
-from hearthlog.models.classes import ordered
+from hearthlog.models.classes import Colour, ordered
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS, time_text
 from hearthlog.schemas.new_files import check_new, new_file
