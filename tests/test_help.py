@@ -156,7 +156,7 @@ def test_completing_a_word_imports_nothing_that_takes_long():
     assert not loaded & _HEAVY
     packages = tuple(f"hearthlog.{name}" for name in ("analyzer", "recorder", "models"))
     # Names and suffixes, for help texts.
-    tables = ("hearthlog.analyzer.marks.formats", "hearthlog.analyzer.export.formats")
+    tables = ("hearthlog.analyzer.marks.formats", "hearthlog.analyzer.export")
     for name in filter(lambda name: name.startswith(packages), loaded):
         assert any(table.startswith(name) for table in tables), name
 

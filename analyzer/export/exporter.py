@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, NamedTuple, Protocol, cast
 
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.export.formats import ExportFormat, file_stem, unused_name
+from hearthlog.analyzer.export import ExportFormat, file_stem, unused_name
 from hearthlog.analyzer.logs.selection import (
     Described,
     LogSelection,

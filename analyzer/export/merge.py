@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
-from hearthlog.analyzer.export.formats import unused_name
+from hearthlog.analyzer.export import unused_name
 from hearthlog.analyzer.logs.selection import Damages, Described, LogSelection, identity
 from hearthlog.schemas.arrays import Indices
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hearthlog.analyzer.export.formats import FORMATS
+from hearthlog.analyzer.export import FORMATS
 from hearthlog.schemas.errors import abridged, listed
 from hearthlog.tools.cli.options import End, Logs, NewLog, Start, Topics, check_output, parse_span
 from hearthlog.tools.cli.terminal import (
