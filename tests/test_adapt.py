@@ -12,7 +12,6 @@ from blobs import blobs, with_arrays
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.method_scores import KINDS, evaluate_method
 from hearthlog.analyzer.evaluation.model_scores import segment_probabilities
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.training.adaptation import adapt_model, is_moved, learned_over
@@ -33,7 +32,12 @@ from hearthlog.analyzer.training.manifest import (
 )
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.svm_method import BANDS, SVM
-from hearthlog.analyzer.training.train import default_transitions, train_model
+from hearthlog.analyzer.training.train import (
+    KINDS,
+    default_transitions,
+    evaluate_method,
+    train_model,
+)
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError

@@ -9,7 +9,6 @@ import pytest
 from blobs import blobs
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.method_scores import evaluate_method
 from hearthlog.analyzer.training import clips as hearing
 from hearthlog.analyzer.training import train as installed
 from hearthlog.analyzer.training.adaptation import adapt_model, base_heads, learn_home
@@ -37,7 +36,7 @@ from hearthlog.analyzer.training.heads import (
 )
 from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM
 from hearthlog.analyzer.training.manifest import BUILTIN, Scenario, read_manifest
-from hearthlog.analyzer.training.train import group_folds, train_model
+from hearthlog.analyzer.training.train import evaluate_method, group_folds, train_model
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import UNTAUGHT, EmbeddingHeads
 from hearthlog.models.classifiers.model import FORMAT, FORMAT_OF_EMBEDDINGS

@@ -1,15 +1,15 @@
-"""Training of a model with an installed method, and its scores on held-out sources."""
+"""Training of a model with an installed method, and the method's cross-validated scores."""
 
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
-from sklearn.model_selection import StratifiedGroupKFold
+from sklearn.model_selection import LeaveOneGroupOut, StratifiedGroupKFold, StratifiedKFold
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.calibration import (
@@ -18,6 +18,7 @@ from hearthlog.analyzer.training.calibration import (
     collection_folds,
     cross_validate,
     inverse_temperature,
+    nested_probabilities,
     scores_elsewhere,
     softmax,
     trained_elsewhere,
@@ -29,6 +30,7 @@ from hearthlog.analyzer.training.direction_samples import with_directions
 from hearthlog.analyzer.training.heads import (
     Mixture,
     Tried,
+    best_mix,
     can_learn_heads,
     head_inputs_of,
     learn_mixture,
@@ -37,7 +39,7 @@ from hearthlog.analyzer.training.heads import (
 from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM, ROOM21
 from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.analyzer.training.method import Learned, Method, prepare
-from hearthlog.analyzer.training.scores import calibration_error
+from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
 from hearthlog.analyzer.training.svm_method import BANDS, PAPER, SVM, network_method
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, find_class
 from hearthlog.models.classifiers.model import (
@@ -357,3 +359,80 @@ def _scenario_fields(scenario: Scenario, data: Dataset) -> dict[str, Any]:
             ],
         ),
     }
+
+
+Kind = Literal["segment", "source", "collection"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Cross-validated scores."""
+
+    folds: int
+    scores: Scores
+    expected_calibration_error: float
+    reliability: list[Bin]
+
+
+def evaluate_method(
+    data: Dataset, method: Method, kind: Kind, progress: Progress
+) -> CrossValidation:
+    """Cross-validate a training method.
+
+    The `kind` is the unit that is never on both sides of a fold: a `segment` (the paper's folds,
+    optimistic since segments of one recording are alike), a `source`, or a `collection`, which is
+    like a new home. `progress` receives the completed share of the folds, 0 to 1. Raise `DataError`
+    if all segments are equal, if the method needs augmented copies and its feature set has none,
+    and as for `divide`.
+    """
+    check_varied(data)
+    folds = divide(data, kind)
+    examples = prepare(method, data)
+    [decisions] = cross_validate([method], examples, len(data.classes), folds, progress)
+    probabilities = nested_probabilities(decisions, data.target, folds)
+    if method.network and can_learn_heads(data):
+        probabilities = _mixed(data, method, folds, decisions)
+    return CrossValidation(
+        len(folds),
+        score(data.target, probabilities.argmax(axis=1), data.group, data.classes),
+        calibration_error(probabilities, data.target),
+        reliability(probabilities, data.target),
+    )
+
+
+def _mixed(data: Dataset, method: Method, folds: Sequence[Fold], decisions: Float64) -> Float64:
+    """Return the probabilities of the mix of a classifier and heads."""
+    inverse = inverse_temperature(decisions, data.target)
+    used = np.array([name != UNKNOWN for name in data.classes])[data.target]
+    way = Tried(folds, inverse * decisions, used)
+    return softmax(best_mix(data, head_inputs_of(method.network), [way]).left_out[0])
+
+
+def divide(data: Dataset, kind: Kind) -> list[Fold]:
+    """Divide segments into folds of training and test segments.
+
+    The `kind` is the unit that is never on both sides of a fold: a `segment`, a `source` or a
+    `collection`. Raise `DataError` if a class has fewer than five segments (`segment`) or comes
+    from fewer than two groups (`source`), if there is one collection (`collection`), or if a fold
+    leaves too few classes to learn from.
+    """
+    if kind == "source":
+        return group_folds(data)
+    if kind == "segment":
+        fewest, name = min((amount.segments, name) for name, amount in data.amounts.items())
+        if fewest < MOST_FOLDS:
+            raise DataError(f"class {name} has {fewest} segments; {MOST_FOLDS} folds need one each")
+        divider = StratifiedKFold(MOST_FOLDS, shuffle=True, random_state=0)
+        return list(divider.split(data.target, data.target))
+    if len(data.collection_names) < 2:
+        raise DataError(
+            "all recordings are of one collection (column source of the manifest): there is none "
+            "to learn from when it is left out"
+        )
+    folds = list(LeaveOneGroupOut().split(data.target, data.target, data.collection))
+    for seen, unseen in folds:
+        if data.target[seen].min() == data.target[seen].max():
+            name = data.collection_names[data.collection[unseen[0]]]
+            raise DataError(f"without collection {name} there is one class left to learn from")
+    return folds

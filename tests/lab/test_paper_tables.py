@@ -8,10 +8,10 @@ import pytest
 from spliced import run_function
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.method_scores import evaluate_method
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, read_manifest
 from hearthlog.analyzer.training.svm_method import PAPER
+from hearthlog.analyzer.training.train import evaluate_method
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import paper

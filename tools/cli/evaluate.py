@@ -44,12 +44,12 @@ from hearthlog.tools.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.evaluation.method_scores import CrossValidation
     from hearthlog.analyzer.evaluation.model_scores import ModelEvaluation
     from hearthlog.analyzer.training.dataset import Dataset
     from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, SkippedClip
     from hearthlog.analyzer.training.method import Method
     from hearthlog.analyzer.training.scores import Bin, Scores
+    from hearthlog.analyzer.training.train import CrossValidation
     from hearthlog.models.classifiers.model import Model
 
 
@@ -338,7 +338,7 @@ def evaluate_method(
     from hearthlog.analyzer.errors import require
 
     require("sklearn", "scipy", "joblib", "matplotlib")
-    from hearthlog.analyzer.evaluation.method_scores import evaluate_method as cross_validate
+    from hearthlog.analyzer.training.train import evaluate_method as cross_validate
 
     check_output("--plot", plot, ".png", "a picture")
     with learning(method, data, scenario, scheduler) as (chosen, segments, progress):

@@ -17,7 +17,6 @@ import numpy as np
 import soundfile
 import typer
 
-from hearthlog.analyzer.evaluation.method_scores import CrossValidation, evaluate_method
 from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import (
@@ -27,6 +26,7 @@ from hearthlog.analyzer.training.manifest import (
     read_manifest,
 )
 from hearthlog.analyzer.training.svm_method import SvmMethod
+from hearthlog.analyzer.training.train import CrossValidation, evaluate_method
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import FEATURE_SETS, feature_set

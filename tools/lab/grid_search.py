@@ -9,12 +9,11 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from hearthlog.analyzer.evaluation.method_scores import Kind, divide
 from hearthlog.analyzer.training.calibration import cross_validate
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.method import Method, prepare
 from hearthlog.analyzer.training.scores import Scores, score
-from hearthlog.analyzer.training.train import DEFAULT, check_varied
+from hearthlog.analyzer.training.train import DEFAULT, Kind, check_varied, divide
 from hearthlog.schemas.errors import Progress
 from hearthlog.tools.cli.evaluate import Folds, ScenarioOption, end_with_left_out, learning
 from hearthlog.tools.cli.options import Clips, Json, Scheduler, chosen_method

@@ -15,13 +15,6 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.method_scores import (
-    KINDS,
-    CrossValidation,
-    Kind,
-    divide,
-    evaluate_method,
-)
 from hearthlog.analyzer.training.dataset import Dataset, Recording, build_dataset, clip_recordings
 from hearthlog.analyzer.training.manifest import (
     BUILTIN,
@@ -33,7 +26,15 @@ from hearthlog.analyzer.training.manifest import (
 )
 from hearthlog.analyzer.training.method import Method
 from hearthlog.analyzer.training.svm_method import PAPER
-from hearthlog.analyzer.training.train import DEFAULT, check_varied
+from hearthlog.analyzer.training.train import (
+    DEFAULT,
+    KINDS,
+    CrossValidation,
+    Kind,
+    check_varied,
+    divide,
+    evaluate_method,
+)
 from hearthlog.schemas.errors import Progress, ignore_progress, shortened
 from hearthlog.tools.cli.options import Clips, Json, labelled_clips
 from hearthlog.tools.cli.tables import between, share
