@@ -22,7 +22,6 @@ from streams import camera, live_server
 
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import load_scenario, read_manifest
-from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import (
     LAG_SECONDS,
     REACH_SECONDS,
@@ -30,6 +29,7 @@ from hearthlog.analyzer.training.train import (
     default_transitions,
     train_model,
 )
+from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile.modelfile import load_model, save_model

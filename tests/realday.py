@@ -12,8 +12,8 @@ from lossy import LossySource
 
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, read_manifest
-from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile.modelfile import save_model
 from hearthlog.recorder.config import Settings

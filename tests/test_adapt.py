@@ -21,8 +21,6 @@ from hearthlog.analyzer.training.home_recordings import (
     home_recordings,
     lesson_recordings,
 )
-from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.learned_inputs import kept_inputs
 from hearthlog.analyzer.training.manifest import (
     BUILTIN,
     LABELS,
@@ -31,13 +29,13 @@ from hearthlog.analyzer.training.manifest import (
     scenario_of,
 )
 from hearthlog.analyzer.training.method import prepare
-from hearthlog.analyzer.training.svm_method import BANDS, SVM
 from hearthlog.analyzer.training.train import (
     KINDS,
     default_transitions,
     evaluate_method,
     train_model,
 )
+from hearthlog.analyzer.training.window_methods import BANDS, ROOM, SVM, kept_inputs
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError

@@ -13,9 +13,8 @@ from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
 
 from hearthlog.analyzer.training.calibration import softmax
-from hearthlog.analyzer.training.learned_inputs import rounded, rounded_to_steps
-from hearthlog.analyzer.training.svm_method import PAPER, LearnedSvm
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.window_methods import PAPER, LearnedSvm, rounded, rounded_to_steps
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.rbf_distances import (
     RoundedDistances,

@@ -34,9 +34,9 @@ from hearthlog.analyzer.training.heads import (
     names_head,
     rejecting_head,
 )
-from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM
 from hearthlog.analyzer.training.manifest import BUILTIN, Scenario, read_manifest
 from hearthlog.analyzer.training.train import evaluate_method, group_folds, train_model
+from hearthlog.analyzer.training.window_methods import EMBEDDING, ROOM
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import UNTAUGHT, EmbeddingHeads
 from hearthlog.models.classifiers.model import FORMAT, FORMAT_OF_EMBEDDINGS

@@ -33,8 +33,8 @@ from hearthlog.analyzer.training.scores import (
     reliability,
     score,
 )
-from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import default_transitions, train_model
+from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.models.classes import ordered
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.modelfile.modelfile import load_model, save_model

@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
-from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.manifest import Scenario
-from hearthlog.analyzer.training.svm_method import SVM
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.window_methods import ROOM, SVM
 from hearthlog.models.classifiers.classifier import Classifier, LabelTiming, label_timing
 from hearthlog.models.classifiers.model import read_description
 from hearthlog.models.errors import ModelError

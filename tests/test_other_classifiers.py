@@ -31,10 +31,9 @@ from threadpoolctl import threadpool_limits
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.adaptation import adapt_model, base_classes, is_moved
-from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.learned_inputs import balanced, rounded, rounded_to_steps
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.train import method_named, train_model
+from hearthlog.analyzer.training.window_methods import ROOM, balanced, rounded, rounded_to_steps
 from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.svm_rbf import weakest_pairs
 from hearthlog.models.errors import ModelError

@@ -10,8 +10,6 @@ from scipy.signal import welch
 from hearthlog.analyzer.training import clips as rooms
 from hearthlog.analyzer.training.clips import empty_room, in_room, reverberated, steady_noise
 from hearthlog.analyzer.training.dataset import build_dataset, clip_recordings, cut_recordings
-from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.learned_inputs import spread_over_classes
 from hearthlog.analyzer.training.manifest import (
     LABELS,
     LabelledClip,
@@ -21,6 +19,7 @@ from hearthlog.analyzer.training.manifest import (
 )
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.window_methods import ROOM, spread_over_classes
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT

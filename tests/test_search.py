@@ -20,8 +20,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from hearthlog.analyzer.errors import WorkerError
 from hearthlog.analyzer.training.calibration import cross_validate
 from hearthlog.analyzer.training.method import prepare
-from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import group_folds
+from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.analyzer.workers.workers import fits_on, in_parallel, single_thread
 from hearthlog.models.modelfile.modelfile import load_model
 from hearthlog.schemas.errors import ignore_progress

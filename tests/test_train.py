@@ -15,7 +15,6 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training import clips as clip_sound
 from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.dataset import SEGMENTS_PER_GROUP, build_dataset
-from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.manifest import (
     BUILTIN,
     LABELS,
@@ -24,6 +23,7 @@ from hearthlog.analyzer.training.manifest import (
     read_manifest,
 )
 from hearthlog.analyzer.training.train import calibration_error, group_folds, train_model
+from hearthlog.analyzer.training.window_methods import ROOM
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT

@@ -17,9 +17,9 @@ from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.lanes import FEATURES, timeline_plots
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.training.home_recordings import home_recordings
-from hearthlog.analyzer.training.landmark_method import EMBEDDING
 from hearthlog.analyzer.training.train import DEFAULT as DEFAULT_METHOD
 from hearthlog.analyzer.training.train import method_named
+from hearthlog.analyzer.training.window_methods import EMBEDDING
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.installed import DEFAULT, FEATURE_SETS
 from hearthlog.recorder.config import Settings

@@ -17,12 +17,17 @@ from hearthlog.analyzer.training.dataset import (
 )
 from hearthlog.analyzer.training.direction_samples import with_directions
 from hearthlog.analyzer.training.heads import in_units, regressed
-from hearthlog.analyzer.training.landmark_method import ROOM, LandmarkMap, centres
-from hearthlog.analyzer.training.learned_inputs import balanced, kept_inputs
 from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.train import default_transitions, merged_spans
-from hearthlog.analyzer.training.window_method import LearnedMachine
+from hearthlog.analyzer.training.window_methods import (
+    ROOM,
+    LandmarkMap,
+    LearnedMachine,
+    balanced,
+    centres,
+    kept_inputs,
+)
 from hearthlog.analyzer.workers.workers import single_thread
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import classifier_kind

@@ -116,7 +116,7 @@ def others_of(model: Model, method: Method, scenario: Scenario) -> tuple[Float32
     Raise `DataError` if the model has not stored training inputs of the kind that the method uses.
     """
     description = model.description
-    from hearthlog.analyzer.training.learned_inputs import (  # noqa: PLC0415  needs scikit-learn
+    from hearthlog.analyzer.training.window_methods import (  # noqa: PLC0415  needs scikit-learn
         kept_inputs,
     )
 

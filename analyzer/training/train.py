@@ -36,11 +36,18 @@ from hearthlog.analyzer.training.heads import (
     learn_mixture,
     scaler_of,
 )
-from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM, ROOM21
 from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.analyzer.training.method import Learned, Method, prepare
 from hearthlog.analyzer.training.scores import Bin, Scores, calibration_error, reliability, score
-from hearthlog.analyzer.training.svm_method import BANDS, PAPER, SVM, network_method
+from hearthlog.analyzer.training.window_methods import (
+    BANDS,
+    EMBEDDING,
+    PAPER,
+    ROOM,
+    ROOM21,
+    SVM,
+    network_method,
+)
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, find_class
 from hearthlog.models.classifiers.model import (
     FORMAT,

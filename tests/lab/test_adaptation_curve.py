@@ -7,8 +7,7 @@ import pytest
 from blobs import blobs
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.svm_method import BANDS
+from hearthlog.analyzer.training.window_methods import BANDS, ROOM
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.lab import adaptation_curve as curves
 from hearthlog.tools.lab.adaptation_curve import CORRECTED, adaptation_curve

@@ -11,9 +11,8 @@ from clusters import two_threads_in
 from spliced import run, run_function
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.training.landmark_method import ROOM
-from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import evaluate_method
+from hearthlog.analyzer.training.window_methods import PAPER, ROOM
 from hearthlog.analyzer.workers.workers import fits_on
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set

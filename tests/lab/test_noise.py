@@ -12,7 +12,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.clips import clip_frames, level_of, steady_noise
 from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, read_manifest
 from hearthlog.analyzer.training.scores import F1Difference
-from hearthlog.analyzer.training.svm_method import PAPER
+from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import noise as bench

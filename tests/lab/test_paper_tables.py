@@ -10,8 +10,8 @@ from spliced import run_function
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, read_manifest
-from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import evaluate_method
+from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import paper

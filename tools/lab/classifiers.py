@@ -36,11 +36,11 @@ from hearthlog.analyzer.training.calibration import (
     nested_probabilities,
 )
 from hearthlog.analyzer.training.dataset import Dataset, build_dataset
-from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.manifest import load_scenario, read_manifest
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.scores import Scores, calibration_error, difference, score
 from hearthlog.analyzer.training.train import MOST_FOLDS, method_named
+from hearthlog.analyzer.training.window_methods import ROOM
 from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.model import Description, Model

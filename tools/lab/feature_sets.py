@@ -25,8 +25,8 @@ from hearthlog.analyzer.training.manifest import (
     load_scenario,
     read_manifest,
 )
-from hearthlog.analyzer.training.svm_method import SvmMethod
 from hearthlog.analyzer.training.train import CrossValidation, evaluate_method
+from hearthlog.analyzer.training.window_methods import SvmMethod
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import FEATURE_SETS, feature_set

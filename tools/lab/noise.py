@@ -16,12 +16,11 @@ import typer
 
 from hearthlog.analyzer.training.clips import RoomCopy
 from hearthlog.analyzer.training.dataset import Dataset, Recording, cut_recordings
-from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.manifest import BUILTIN, Scenario
 from hearthlog.analyzer.training.method import Learned, Method, prepare
 from hearthlog.analyzer.training.scores import F1Difference, Scores, difference, score
-from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import Kind, divide
+from hearthlog.analyzer.training.window_methods import PAPER, ROOM
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker, low_power
 from hearthlog.models.features.window_inputs import of_segments

@@ -25,7 +25,6 @@ from hearthlog.analyzer.training.manifest import (
     left_out_lines,
 )
 from hearthlog.analyzer.training.method import Method
-from hearthlog.analyzer.training.svm_method import PAPER
 from hearthlog.analyzer.training.train import (
     DEFAULT,
     KINDS,
@@ -35,6 +34,7 @@ from hearthlog.analyzer.training.train import (
     divide,
     evaluate_method,
 )
+from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.schemas.errors import Progress, ignore_progress, shortened
 from hearthlog.tools.cli.options import Clips, Json, labelled_clips
 from hearthlog.tools.cli.tables import between, share

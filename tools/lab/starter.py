@@ -23,8 +23,6 @@ import soundfile
 from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.dataset import Dataset, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.heads import head_inputs_of
-from hearthlog.analyzer.training.landmark_method import EMBEDDING, ROOM, LandmarkMethod
-from hearthlog.analyzer.training.learned_inputs import kept_inputs
 from hearthlog.analyzer.training.manifest import (
     BUILTIN,
     LABELS,
@@ -34,6 +32,7 @@ from hearthlog.analyzer.training.manifest import (
 )
 from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.train import clip_embedder, train_model
+from hearthlog.analyzer.training.window_methods import EMBEDDING, ROOM, LandmarkMethod, kept_inputs
 from hearthlog.models.classes import CRYING, LAUGHING, PHONE_RING, SILENCE
 from hearthlog.models.classifiers.evidence import UNTAUGHT
 from hearthlog.models.classifiers.model import SIMULATED, Model, may_be_shipped

@@ -9,8 +9,13 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.neural_network import MLPClassifier
 from sklearn.preprocessing import StandardScaler
 
-from hearthlog.analyzer.training.learned_inputs import balanced, fitted_scaler, scaler_arrays
-from hearthlog.analyzer.training.window_method import WindowMethod, as_room
+from hearthlog.analyzer.training.window_methods import (
+    WindowMethod,
+    as_room,
+    balanced,
+    fitted_scaler,
+    scaler_arrays,
+)
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog_classifiers.layers import LAYERS, LayersMachine

@@ -12,8 +12,7 @@ from sklearn.ensemble import (
     RandomForestClassifier,
 )
 
-from hearthlog.analyzer.training.learned_inputs import balanced
-from hearthlog.analyzer.training.window_method import WindowMethod, as_room
+from hearthlog.analyzer.training.window_methods import WindowMethod, as_room, balanced
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog_classifiers.trees import TREES, TreesMachine

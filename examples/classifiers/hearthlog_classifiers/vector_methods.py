@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.svm import OneClassSVM
 
-from hearthlog.analyzer.training.learned_inputs import (
+from hearthlog.analyzer.training.window_methods import (
+    WindowMethod,
+    as_room,
     fitted_scaler,
     rounded_to_steps,
     scaler_arrays,
 )
-from hearthlog.analyzer.training.window_method import WindowMethod, as_room
 from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog_classifiers.neighbours import (

@@ -1,6 +1,6 @@
 """A way to learn from each set: a support vector machine on means and deviations of a second."""
 
-from hearthlog.analyzer.training.svm_method import SvmMethod
+from hearthlog.analyzer.training.window_methods import SvmMethod
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog_feature_sets.auditory_image import SAI

@@ -12,11 +12,10 @@ from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
 from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.dataset import Dataset
-from hearthlog.analyzer.training.landmark_method import ROOM
 from hearthlog.analyzer.training.manifest import BUILTIN
 from hearthlog.analyzer.training.method import prepare
-from hearthlog.analyzer.training.svm_method import SVM
 from hearthlog.analyzer.training.train import train_model
+from hearthlog.analyzer.training.window_methods import ROOM, SVM
 from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
