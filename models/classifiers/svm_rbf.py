@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
-from hearthlog.models.classifiers.learned_windows import target_problem
+from hearthlog.models.classifiers.classifier_kind import ClassifierKind, target_problem
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import (
     SCALER,

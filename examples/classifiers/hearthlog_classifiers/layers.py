@@ -7,8 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind, NoParameters
-from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
+from hearthlog.models.classifiers.classifier_kind import (
+    LEARNED,
+    ClassifierKind,
+    NoParameters,
+    learned_shapes,
+    target_problem,
+)
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.schemas.arrays import Float32, Float64
@@ -29,7 +34,7 @@ class LayersKind(ClassifierKind):
         Of hidden units; of scaled inputs, with shape (width, C), where there are none.
     output_bias : [shape=(C,)], float64
     learned_inputs, learned_target : optional
-        As of `hearthlog.models.classifiers.learned_windows`.
+        As of `hearthlog.models.classifiers.classifier_kind`.
     """
 
     name = "layers"

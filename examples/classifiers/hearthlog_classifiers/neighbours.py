@@ -6,8 +6,12 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
-from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
+from hearthlog.models.classifiers.classifier_kind import (
+    LEARNED,
+    ClassifierKind,
+    learned_shapes,
+    target_problem,
+)
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import (
     SCALER,
@@ -50,7 +54,7 @@ class NeighboursKind(ClassifierKind):
     vectors_target : [shape=(n,)], int64
         Their classes.
     learned_inputs, learned_target : optional
-        As of `hearthlog.models.classifiers.learned_windows`, of a model that was adapted: those
+        As of `hearthlog.models.classifiers.classifier_kind`, of a model that was adapted: those
         before it was.
     """
 

@@ -7,8 +7,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
-from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
+from hearthlog.models.classifiers.classifier_kind import (
+    LEARNED,
+    ClassifierKind,
+    learned_shapes,
+    target_problem,
+)
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_distances import (
     SCALER,
@@ -53,7 +57,7 @@ class OneClassKind(ClassifierKind):
     offsets : [shape=(C,)], float64
         What the weighted kernels must be above where a window is of the class.
     learned_inputs, learned_target : optional
-        As of `hearthlog.models.classifiers.learned_windows`.
+        As of `hearthlog.models.classifiers.classifier_kind`.
     """
 
     name = "one-class"

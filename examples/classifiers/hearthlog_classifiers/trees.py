@@ -5,8 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind, NoParameters
-from hearthlog.models.classifiers.learned_windows import LEARNED, learned_shapes, target_problem
+from hearthlog.models.classifiers.classifier_kind import (
+    LEARNED,
+    ClassifierKind,
+    NoParameters,
+    learned_shapes,
+    target_problem,
+)
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
 from hearthlog_classifiers.shares import log_shares
@@ -35,7 +40,7 @@ class TreesKind(ClassifierKind):
     importances : [shape=(width,)], float64
         How much each input decides, as scikit-learn's `feature_importances_`.
     learned_inputs, learned_target : optional
-        As of `hearthlog.models.classifiers.learned_windows`.
+        As of `hearthlog.models.classifiers.classifier_kind`.
     """
 
     name = "trees"

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
-from hearthlog.models.classifiers.learned_windows import (
+from hearthlog.models.classifiers.classifier_kind import (
     LEARNED,
+    ClassifierKind,
     learned_shapes,
     target_problem,
 )
