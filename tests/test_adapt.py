@@ -40,9 +40,9 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21 import FeatureExtractor, augmented, bands_of
+from hearthlog.models.features.feature_set import of_segments
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings

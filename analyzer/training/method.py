@@ -12,9 +12,8 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.clips import empty_room
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.feature_set import FeatureSet, Inputs, of_segments, window_places
 from hearthlog.models.features.installed import feature_set
-from hearthlog.models.features.window_inputs import Inputs, of_segments, window_places
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 
 _SEED = 20_261_121

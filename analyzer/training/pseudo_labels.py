@@ -23,9 +23,9 @@ from hearthlog.analyzer.training.method import loud_windows
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.features.feature_set import of_segments, window_places
 from hearthlog.models.features.floor import is_quiet
 from hearthlog.models.features.installed import feature_set
-from hearthlog.models.features.window_inputs import of_segments, window_places
 from hearthlog.schemas.arrays import Bool, Float64, Indices
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS

@@ -14,8 +14,7 @@ from hearthlog.models.features.auros21 import (
     FLUX,
     FeatureExtractor,
 )
-from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.features.window_inputs import WindowStatistics
+from hearthlog.models.features.feature_set import FeatureSet, WindowStatistics
 from hearthlog.schemas.arrays import Float32, Float64
 
 SHAPE_NAMES = tuple(

@@ -8,9 +8,8 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import Auxiliary, Directions
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.embedding.projection import WINDOW_FRAMES, Embeddings
-from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
+from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet, mean_and_std
 from hearthlog.models.features.floor import Floors, is_quiet
-from hearthlog.models.features.window_inputs import mean_and_std
 from hearthlog.models.labels.labeller import FrameLabels, segment_columns
 from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Segment

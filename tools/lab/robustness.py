@@ -44,9 +44,8 @@ from hearthlog.analyzer.workers.workers import in_parallel
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features.feature_set import FeatureSet, of_segments
 from hearthlog.models.features.floor import low_power
-from hearthlog.models.features.window_inputs import of_segments
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.tools.cli.evaluate import ModelFile, learned_lines, read_model_and_clips
