@@ -16,7 +16,7 @@ from conftest import HEARTHLOG
 from homelife import at, write_day
 from mcap.writer import Writer as McapWriter
 
-from hearthlog.analyzer.logs.never_tell import write_list
+from hearthlog.analyzer.logs.shown_classes import write_list
 from hearthlog.models.classes import SILENCE, in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs

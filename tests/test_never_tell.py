@@ -20,7 +20,7 @@ from hearthlog.analyzer.bridge.output import Totals
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.logs.never_tell import NEVER_TELL_FILE, read_list, write_list
+from hearthlog.analyzer.logs.shown_classes import NEVER_TELL_FILE, read_list, write_list
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

@@ -14,7 +14,7 @@ from conftest import HEARTHLOG
 from livehome import LiveHome
 from waiting import wait_for
 
-from hearthlog.analyzer.logs.never_tell import write_list
+from hearthlog.analyzer.logs.shown_classes import write_list
 from hearthlog.analyzer.review.current_sounds import CurrentSound, lasting
 
 FRAME = 50_000_000

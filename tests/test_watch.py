@@ -24,7 +24,7 @@ from waiting import wait_for
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
-from hearthlog.analyzer.logs.never_tell import write_list
+from hearthlog.analyzer.logs.shown_classes import write_list
 from hearthlog.analyzer.review.current_sounds import AWAY_SECONDS, CurrentSound, CurrentSounds
 from hearthlog.analyzer.review.lanes import (
     FEATURES,

@@ -23,11 +23,10 @@ from hearthlog.analyzer.activity.segments import (
 from hearthlog.analyzer.bridge.corrections import EventCorrections
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import Report
-from hearthlog.analyzer.logs.confused_classes import WATER, common_names_of
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
-from hearthlog.analyzer.logs.never_tell import read_list
 from hearthlog.analyzer.logs.recorder_info import status_value
+from hearthlog.analyzer.logs.shown_classes import WATER, common_names_of, read_list
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN, class_name, ordered
 from hearthlog.schemas.errors import LogError

@@ -11,7 +11,6 @@ from typing import NamedTuple
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import find_with_layers, latest_records, readable_span
 from hearthlog.analyzer.logs.local_time import day_span, local_time
-from hearthlog.analyzer.logs.never_tell import list_of_log, recorded_list
 from hearthlog.analyzer.logs.recorder_info import (
     NO_MODEL,
     LabelledBy,
@@ -19,6 +18,7 @@ from hearthlog.analyzer.logs.recorder_info import (
     microphones_of,
     models_of,
 )
+from hearthlog.analyzer.logs.shown_classes import list_of_log, recorded_list
 from hearthlog.analyzer.logs.spans import NEVER
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS

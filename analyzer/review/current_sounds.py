@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.logs.never_tell import read_list, recorded_list
 from hearthlog.analyzer.logs.selection import checked_array_names, decode_types
+from hearthlog.analyzer.logs.shown_classes import read_list, recorded_list
 from hearthlog.analyzer.review.lanes import decibel
 from hearthlog.models.classes import class_name, in_words
 from hearthlog.schemas.arrays import Float32, Int64

@@ -37,7 +37,7 @@ from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.analyzer.bridge.wording import Words, clock, preferred_language, room, words_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time
-from hearthlog.analyzer.logs.never_tell import read_list, write_list
+from hearthlog.analyzer.logs.shown_classes import read_list, write_list
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError
