@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from mcap.opcode import Opcode
 
-from hearthlog.analyzer.doctor.chunk import ROS_ENCODINGS, MessageBatch
 from hearthlog.analyzer.doctor.column_checks import ALWAYS, LOG_NAME, split_topic
 from hearthlog.analyzer.doctor.findings import DISTRUST, RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
@@ -23,7 +22,7 @@ from hearthlog.analyzer.doctor.message_checks import (
     MessageChecks,
     MetadataChecks,
 )
-from hearthlog.analyzer.doctor.record_walk import RecordWalk
+from hearthlog.analyzer.doctor.records import ROS_ENCODINGS, MessageBatch, RecordWalk
 from hearthlog.analyzer.doctor.sections import DataSection, SummarySection
 from hearthlog.schemas.errors import HearthlogWarning, LogError, Progress, ignore_progress
 from hearthlog.schemas.files import LocalFile

@@ -13,7 +13,6 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.doctor.chunk import MessageBatch
 from hearthlog.analyzer.doctor.column_checks import (
     BESIDE_LABEL,
     DIRECTION,
@@ -33,6 +32,7 @@ from hearthlog.analyzer.doctor.column_checks import (
 )
 from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
+from hearthlog.analyzer.doctor.records import MessageBatch
 from hearthlog.analyzer.doctor.sections import DataSection
 from hearthlog.models.classifiers.classifier import LabelTiming, label_timing
 from hearthlog.models.classifiers.model import read_description

@@ -23,17 +23,19 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from hearthlog.analyzer.doctor.chunk import (
+from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor.records import (
     BATCH_SIZE,
     CheckedDefinitions,
     Chunk,
     MessageBatch,
+    Record,
     RecordBudget,
     batches,
     check_channels,
+    name_of,
+    parse_strictly,
 )
-from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
-from hearthlog.analyzer.doctor.record_walk import Record, name_of, parse_strictly
 from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.raw_messages import gather_heads, iterate_records
 from hearthlog.schemas.mcap.records import (
