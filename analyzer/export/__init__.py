@@ -27,7 +27,7 @@ FORMATS = {
     each.name: each
     for each in (
         ExportFormat("parquet", "arrow", "PARQUET"),
-        ExportFormat("csv", "csvfile", "CSV"),
+        ExportFormat("csv", "arrow", "CSV"),
         ExportFormat("npz", "npz", "NPZ"),
         ExportFormat("wav", "audio", "WAV"),
         ExportFormat("txt", "audio", "LABEL_TRACK", "Audacity labels"),

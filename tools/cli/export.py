@@ -149,7 +149,7 @@ def cat(
 
 
 def _print_table(selection: "LogSelection") -> None:
-    from hearthlog.analyzer.export.csvfile import CsvFile
+    from hearthlog.analyzer.export.arrow import CsvFile
     from hearthlog.analyzer.export.exporter import one_table, tables_of
     from hearthlog.analyzer.logs.selection import decode_all
 
