@@ -23,7 +23,7 @@ from waiting import wait_for
 
 from hearthlog import __version__
 from hearthlog.tools.service import addon as addon_program
-from hearthlog.tools.service.addon_options import AddonFolders, AddonOptions, MicrophoneOptions
+from hearthlog.tools.service.addon import AddonFolders, AddonOptions, MicrophoneOptions
 
 ADDON = Path(__file__).parents[1] / "tools/home-assistant"
 TOKEN = "the-token-of-the-supervisor"
@@ -160,9 +160,9 @@ class Addon:
 
     def command(self):
         code = (
-            "from hearthlog.tools.service import addon, addon_options\n"
+            "from hearthlog.tools.service import addon\n"
             "addon._BROKER_SECONDS = 0.5\n"
-            f"addon_options.INGRESS_PORT = {self.port}\n"
+            f"addon.INGRESS_PORT = {self.port}\n"
             "addon.main()\n"
         )
         return [sys.executable, "-c", code, *self.options()]
