@@ -21,10 +21,10 @@ from safetensors.numpy import load, save
 
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.relabel.player import ReplayOptions
+from hearthlog.analyzer.relabel.recorded import Features, read_recorded
 from hearthlog.analyzer.relabel.relabel import relabel
-from hearthlog.analyzer.replay.player import ReplayOptions
-from hearthlog.analyzer.replay.recorded import Features, read_recorded
-from hearthlog.analyzer.replay.replay import LogSet, replay
+from hearthlog.analyzer.relabel.replay import LogSet, replay
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.direction_samples import (
     DirectionSample,

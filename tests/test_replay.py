@@ -25,9 +25,9 @@ from rewriting import Log
 from together import record_together
 from waiting import wait_for
 
-from hearthlog.analyzer.replay.player import ReplayOptions
-from hearthlog.analyzer.replay.replay import LogSet, find_model
-from hearthlog.analyzer.replay.replay import replay as replay_logs
+from hearthlog.analyzer.relabel.player import ReplayOptions
+from hearthlog.analyzer.relabel.replay import LogSet, find_model
+from hearthlog.analyzer.relabel.replay import replay as replay_logs
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier, label_timing
 from hearthlog.models.features.auros21 import FEATURE_NAMES

@@ -11,9 +11,9 @@ from lossy import LossySource
 from rewriting import Log
 
 from hearthlog.analyzer.doctor.examination import examine
-from hearthlog.analyzer.replay.player import ReplayOptions
-from hearthlog.analyzer.replay.replay import LogSet
-from hearthlog.analyzer.replay.replay import replay as replay_logs
+from hearthlog.analyzer.relabel.player import ReplayOptions
+from hearthlog.analyzer.relabel.replay import LogSet
+from hearthlog.analyzer.relabel.replay import replay as replay_logs
 from hearthlog.analyzer.training.hidden_markov import viterbi
 from hearthlog.analyzer.training.train import (
     FRAME_SECONDS,

@@ -13,7 +13,7 @@ import numpy as np
 
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, read_recorder_infos
 from hearthlog.analyzer.logs.spans import Spans, rows_at
-from hearthlog.analyzer.replay.recorded import Features, read_recorded
+from hearthlog.analyzer.relabel.recorded import Features, read_recorded
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import Floors, FloorTracker

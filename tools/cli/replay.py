@@ -27,8 +27,8 @@ from hearthlog.tools.cli.terminal import (
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-    from hearthlog.analyzer.replay.player import Replay, ReplayOptions
-    from hearthlog.analyzer.replay.replay import LogSet
+    from hearthlog.analyzer.relabel.player import Replay, ReplayOptions
+    from hearthlog.analyzer.relabel.replay import LogSet
     from hearthlog.models.classifiers.model import Model
 
 _MAX_RATE = "max"
@@ -85,8 +85,8 @@ def replay(
     interrupted, a log is unfinished, sound before or between the logs is missing, or there
     were no labels.
     """
-    from hearthlog.analyzer.replay.player import ReplayOptions
-    from hearthlog.analyzer.replay.replay import LogSet
+    from hearthlog.analyzer.relabel.player import ReplayOptions
+    from hearthlog.analyzer.relabel.replay import LogSet
     from hearthlog.models.modelfile.modelfile import load_model
     from hearthlog.models.starter import GENERAL, starter_file
     from hearthlog.schemas.logs.files import find_logs
@@ -153,7 +153,7 @@ class _Models:
 
     def __call__(self, info: "RecorderInfo") -> "Model | None":
         """Return the model for a recorder's info."""
-        from hearthlog.analyzer.replay.replay import find_model
+        from hearthlog.analyzer.relabel.replay import find_model
 
         if self._given is not None:
             return self._given
@@ -218,7 +218,7 @@ def _check_output(output: Path | None, source: Path) -> None:
 
 
 def _run(logs: "LogSet", options: "ReplayOptions", stop: Flag) -> "Replay":
-    from hearthlog.analyzer.replay.replay import replay as replay_logs
+    from hearthlog.analyzer.relabel.replay import replay as replay_logs
 
     def run(options: "ReplayOptions") -> "Replay":
         with share_done("replaying") as progress:

@@ -8,8 +8,8 @@ import numpy as np
 from sklearn.calibration import CalibratedClassifierCV
 from sklearn.frozen import FrozenEstimator
 
+from hearthlog.analyzer.relabel.recorded import Features
 from hearthlog.analyzer.relabel.stream_labeller import StreamLabeller
-from hearthlog.analyzer.replay.recorded import Features
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.manifest import BUILTIN

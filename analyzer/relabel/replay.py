@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.clips import read_clips
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_infos
-from hearthlog.analyzer.replay.player import Player, Replay, ReplayOptions
-from hearthlog.analyzer.replay.recorded import read_recorded
+from hearthlog.analyzer.relabel.player import Player, Replay, ReplayOptions
+from hearthlog.analyzer.relabel.recorded import read_recorded
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile.modelfile import SUFFIX, load_model

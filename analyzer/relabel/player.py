@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Event as Flag
 
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo, check_model, features_of, models_for
-from hearthlog.analyzer.replay.recorded import Features, RecordedBatch, ReplayComparison
+from hearthlog.analyzer.relabel.recorded import Features, RecordedBatch, ReplayComparison
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import is_by_names, without_classes
