@@ -20,7 +20,7 @@ from systemd import PREFIX, PROGRAM
 from test_service import LOGS, UNIT, USER_ID, machine, service, wait_for_labels
 
 from hearthlog.analyzer.http import free_port
-from hearthlog.tools.cli.level_meter import users_of_microphones
+from hearthlog.tools.cli.live_display import users_of_microphones
 from hearthlog.tools.service.unit import bridge_unit
 
 __all__ = ["machine", "service"]

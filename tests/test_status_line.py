@@ -27,7 +27,7 @@ from hearthlog.recorder.events import OK, Frames, SourceHealth
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.recording_session import RecorderState, RecordingSession
 from hearthlog.schemas.frames import FRAME_SAMPLES
-from hearthlog.tools.cli.status_line import line_of
+from hearthlog.tools.cli.live_display import line_of
 
 EVENING = datetime(2026, 3, 1, 20, 14, tzinfo=UTC)
 NO_TIME = np.zeros(10, np.int64)

@@ -188,7 +188,7 @@ def record(
 def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
     """Show a live line, from the state that is yielded."""
     from hearthlog.recorder.recording_session import RecorderState
-    from hearthlog.tools.cli.status_line import living_line
+    from hearthlog.tools.cli.live_display import living_line
 
     print_notice("press Ctrl-C to stop and complete the log")
     state = RecorderState()

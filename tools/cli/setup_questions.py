@@ -133,7 +133,7 @@ class Questions:
     def _choose(
         self, devices: "list[Device]", configured: list[tuple[str, str]]
     ) -> list[tuple[str, str]]:
-        from hearthlog.tools.cli.level_meter import choose_by_level
+        from hearthlog.tools.cli.live_display import choose_by_level
 
         default = _found(devices, "")
         rooms = {device or default.identity: room for device, room in configured}
@@ -323,7 +323,7 @@ def _found(devices: "list[Device]", name: str) -> "Device":
     """Find a device; the error for a missing one names what uses the microphones."""
     from hearthlog.recorder.errors import DeviceError
     from hearthlog.recorder.sources.capture import closed_card, find_device
-    from hearthlog.tools.cli.level_meter import users_of_microphones
+    from hearthlog.tools.cli.live_display import users_of_microphones
 
     try:
         return find_device(devices, name)
@@ -353,7 +353,7 @@ def _room(text: str) -> str:
 def _check_level(device: str) -> None:
     from hearthlog.recorder.addresses import is_address
     from hearthlog.recorder.sources.process import query_devices
-    from hearthlog.tools.cli.level_meter import show_level
+    from hearthlog.tools.cli.live_display import show_level
 
     if not is_address(device):
         _found(query_devices(), device)
