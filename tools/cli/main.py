@@ -67,6 +67,7 @@ _MODULES = {  # subcommands that share a module
     "enrol": "annotate",
     "manifest": "train",
     "recover": "doctor",
+    "report": "events",
     "voices": "discover",
 }
 _TYPES = {"str": "TEXT", "int": "NUMBER", "float": "NUMBER"}
