@@ -67,7 +67,7 @@ def test_the_command_multiplies_with_the_kernel_that_is_chosen():
     script = (
         "from hearthlog.tools.cli import main\n"
         "import numpy\n"
-        "from hearthlog.analyzer.workers.workers import kernel_in_use\n"
+        "from hearthlog.analyzer.workers import kernel_in_use\n"
         "print(kernel_in_use())"
     )
     environment = {n: v for n, v in os.environ.items() if n != "OPENBLAS_CORETYPE"}

@@ -32,8 +32,7 @@ from hearthlog.analyzer.logs.layers import find_chains
 from hearthlog.analyzer.relabel import layer as labels
 from hearthlog.analyzer.relabel.layer import Job, complete_layer, label_logs, read_layer_metadata
 from hearthlog.analyzer.relabel.relabel import relabel
-from hearthlog.analyzer.workers import open_workers
-from hearthlog.analyzer.workers.workers import InlineWorkers
+from hearthlog.analyzer.workers import InlineWorkers, open_workers
 from hearthlog.models.classifiers.classifier import label_timing
 from hearthlog.models.modelfile.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings

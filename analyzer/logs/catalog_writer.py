@@ -23,7 +23,7 @@ from hearthlog.analyzer.logs.labelling import MOST_CLASSES
 from hearthlog.analyzer.logs.locations import ListedLog, list_logs, size_and_time
 from hearthlog.analyzer.logs.selection import decode_types, is_compatible
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NONE, Spans, union
-from hearthlog.analyzer.workers.workers import InlineWorkers, Workers
+from hearthlog.analyzer.workers import InlineWorkers, Workers
 from hearthlog.schemas.errors import HearthlogError, LogError, Progress, ignore_progress
 from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.frames import NANOSECONDS

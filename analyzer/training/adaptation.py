@@ -28,7 +28,7 @@ from hearthlog.analyzer.training.window_methods import (
     centres,
     kept_inputs,
 )
-from hearthlog.analyzer.workers.workers import single_thread
+from hearthlog.analyzer.workers import single_thread
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.evidence import UNIT, UNTAUGHT, EmbeddingHeads, mixed, sounds_of

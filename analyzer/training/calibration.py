@@ -10,7 +10,7 @@ import numpy as np
 from hearthlog.analyzer.training.dataset import Dataset, source_counts
 from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.analyzer.training.scores import calibration_error, score
-from hearthlog.analyzer.workers.workers import in_parallel
+from hearthlog.analyzer.workers import in_parallel
 from hearthlog.models.classes import UNKNOWN
 from hearthlog.models.classifiers.model import Elsewhere
 from hearthlog.schemas.arrays import Bool, Float64, Indices

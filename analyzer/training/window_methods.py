@@ -16,7 +16,7 @@ from sklearn.svm import SVC
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.heads import regressed
 from hearthlog.analyzer.training.method import Examples, Method
-from hearthlog.analyzer.workers.workers import single_thread
+from hearthlog.analyzer.workers import single_thread
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind, Machine
 from hearthlog.models.classifiers.landmarks import (
     RBF_LANDMARKS,

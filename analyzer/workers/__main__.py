@@ -1,6 +1,6 @@
-"""A worker process, started by `workers.py`."""
+"""A worker process, started by `open_workers`."""
 
-from hearthlog.analyzer.workers.workers import serve
+from hearthlog.analyzer.workers import serve
 
 if __name__ == "__main__":
     serve()

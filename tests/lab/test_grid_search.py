@@ -13,7 +13,7 @@ from spliced import run, run_function
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.train import evaluate_method
 from hearthlog.analyzer.training.window_methods import PAPER, ROOM
-from hearthlog.analyzer.workers.workers import fits_on
+from hearthlog.analyzer.workers import fits_on
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import adaptation_curve, command, grid_search

@@ -372,7 +372,7 @@ def learning(
     from hearthlog.analyzer.training.dataset import build_dataset
     from hearthlog.analyzer.training.manifest import load_scenario
     from hearthlog.analyzer.training.train import clip_embedder
-    from hearthlog.analyzer.workers.workers import fits_on
+    from hearthlog.analyzer.workers import fits_on
 
     method = chosen_method(name)
     with fits_on(scheduler):

@@ -110,7 +110,7 @@ def _print(result: "Relabelled", model: str) -> None:
 
 
 def _as_json(result: "Relabelled", model: str, sha256: str) -> dict[str, object]:
-    from hearthlog.analyzer.workers.workers import kernel_in_use
+    from hearthlog.analyzer.workers import kernel_in_use
 
     return {
         "model": model,

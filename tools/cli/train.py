@@ -133,7 +133,7 @@ def train(
     else:
         assert scenario is not None
         from hearthlog.analyzer.training.train import DEFAULT
-        from hearthlog.analyzer.workers.workers import fits_on
+        from hearthlog.analyzer.workers import fits_on
 
         # Speakers are separated by features alone.
         method = DEFAULT.name if speakers and method is None else method

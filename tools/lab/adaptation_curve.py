@@ -22,7 +22,7 @@ from hearthlog.analyzer.training.home_recordings import HOME_WEIGHT
 from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.pseudo_labels import MOST_CONFIRMED
 from hearthlog.analyzer.training.window_methods import LandmarkMethod
-from hearthlog.analyzer.workers.workers import in_parallel
+from hearthlog.analyzer.workers import in_parallel
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.errors import Progress

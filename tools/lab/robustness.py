@@ -40,7 +40,7 @@ from hearthlog.analyzer.training.manifest import (
     left_out_lines,
 )
 from hearthlog.analyzer.training.scores import F1Difference, Scores, difference, score
-from hearthlog.analyzer.workers.workers import in_parallel
+from hearthlog.analyzer.workers import in_parallel
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model

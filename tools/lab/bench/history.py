@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from hearthlog.analyzer.workers.workers import kernel_in_use
+from hearthlog.analyzer.workers import kernel_in_use
 from hearthlog.tools.lab.bench.table import Table
 
 _PACKAGES = (
