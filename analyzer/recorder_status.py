@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 from hearthlog._version import __version__
 from hearthlog.analyzer.doctor.examination import examine_file
 from hearthlog.analyzer.logs.recorder_info import CONFIGURATION, attachments_of, read_recorder_infos
-from hearthlog.models.modelfile.modelfile import DESCRIPTION, attachment_of
+from hearthlog.models.modelfile import DESCRIPTION, attachment_of
 from hearthlog.recorder.log.folder_lock import NodeLock, node_locks
 from hearthlog.recorder.pause_schedule import paused_until
 from hearthlog.schemas.errors import LogError

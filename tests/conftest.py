@@ -32,7 +32,7 @@ from hearthlog.analyzer.training.train import (
 from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.home.simulate import write_day, write_training_set

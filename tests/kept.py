@@ -7,8 +7,8 @@ import numpy as np
 
 from hearthlog.models.classifiers.model import Model, Smoothing
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.models.modelfile.registry import insist
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.models.registry import insist
 
 
 def keep_models(folder: Path, model_file: Path) -> Path:

@@ -21,7 +21,7 @@ from spliced import Result
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.review.live_timeline import LiveTimeline
 from hearthlog.analyzer.review.timeline_reader import read_timeline
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.logs.columns import decode, iterate_columns, read_columns
 from hearthlog.schemas.logs.contents import CONTENTS_METADATA
 from hearthlog.schemas.logs.files import find_logs, is_layer

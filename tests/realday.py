@@ -15,7 +15,7 @@ from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, read_ma
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.modelfile.modelfile import save_model
+from hearthlog.models.modelfile import save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

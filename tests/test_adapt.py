@@ -43,7 +43,7 @@ from hearthlog.models.features.auros21 import FeatureExtractor, augmented, bands
 from hearthlog.models.features.feature_set import of_segments
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
+from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

@@ -13,7 +13,7 @@ from logs import features
 from spliced import run, small_disk
 
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_mar
 from hearthlog.analyzer.promotion.comparison import compare_on_trial, gather_evidence
 from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import promote, target
+from hearthlog.models.modelfile import load_model
+from hearthlog.models.registry import promote, target
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import CandidateWatch, ModelWatch

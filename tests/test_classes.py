@@ -28,7 +28,7 @@ from hearthlog.models.classes import (
 )
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import MOST_CLASSES
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 
 DOCS = Path(__file__).parents[1] / "docs" / "models.md"
 OF_0_1_0 = Path(__file__).parent / "golden" / "0.1.0" / "models" / "smoothed.safetensors"

@@ -30,8 +30,8 @@ from hearthlog.models.classifiers.model import Description
 from hearthlog.models.features.auros21 import WINDOW_FRAMES
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.labels.labeller import FrameLabels
-from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.models.modelfile.registry import insist
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.models.registry import insist
 from hearthlog.recorder.config import Settings, load_settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import Frames, Gap

@@ -10,7 +10,7 @@ from simulated_fleet import write_fleet
 
 from hearthlog.analyzer.relabel.relabel import relabel
 from hearthlog.analyzer.workers import open_workers
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

@@ -23,7 +23,7 @@ from hearthlog.analyzer.collections.manifest_writer import (
 from hearthlog.analyzer.collections.readers import COLLECTIONS, CategorySpan, short_licence
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
-from hearthlog.models.modelfile.modelfile import load_model, model_card
+from hearthlog.models.modelfile import load_model, model_card
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.main import make_app
 

@@ -18,7 +18,7 @@ from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
 from hearthlog.analyzer.training.home_recordings import home_recordings
 from hearthlog.analyzer.training.manifest import load_scenario, read_manifest, scenario_of
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

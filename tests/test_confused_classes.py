@@ -17,7 +17,7 @@ from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.logs.shown_classes import WATER, common_names, common_names_of
 from hearthlog.analyzer.report.report import Period, make_report, read_account
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import BATHROOM, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.logs.files import find_logs

@@ -48,7 +48,7 @@ from hearthlog.models.classifiers.model import FORMAT_OF_DIRECTIONS
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.floor import Floors, FloorTracker
 from hearthlog.models.labels.labeller import Labeller
-from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
+from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.events import Gap

@@ -14,7 +14,7 @@ from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     home_id,
 )
 from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 
 pytestmark = pytest.mark.fast
 

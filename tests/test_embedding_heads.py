@@ -21,7 +21,7 @@ from hearthlog.models.classifiers.model import (
     NamesHead,
 )
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
+from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.arrays import read_sealed, write_sealed
 

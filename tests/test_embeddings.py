@@ -16,7 +16,7 @@ from hearthlog.models.embedding.networks import YAMNET, load_embedder
 from hearthlog.models.embedding.projection import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.stream import EmbeddingStream, SteadyNoise
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file, with_network
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.stream.pipeline import Pipeline

@@ -37,7 +37,7 @@ from hearthlog.analyzer.training.train import default_transitions, train_model
 from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.models.classes import ordered
 from hearthlog.models.classifiers.model import Smoothing
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.tables import print_scores
 from hearthlog.tools.home.simulate import write_training_set

@@ -10,7 +10,7 @@ from conftest import HEARTHLOG
 from logs import read
 from waiting import wait_for
 
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import find_logs, is_layer

@@ -19,7 +19,7 @@ from hearthlog.models.features.floor import (
 )
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.labeller import Labeller
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
 pytestmark = pytest.mark.fast

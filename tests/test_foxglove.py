@@ -33,7 +33,7 @@ from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.shown_classes import write_list
 from hearthlog.models.classes import in_words, ordered
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.mcap.chunks import read_definitions
 from hearthlog.schemas.mcap.logfile import LogFile

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from test_fuzz import BYTES, FEW, START, of_bytes
 
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings, load_settings
 from hearthlog.recorder.pause_schedule import PauseSchedule
 from hearthlog.recorder.sources.audio_files import FileSource

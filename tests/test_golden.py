@@ -41,7 +41,7 @@ from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.review.lanes import FEATURES
 from hearthlog.analyzer.review.timeline_reader import read_timeline
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.errors import HearthlogWarning
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer

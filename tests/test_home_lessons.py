@@ -33,7 +33,7 @@ from hearthlog.analyzer.training.pseudo_labels import (
 from hearthlog.models.classifiers.model import Description
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.labelling.labelling_models import LabellingModels

@@ -7,10 +7,9 @@ import pytest
 from kept import keep_models
 from spliced import run
 
-from hearthlog.models import starter
-from hearthlog.models.modelfile import modelfile
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import promote
+from hearthlog.models import modelfile, starter
+from hearthlog.models.modelfile import load_model
+from hearthlog.models.registry import promote
 from hearthlog.schemas.logs.files import find_logs
 
 

@@ -28,7 +28,7 @@ from hearthlog.analyzer.review.spans import JudgeableSpans, span_sounds
 from hearthlog.analyzer.training.home_recordings import lesson_recordings, read_reviewed_sound
 from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder import recording
 from hearthlog.schemas.frames import NANOSECONDS

@@ -15,7 +15,7 @@ from spliced import run
 
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.models.classifiers.model import PublicCollection
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

@@ -14,7 +14,7 @@ from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource

@@ -21,7 +21,7 @@ from rosbags.interfaces import QosDurability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from hearthlog.models.modelfile.modelfile import load_model, model_card
+from hearthlog.models.modelfile import load_model, model_card
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 

@@ -27,8 +27,8 @@ from hearthlog.models.embedding.sound_names import audioset_names, named_sounds
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.names_labeller import NamesLabeller
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import load, promote
+from hearthlog.models.modelfile import load_model
+from hearthlog.models.registry import load, promote
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.labelling.labelling_models import LabellingModels

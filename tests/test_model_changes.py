@@ -25,8 +25,8 @@ from spliced import run
 from hearthlog.models.classifiers.classifier import Classifier, label_timing
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model, model_card
-from hearthlog.models.modelfile.registry import insist, promote
+from hearthlog.models.modelfile import load_model, model_card
+from hearthlog.models.registry import insist, promote
 from hearthlog.models.starter import SHA256, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap

@@ -19,7 +19,7 @@ from hearthlog.models.classifiers.classifier import Classifier, LabelTiming, lab
 from hearthlog.models.classifiers.model import read_description
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
+from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.schemas.errors import ignore_progress
 
 pytestmark = pytest.mark.fast

@@ -21,7 +21,7 @@ from hearthlog.analyzer.logs.recorder_info import features_of, read_recorder_inf
 from hearthlog.analyzer.training.train import method_named
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.errors import HearthlogError, HearthlogWarning, LogError
 from hearthlog.schemas.frames import FRAME_SAMPLES

@@ -37,7 +37,7 @@ from hearthlog.analyzer.training.window_methods import ROOM, balanced, rounded, 
 from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.svm_rbf import weakest_pairs
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "classifiers"
@@ -239,7 +239,7 @@ import hashlib, sys
 from pathlib import Path
 import numpy as np
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 rows = np.load(sys.argv[2])
 for path in sorted(Path(sys.argv[1]).iterdir()):
     probabilities = Classifier(load_model(path)).probabilities(rows)

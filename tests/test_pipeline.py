@@ -5,7 +5,7 @@ import pytest
 
 from hearthlog.models.classifiers.classifier import Classifier, label_timing
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.messages import gap_line, opening_messages

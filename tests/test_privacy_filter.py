@@ -15,7 +15,7 @@ from lossy import LossySource
 from hearthlog.analyzer.training.home_recordings import read_sound_of
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.labels.labeller import FrameLabels
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import ERROR, OK, Frames, SourceHealth

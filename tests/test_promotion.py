@@ -55,8 +55,8 @@ from hearthlog.analyzer.promotion.recent_time import (
 from hearthlog.analyzer.review.review_list import ReviewSpan, read_list
 from hearthlog.analyzer.review.review_queue import queue_spans, review_items
 from hearthlog.models.classifiers.model import Amount, Description
-from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.models.modelfile.registry import (
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.models.registry import (
     Judgement,
     insist,
     judgement_path,

@@ -17,7 +17,7 @@ from waiting import wait_for
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import OK, READING, Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.audio_files import FileSource, long_blocks

@@ -14,8 +14,8 @@ from kept import keep_models, put_by_hand
 from spliced import run
 
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
-from hearthlog.models.modelfile.registry import (
+from hearthlog.models.modelfile import load_model, model_card, save_model
+from hearthlog.models.registry import (
     first_starter,
     list_models,
     load,
@@ -123,7 +123,7 @@ PROMOTING = """
 import sys
 from itertools import cycle
 from pathlib import Path
-from hearthlog.models.modelfile.registry import promote, rollback
+from hearthlog.models.registry import promote, rollback
 folder = Path(sys.argv[1])
 for number, name in enumerate(cycle(["two", "broad", "one"])):
     promote(folder, name)

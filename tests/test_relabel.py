@@ -34,7 +34,7 @@ from hearthlog.analyzer.relabel.layer import Job, complete_layer, label_logs, re
 from hearthlog.analyzer.relabel.relabel import relabel
 from hearthlog.analyzer.workers import InlineWorkers, open_workers
 from hearthlog.models.classifiers.classifier import label_timing
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

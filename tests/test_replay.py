@@ -32,7 +32,7 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier, label_timing
 from hearthlog.models.features.auros21 import FEATURE_NAMES
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
+from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.log.recovery import recover_active

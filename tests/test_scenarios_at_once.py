@@ -41,7 +41,7 @@ from hearthlog.analyzer.review.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Description, Model
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder import recording
 from hearthlog.recorder.config import Settings, load_settings

@@ -22,7 +22,7 @@ from hearthlog.analyzer.evaluation.scenes import (
     loudest,
 )
 from hearthlog.analyzer.training.manifest import read_manifest, scenario_of
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.tools.home.simulate import write_training_set

@@ -23,7 +23,7 @@ from hearthlog.analyzer.training.method import prepare
 from hearthlog.analyzer.training.train import group_folds
 from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.analyzer.workers import fits_on, in_parallel, single_thread
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli import terminal
 from hearthlog.tools.home.simulate import write_training_set

@@ -20,7 +20,7 @@ from hearthlog.analyzer.promotion.promotion_check import find_champion
 from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.analyzer.review.spans import labelling_model
 from hearthlog.analyzer.training.pseudo_labels import unreviewed_silence, unreviewed_sounds
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns

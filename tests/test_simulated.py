@@ -10,8 +10,8 @@ from time import sleep
 import pytest
 
 from hearthlog.models.classifiers.model import SIMULATED, Amount, PublicCollection
-from hearthlog.models.modelfile.modelfile import load_model, save_model
-from hearthlog.models.modelfile.registry import insist
+from hearthlog.models.modelfile import load_model, save_model
+from hearthlog.models.registry import insist
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 
 LINE = (

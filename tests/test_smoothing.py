@@ -31,7 +31,7 @@ from hearthlog.models.labels.smoothing import (
     FixedLagSmoother,
     log_likelihoods,
 )
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.recording import record

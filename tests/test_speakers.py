@@ -18,7 +18,7 @@ from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.speakers import others_of, speaker_recordings, speakers_scenario
 from hearthlog.analyzer.training.train import method_named
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns

@@ -16,7 +16,7 @@ from spliced import run
 
 from hearthlog.analyzer.recorder_status import _networks
 from hearthlog.models.embedding.networks import NETWORKS, YAMNET, NetworkFile
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import NO_MODEL, MicrophoneSettings, Settings
 from hearthlog.recorder.labelling import embedder_probe
 from hearthlog.recorder.labelling.embedder_probe import Probe, likely_network

@@ -20,8 +20,8 @@ from rich.cells import cell_len
 from test_capture import features, wait_for_frames
 
 from hearthlog.models.labels.labeller import FrameLabels
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import insist, promote
+from hearthlog.models.modelfile import load_model
+from hearthlog.models.registry import insist, promote
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import OK, Frames, SourceHealth
 from hearthlog.recorder.labelling.labelling_models import LabellingModels

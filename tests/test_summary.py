@@ -20,7 +20,7 @@ from hearthlog.analyzer.logs.recorder_info import Status
 from hearthlog.analyzer.logs.summary import summarise
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

@@ -59,7 +59,7 @@ from hearthlog.analyzer.review.viewer.drawing import LANE_HEIGHT, DrawnLane
 from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classes import colour, in_words, ordered
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

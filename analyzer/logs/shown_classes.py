@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from hearthlog.analyzer.logs.recorder_info import attachments_of
 from hearthlog.models.classes import FLUSHING_WATER, RUNNING_WATER, SHOWER, TAP_WATER, class_name
-from hearthlog.models.modelfile.modelfile import DESCRIPTION
+from hearthlog.models.modelfile import DESCRIPTION
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.logs.metadata import NEVER_TELL

@@ -23,8 +23,8 @@ from hearthlog.analyzer.promotion.recent_time import RecentLog, recent_logs
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import (
+from hearthlog.models.modelfile import load_model
+from hearthlog.models.registry import (
     CHAMPION,
     Judgement,
     find_model,

@@ -14,7 +14,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import is_by_names, without_classes
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, entries_of, feature_set
-from hearthlog.models.modelfile.modelfile import CARD, DESCRIPTION, model_attachments
+from hearthlog.models.modelfile import CARD, DESCRIPTION, model_attachments
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.labelling.labelling_models import class_conflict, shared_classes
 from hearthlog.recorder.log.description import LogDescription, with_scenarios

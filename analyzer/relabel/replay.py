@@ -13,7 +13,7 @@ from hearthlog.analyzer.relabel.player import Player, Replay, ReplayOptions
 from hearthlog.analyzer.relabel.recorded import read_recorded
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.modelfile.modelfile import SUFFIX, load_model
+from hearthlog.models.modelfile import SUFFIX, load_model
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.sources.framing import FrameCutter
 from hearthlog.schemas.arrays import Float32

@@ -22,7 +22,7 @@ from hearthlog.analyzer.review.spans import (
     without,
 )
 from hearthlog.models.classes import SILENCE, class_name
-from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+from hearthlog.models.registry import DEFAULT_FOLDER
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS

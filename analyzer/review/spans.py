@@ -22,8 +22,8 @@ from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet, Inputs, WindowStatistics
 from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker
 from hearthlog.models.features.installed import feature_set
-from hearthlog.models.modelfile.modelfile import load_model
-from hearthlog.models.modelfile.registry import find_model
+from hearthlog.models.modelfile import load_model
+from hearthlog.models.registry import find_model
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS

@@ -12,8 +12,8 @@ from hearthlog.models.classifiers.network_names import is_by_names, without_clas
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
-from hearthlog.models.modelfile.modelfile import SUFFIX
-from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+from hearthlog.models.modelfile import SUFFIX
+from hearthlog.models.registry import DEFAULT_FOLDER
 from hearthlog.recorder.config import NO_MODEL, Settings
 from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.host import announce

@@ -15,8 +15,8 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features.feature_set import FeatureSet
-from hearthlog.models.modelfile.modelfile import SUFFIX, load_model, name_and_digest, starter_for
-from hearthlog.models.modelfile.registry import (
+from hearthlog.models.modelfile import SUFFIX, load_model, name_and_digest, starter_for
+from hearthlog.models.registry import (
     CANDIDATE,
     DEFAULT_MODEL,
     is_starter,

@@ -9,7 +9,7 @@ from typing import Any
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import entries_of
-from hearthlog.models.modelfile.modelfile import attachment_of, model_attachments
+from hearthlog.models.modelfile import attachment_of, model_attachments
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.logs.metadata import (
     NEVER_TELL,

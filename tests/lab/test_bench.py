@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.frames import FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns

@@ -11,7 +11,7 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.home.clips import SHIPPED

@@ -15,7 +15,7 @@ from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.home33 import HOME33
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.stream.pipeline import Pipeline

@@ -10,7 +10,7 @@ from spliced import run_function
 from hearthlog.analyzer.evaluation.model_scores import evaluate_model
 from hearthlog.analyzer.training.manifest import read_manifest, scenario_of
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.tools.lab import robustness as evaluation

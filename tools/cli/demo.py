@@ -40,7 +40,7 @@ def demo(
         hidden_options,
     )
     from hearthlog.analyzer.review.viewer.recording import save_timeline
-    from hearthlog.models.modelfile.modelfile import load_model
+    from hearthlog.models.modelfile import load_model
     from hearthlog.models.starter import GENERAL
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.recording import record_files

@@ -154,7 +154,7 @@ def read_model_and_clips(
 ) -> "tuple[Model, list[LabelledClip], Scenario, list[SkippedClip]]":
     """Read a model, its scenario unless another one is named, and clips, with the skipped ones."""
     from hearthlog.analyzer.training.manifest import load_scenario, scenario_of
-    from hearthlog.models.modelfile.modelfile import load_model
+    from hearthlog.models.modelfile import load_model
 
     loaded = load_model(starter_here(model))
     classes = load_scenario(scenario) if scenario else scenario_of(loaded)

@@ -57,7 +57,7 @@ def info(
     if catalog:
         wrong_use("use `hearthlog catalog FOLDER`")
     from hearthlog.analyzer.logs.summary import summarise
-    from hearthlog.models.modelfile.registry import is_starter
+    from hearthlog.models.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
     from hearthlog.tools.cli.info_summary import Overview, day_line, next_step
 

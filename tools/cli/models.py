@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.training.manifest import Scenario, SkippedClip
     from hearthlog.models.classifiers.model import Model
     from hearthlog.models.embedding.networks import EmbeddingNetwork
-    from hearthlog.models.modelfile.registry import ModelEntry
+    from hearthlog.models.registry import ModelEntry
 
 
 def fetch(
@@ -174,7 +174,7 @@ _Folder = Annotated[
 @models.command("list")
 def list_(folder: _Folder = None, as_json: Json = False) -> None:
     """List the models and the starters; exit status 3: one of them cannot be used."""
-    from hearthlog.models.modelfile.registry import list_models
+    from hearthlog.models.registry import list_models
 
     place = models_folder(folder)
     entries = list_models(place)
@@ -194,7 +194,7 @@ def show(
     as_json: Json = False,
 ) -> None:
     """Print the card of a model: its classes, accuracy and training data."""
-    from hearthlog.models.modelfile.modelfile import model_card
+    from hearthlog.models.modelfile import model_card
 
     model = _named(models_folder(folder), name)
     if as_json:
@@ -296,7 +296,7 @@ def promote(
     The model is compared with the current one on recent logs that it was not trained on. No
     comparison is made with the starter model of a new home.
     """
-    from hearthlog.models.modelfile.registry import promote as promote_model
+    from hearthlog.models.registry import promote as promote_model
 
     place = models_folder(folder)
     name = _starter_here(place, name)
@@ -314,7 +314,7 @@ def promote(
 @models.command()
 def rollback(folder: _Folder = None) -> None:
     """Make the previous champion champion again; before the first, that is a starter model."""
-    from hearthlog.models.modelfile.registry import rollback as roll_back
+    from hearthlog.models.registry import rollback as roll_back
 
     model, before = roll_back(models_folder(folder))
     print(f"{model.name} ({model.sha256[:12]}) is champion again{_after(before)}")
@@ -324,7 +324,7 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     """Raise ModelError if a model was judged harmful; judge a model without a verdict first."""
     from hearthlog.analyzer.promotion.promotion_check import judge, judged_against
     from hearthlog.models.errors import ModelError
-    from hearthlog.models.modelfile.registry import first_starter, insist, is_starter, load
+    from hearthlog.models.registry import first_starter, insist, is_starter, load
     from hearthlog.models.starter import BY_FEATURES, with_network
     from hearthlog.tools.cli.promotion import print_verdict, refusal
 
@@ -352,7 +352,7 @@ def _starter_here(folder: Path, name: str) -> str:
     A starter promoted before a network was installed is in the folder, too.
     """
     from hearthlog.models.errors import ModelError
-    from hearthlog.models.modelfile.registry import is_starter, load
+    from hearthlog.models.registry import is_starter, load
 
     other = str(starter_here(Path(name)))
     if other == name:
@@ -367,7 +367,7 @@ def _starter_here(folder: Path, name: str) -> str:
 def _check_against_champion(folder: Path, name: str) -> None:
     """Raise ModelError if a candidate's feature set differs from that of an existing champion."""
     from hearthlog.models.errors import ModelError
-    from hearthlog.models.modelfile.registry import CHAMPION, load
+    from hearthlog.models.registry import CHAMPION, load
 
     model = load(folder, name)
     try:
@@ -422,8 +422,8 @@ def _recordings(
 
 def _named(folder: Path, name: str) -> "Model":
     """Load a model of the folder, a starter model, or a file."""
-    from hearthlog.models.modelfile.modelfile import load_model
-    from hearthlog.models.modelfile.registry import load
+    from hearthlog.models.modelfile import load_model
+    from hearthlog.models.registry import load
 
     if Path(name).name != name and Path(name).exists():  # a file in another folder
         return load_model(Path(name))

@@ -167,7 +167,7 @@ def home_and_zone(logs: "Sequence[Path]", timezone: str | None) -> "tuple[HomeLo
 
 def models_folder(given: Path | None = None) -> Path:
     """Return the model folder: the given one, the folder of the configured model, or `models`."""
-    from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+    from hearthlog.models.registry import DEFAULT_FOLDER
     from hearthlog.models.starter import STARTERS
     from hearthlog.recorder.config import NO_MODEL, load_settings
 
@@ -182,7 +182,7 @@ def models_folder(given: Path | None = None) -> Path:
 
 def starter_here(model: Path) -> Path:
     """Return the model for a name; a starter is resolved by the installed network."""
-    from hearthlog.models.modelfile.modelfile import starter_for
+    from hearthlog.models.modelfile import starter_for
     from hearthlog.recorder.config import load_settings
     from hearthlog.recorder.labelling.embedder_probe import likely_network
 
@@ -197,7 +197,7 @@ def starter_of(model: Path, logs: "Iterable[Path]") -> Path:
     """
     from hearthlog.analyzer.logs.recorder_info import first_embedding_source
     from hearthlog.models.classifiers.classifier import Classifier
-    from hearthlog.models.modelfile.modelfile import load_model, starter_for
+    from hearthlog.models.modelfile import load_model, starter_for
     from hearthlog.models.starter import NETWORK
     from hearthlog.schemas.logs.files import find_logs
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hearthlog.analyzer.promotion.comparison import HomeComparison, PairedAccuracy
     from hearthlog.analyzer.promotion.paired_labels import LabelChanges
     from hearthlog.analyzer.promotion.promotion_check import Verdict
-    from hearthlog.models.modelfile.registry import Judgement
+    from hearthlog.models.registry import Judgement
 
 
 _SHOWN = 8  # changes listed

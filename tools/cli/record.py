@@ -198,7 +198,7 @@ def _living_line(settings: "Settings") -> "Iterator[RecorderState]":
 
 def with_model(settings: "Settings") -> "Settings":
     """Return settings with a model where none is configured."""
-    from hearthlog.models.modelfile.registry import DEFAULT_MODEL
+    from hearthlog.models.registry import DEFAULT_MODEL
 
     model = DEFAULT_MODEL if settings.model is None else settings.model
     if model == DEFAULT_MODEL and model.is_symlink() and not model.exists():
@@ -210,7 +210,7 @@ def _report_network(settings: "Settings") -> None:
     """Print the benefit of a network and how to get one, unless the configuration decides."""
     from hearthlog.analyzer.errors import remedy
     from hearthlog.models.embedding.networks import YAMNET, find_network, missing_modules
-    from hearthlog.models.modelfile.registry import DEFAULT_MODEL
+    from hearthlog.models.registry import DEFAULT_MODEL
     from hearthlog.models.starter import BY_FEATURES
 
     model = settings.model or DEFAULT_MODEL

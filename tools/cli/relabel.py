@@ -75,7 +75,7 @@ def relabel(
     with open_workers(count, scheduler, _TASKS) as pool:
         # Imported here: it takes as long as the workers take to start.
         from hearthlog.analyzer.relabel.relabel import relabel as run
-        from hearthlog.models.modelfile.modelfile import load_model
+        from hearthlog.models.modelfile import load_model
 
         model = starter_of(model, logs)
         where = model.resolve() if model.is_file() else model  # otherwise a starter name

@@ -87,7 +87,7 @@ def replay(
     """
     from hearthlog.analyzer.relabel.player import ReplayOptions
     from hearthlog.analyzer.relabel.replay import LogSet
-    from hearthlog.models.modelfile.modelfile import load_model
+    from hearthlog.models.modelfile import load_model
     from hearthlog.models.starter import GENERAL, starter_file
     from hearthlog.schemas.logs.files import find_logs
 
@@ -143,7 +143,7 @@ class _Models:
     """
 
     def __init__(self, given: Path | None, folders: Sequence[Path]) -> None:
-        from hearthlog.models.modelfile.modelfile import load_model
+        from hearthlog.models.modelfile import load_model
 
         self._given = None if given is None else load_model(given)
         self._folders = folders

@@ -104,7 +104,7 @@ def train(
     out because they cannot be read.
     """
     from hearthlog.analyzer.errors import require
-    from hearthlog.models.modelfile.modelfile import check_output, load_model, save_model
+    from hearthlog.models.modelfile import check_output, load_model, save_model
     from hearthlog.schemas.messages.topics import check_scenario_name
 
     require("sklearn", "scipy", "joblib")
@@ -219,7 +219,7 @@ def _next_model(name: str) -> Path:
 def _model_of(home: list[Path], scenario: str) -> Path:
     """Return the model that labelled the latest log, and print its name."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.models.modelfile.registry import find_model
+    from hearthlog.models.registry import find_model
 
     logs = find_home_logs(home)
     models = logs.latest_scenario_models(scenario) if scenario else logs.latest_models()
@@ -331,7 +331,7 @@ def _cut_voices(
         speaker_recordings,
         speakers_scenario,
     )
-    from hearthlog.models.modelfile.modelfile import load_model
+    from hearthlog.models.modelfile import load_model
     from hearthlog.models.starter import GENERAL, starter_file
 
     enrolled = list(speaker_recordings(home, method.features))
@@ -353,7 +353,7 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.training.adaptation import adapt_model, is_moved
     from hearthlog.analyzer.training.home_training_set import home_lessons
-    from hearthlog.models.modelfile.modelfile import load_model
+    from hearthlog.models.modelfile import load_model
 
     model = load_model(base)
     segments, notes, nothing = home_lessons(home, model, scenario)

@@ -22,7 +22,7 @@ from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.tools.lab.command import run

@@ -34,7 +34,7 @@ from hearthlog.analyzer.training.manifest import LABELS, LabelledClip, read_mani
 from hearthlog.models.classes import COUGHING, MUSIC, SILENCE, SPEECH
 from hearthlog.models.classifiers.evidence import SECTORS
 from hearthlog.models.classifiers.model import FORMAT, Model
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record

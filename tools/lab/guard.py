@@ -21,7 +21,7 @@ from hearthlog.analyzer.training.manifest import LABELS, SIZE_LIMIT, LabelledCli
 from hearthlog.models.classes import MUSIC, SILENCE, SPEECH
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.log.clips import ClipFinder

@@ -27,7 +27,7 @@ from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest, scenario_of
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS

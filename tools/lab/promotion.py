@@ -34,7 +34,7 @@ from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.home_training_set import home_lessons
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.arrays import Float64, Indices
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE

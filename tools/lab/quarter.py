@@ -19,7 +19,7 @@ import typer
 
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.marks.marks import RANDOM
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS

@@ -6,7 +6,7 @@ from typing import Any
 
 from hearthlog.analyzer.evaluation.plots import new_figure, save_figure
 from hearthlog.models.classes import SILENCE, UNKNOWN
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.tools.lab.quarter_scores import MICROPHONE_WEEK, WRONG_WEEK, Scored, Week
 

@@ -31,7 +31,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Int8
 from hearthlog.models.features.floor import FloorTracker, is_quiet
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

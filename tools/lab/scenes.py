@@ -23,7 +23,7 @@ from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, LabelledClip, 
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.events import Frames
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Float32

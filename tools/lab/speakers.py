@@ -24,7 +24,7 @@ from hearthlog.analyzer.training.dataset import cut_recordings
 from hearthlog.analyzer.training.speakers import others_of, speaker_recordings, speakers_scenario
 from hearthlog.analyzer.training.train import DEFAULT, train_model
 from hearthlog.models.classes import SILENCE, UNKNOWN
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.errors import ignore_progress

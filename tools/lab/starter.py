@@ -36,7 +36,7 @@ from hearthlog.analyzer.training.window_methods import EMBEDDING, ROOM, Landmark
 from hearthlog.models.classes import CRYING, LAUGHING, PHONE_RING, SILENCE
 from hearthlog.models.classifiers.evidence import UNTAUGHT
 from hearthlog.models.classifiers.model import SIMULATED, Model, may_be_shipped
-from hearthlog.models.modelfile.modelfile import load_model, model_card, save_model
+from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import BY_FEATURES, starter_file
 from hearthlog.schemas.arrays import Float32, Indices
 from hearthlog.schemas.errors import HearthlogError, ignore_progress, listed

@@ -20,7 +20,7 @@ from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.floor import FloorTracker
-from hearthlog.models.modelfile.modelfile import load_model, save_model
+from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.schemas.arrays import Float32
 from hearthlog.schemas.errors import ignore_progress

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.embedding.networks import YAMNET, find_network
-from hearthlog.models.modelfile.modelfile import SUFFIX
-from hearthlog.models.modelfile.registry import CANDIDATE
+from hearthlog.models.modelfile import SUFFIX
+from hearthlog.models.registry import CANDIDATE
 from hearthlog.models.starter import GENERAL, starter_file, with_network
 from hearthlog.recorder.labelling.embedder_probe import NO_NETWORK
 from hearthlog.recorder.sources import capture

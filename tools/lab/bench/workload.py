@@ -13,7 +13,7 @@ from hearthlog.analyzer.training.dataset import Dataset, build_dataset
 from hearthlog.analyzer.training.manifest import BUILTIN, Scenario, read_manifest
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.modelfile.modelfile import save_model
+from hearthlog.models.modelfile import save_model
 from hearthlog.schemas.arrays import Float32, Int16
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary

@@ -14,7 +14,7 @@ from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.ranking import USEFUL
 from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN, class_name
-from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+from hearthlog.models.registry import DEFAULT_FOLDER
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.tools.home.simulate import LabelledSpan

@@ -10,7 +10,7 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding.networks import Embedder, load_embedder
 from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import OK, Frames, SourceHealth
 from hearthlog.recorder.labelling.embedder_probe import network_path

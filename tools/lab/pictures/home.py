@@ -10,7 +10,7 @@ from zoneinfo import ZoneInfo
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.ranking import USEFUL
-from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+from hearthlog.models.registry import DEFAULT_FOLDER
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record_files

@@ -19,7 +19,7 @@ from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, revi
 from hearthlog.analyzer.review.session import ReviewSession
 from hearthlog.analyzer.review.timeline_reader import MOST_FRAMES, read_frames, read_timeline
 from hearthlog.analyzer.review.viewer.viewer import WindowViewer, open_hidden
-from hearthlog.models.modelfile.registry import DEFAULT_FOLDER
+from hearthlog.models.registry import DEFAULT_FOLDER
 from hearthlog.schemas.messages.topics import LIVE
 
 _STILL_SECONDS = 3.0

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.models import modelfile
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import FloorTracker
@@ -14,7 +15,6 @@ from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.features.installed import feature_set as installed
 from hearthlog.models.labels.labeller import Labeller
-from hearthlog.models.modelfile import modelfile
 from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.decoding import convert_sound
 from hearthlog.schemas.arrays import Float32, Int64

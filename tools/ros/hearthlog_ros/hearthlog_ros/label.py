@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.modelfile.modelfile import load_model
+from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.events import Gap
 from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline

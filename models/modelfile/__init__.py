@@ -1,1 +1,0 @@
-"""The model file, its card, and a recorder's folder of models."""
