@@ -17,8 +17,8 @@ from scipy.signal import resample_poly
 from test_capture import realtime_offset, recording, wait_for_frames
 
 import hearthlog
+from hearthlog.analyzer.doctor import Findings
 from hearthlog.analyzer.doctor.examination import examine
-from hearthlog.analyzer.doctor.findings import Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.sound_vectors import as_vectors, mean_bearings

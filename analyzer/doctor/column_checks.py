@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.analyzer.doctor.findings import Findings, Level
+from hearthlog.analyzer.doctor import Findings, Level
 from hearthlog.models.classifiers.network_names import MOST_AHEAD_FRAMES
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.schemas.arrays import Bool, Int64

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from mcap.opcode import Opcode
 
+from hearthlog.analyzer.doctor import DISTRUST, RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.column_checks import ALWAYS, LOG_NAME, split_topic
-from hearthlog.analyzer.doctor.findings import DISTRUST, RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.message_checks import (
     ALLOWED_DELAY,

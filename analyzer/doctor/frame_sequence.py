@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection
 
 import numpy as np
 
+from hearthlog.analyzer.doctor import DISTRUST, Findings
 from hearthlog.analyzer.doctor.column_checks import (
     DIRECTION,
     EMBEDDING,
@@ -13,7 +14,6 @@ from hearthlog.analyzer.doctor.column_checks import (
     SEGMENT,
     STATISTICS,
 )
-from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.models.classifiers.classifier import LabelTiming
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
 from hearthlog.models.embedding.projection import WINDOW_FRAMES

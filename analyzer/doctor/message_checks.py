@@ -13,6 +13,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.doctor import DISTRUST, Findings
 from hearthlog.analyzer.doctor.column_checks import (
     BESIDE_LABEL,
     DIRECTION,
@@ -30,7 +31,6 @@ from hearthlog.analyzer.doctor.column_checks import (
     split_topic,
     topic_type,
 )
-from hearthlog.analyzer.doctor.findings import DISTRUST, Findings
 from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.doctor.records import MessageBatch
 from hearthlog.analyzer.doctor.sections import DataSection

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, McapRecord, Schema
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor import RECOVER, REINDEX, Findings
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.files import LocalFile
 from hearthlog.schemas.logs.columns import definition_fault

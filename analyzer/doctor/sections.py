@@ -23,7 +23,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from hearthlog.analyzer.doctor.findings import RECOVER, REINDEX, Findings
+from hearthlog.analyzer.doctor import RECOVER, REINDEX, Findings
 from hearthlog.analyzer.doctor.records import (
     BATCH_SIZE,
     CheckedDefinitions,

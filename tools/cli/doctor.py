@@ -12,7 +12,7 @@ from hearthlog.tools.cli.options import Json, LocalLogs, check_output
 from hearthlog.tools.cli.terminal import number, print_lines, print_notice, share_done, wrong_use
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.doctor.findings import Findings
+    from hearthlog.analyzer.doctor import Findings
     from hearthlog.schemas.salvage.recover import Recovery
 
 
