@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from hearthlog.analyzer.collections import COLLECTIONS, CategorySpan, short_licence
 from hearthlog.analyzer.collections.manifest_writer import (
     LabelMap,
     labelled_parts,
@@ -20,7 +21,6 @@ from hearthlog.analyzer.collections.manifest_writer import (
     read_map,
     shipped_map,
 )
-from hearthlog.analyzer.collections.readers import COLLECTIONS, CategorySpan, short_licence
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.modelfile import load_model, model_card

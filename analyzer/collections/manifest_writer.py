@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.collections.readers import (
+from hearthlog.analyzer.collections import (
     FOLDER,
     CategorySpan,
     CollectionClip,

@@ -477,8 +477,8 @@ def manifest(
 
     Exit status 3: some audio files of the collection are missing.
     """
+    from hearthlog.analyzer.collections import FOLDER, NAMES, find_collection
     from hearthlog.analyzer.collections.manifest_writer import make_manifest, shipped_map
-    from hearthlog.analyzer.collections.readers import FOLDER, NAMES, find_collection
 
     chosen = find_collection(collection)
     if chosen is None:
