@@ -1,4 +1,4 @@
-"""Readers of public collections of labelled sound, and the table of collections."""
+"""Public collections of labelled sound: their table, and a reader of each."""
 
 import json
 import math

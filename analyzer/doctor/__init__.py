@@ -1,4 +1,4 @@
-"""Findings about a log, with a limited number of each kind."""
+"""Checks of logs against the MCAP specification, docs/log.md and each other, and their findings."""
 
 from collections import Counter
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Table of export formats, and names of exported files.
+"""Export, merging and cutting of logs: the table of formats, and names of files.
 
 A format is an `Exporter` in a module of this folder, and a row here.
 """

@@ -1,4 +1,4 @@
-"""Marks and reviewed spans in the review layer next to a log."""
+"""Reviewer marks and reviewed spans, in the review layer next to a log."""
 
 import re
 import tempfile
