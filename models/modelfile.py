@@ -29,7 +29,7 @@ from hearthlog.models.classifiers.model import (
 )
 from hearthlog.models.classifiers.network_names import AUDIOSET, KEY, audioset_file
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.starter import (
     BY_FEATURES,

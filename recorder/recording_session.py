@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hearthlog.models.classifiers.network_names import is_by_names
 from hearthlog.models.embedding.networks import Embedder
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.config import Settings

@@ -7,7 +7,7 @@ import numpy as np
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.manifest import Scenario
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 
 SOURCES = 6

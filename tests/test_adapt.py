@@ -39,8 +39,8 @@ from hearthlog.analyzer.training.window_methods import BANDS, ROOM, SVM, kept_in
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError
+from hearthlog.models.features import of_segments
 from hearthlog.models.features.auros21 import FeatureExtractor, augmented, bands_of
-from hearthlog.models.features.feature_set import of_segments
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, model_card, save_model

@@ -42,7 +42,7 @@ from hearthlog.models.classifiers.evidence import UNTAUGHT, EmbeddingHeads
 from hearthlog.models.classifiers.model import FORMAT, FORMAT_OF_EMBEDDINGS
 from hearthlog.models.embedding.networks import YAMNET, load_embedder
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.feature_set import of_segments
+from hearthlog.models.features import of_segments
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
 

@@ -39,7 +39,7 @@ from hearthlog.analyzer.marks.enrol import Enrolled, cut_path, enrol_log
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.speakers import APART, is_voice
 from hearthlog.models.classes import SILENCE, SPEECH, class_name
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, time_text

@@ -46,7 +46,7 @@ from hearthlog.models.embedding.projection import (
     WINDOW_FRAMES,
     Embeddings,
 )
-from hearthlog.models.features.feature_set import FeatureSet, of_segments
+from hearthlog.models.features import FeatureSet, of_segments
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.labels.labeller import Labeller
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64

@@ -19,7 +19,7 @@ from hearthlog.analyzer.logs.layers import find_coverage, latest_records
 from hearthlog.analyzer.logs.selection import array_names, select
 from hearthlog.analyzer.marks import Mark, write_marks
 from hearthlog.models.classes import CLASS_NAME, SILENCE, class_name
-from hearthlog.models.features.feature_set import SILENCE_POWER
+from hearthlog.models.features import SILENCE_POWER
 from hearthlog.recorder.config import MicrophoneSettings, load_settings
 from hearthlog.recorder.events import Event, Frames, SoundSource
 from hearthlog.recorder.pause_schedule import time_zone

@@ -12,7 +12,7 @@ from hearthlog.analyzer.relabel.recorded import Features, RecordedBatch, ReplayC
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import is_by_names, without_classes
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, entries_of, feature_set
 from hearthlog.models.modelfile import CARD, DESCRIPTION, model_attachments
 from hearthlog.recorder.events import Frames, Gap, SourceHealth

@@ -19,7 +19,7 @@ from hearthlog.analyzer.logs.spans import Spans, overlay, ranges, remains
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.feature_set import FeatureSet, Inputs, WindowStatistics
+from hearthlog.models.features import FeatureSet, Inputs, WindowStatistics
 from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile import load_model

@@ -14,7 +14,7 @@ from hearthlog.models.embedding.networks import find_network, load_embedder
 from hearthlog.models.embedding.projection import WINDOW_FRAMES, Int8
 from hearthlog.models.embedding.stream import SteadyNoise
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.errors import SourceError

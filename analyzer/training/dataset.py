@@ -28,7 +28,7 @@ from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, Skipped
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Amount, Model
 from hearthlog.models.embedding.projection import Int8
-from hearthlog.models.features.feature_set import SILENCE_POWER, FeatureSet
+from hearthlog.models.features import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.errors import SourceError

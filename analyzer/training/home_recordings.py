@@ -31,7 +31,7 @@ from hearthlog.models.embedding.projection import (
     WINDOW_FRAMES,
     Embeddings,
 )
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker, is_quiet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64

@@ -37,7 +37,7 @@ from hearthlog.models.classes import (
     meant_by,
 )
 from hearthlog.models.classifiers.model import MOST_CLASSES, Model
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.messages.topics import EmbeddingSpace
 

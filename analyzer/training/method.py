@@ -12,7 +12,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.clips import empty_room
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.models.classes import SILENCE
-from hearthlog.models.features.feature_set import FeatureSet, Inputs, of_segments, window_places
+from hearthlog.models.features import FeatureSet, Inputs, of_segments, window_places
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
 

@@ -23,7 +23,7 @@ from hearthlog.analyzer.training.method import loud_windows
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, translation
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import of_segments, window_places
+from hearthlog.models.features import of_segments, window_places
 from hearthlog.models.features.floor import is_quiet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.schemas.arrays import Bool, Float64, Indices

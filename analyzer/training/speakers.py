@@ -20,7 +20,7 @@ from hearthlog.analyzer.training.manifest import LABELS, Scenario
 from hearthlog.analyzer.training.method import Method
 from hearthlog.models.classes import OTHER, SILENCE, SPEECH, UNKNOWN, class_name, find_class
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.schemas.arrays import Float32, Indices
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import CUT

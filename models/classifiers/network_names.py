@@ -35,7 +35,7 @@ from hearthlog.models.embedding.projection import (
 )
 from hearthlog.models.embedding.sound_names import RELEASE, SoundName, audioset_names
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Float32, Float64, write_sealed
 from hearthlog.schemas.frames import FRAME_SECONDS

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.features import auros21
+from hearthlog.models.features import FeatureSet, WindowStatistics, auros21
 from hearthlog.models.features.auros21 import (
     AUROS21,
     BINS,
@@ -14,7 +14,6 @@ from hearthlog.models.features.auros21 import (
     FLUX,
     FeatureExtractor,
 )
-from hearthlog.models.features.feature_set import FeatureSet, WindowStatistics
 from hearthlog.schemas.arrays import Float32, Float64
 
 SHAPE_NAMES = tuple(

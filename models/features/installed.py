@@ -3,8 +3,8 @@
 from hearthlog.models.embedding.networks import network_folders
 from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.auros21 import AUROS21
-from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
 from hearthlog.models.features.network import (
     card_names,

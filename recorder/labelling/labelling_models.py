@@ -10,7 +10,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import is_by_names, without_classes
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.modelfile import SUFFIX
 from hearthlog.models.registry import DEFAULT_FOLDER

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.errors import ModelError
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.modelfile import SUFFIX, load_model, name_and_digest, starter_for
 from hearthlog.models.registry import (
     CANDIDATE,

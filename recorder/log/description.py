@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import entries_of
 from hearthlog.models.modelfile import attachment_of, model_attachments
 from hearthlog.recorder.config import Settings

@@ -5,7 +5,7 @@ from itertools import repeat
 from typing import Any, NamedTuple
 
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder.events import OK, WARNING, Gap, Notice, SourceHealth
 from hearthlog.schemas.arrays import Int64

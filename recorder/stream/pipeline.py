@@ -19,7 +19,7 @@ from hearthlog.models.classifiers.evidence import (
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.embedding.projection import DELAY_FRAMES, NO_EMBEDDINGS
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.labels.labeller import FrameLabels

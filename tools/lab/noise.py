@@ -21,7 +21,7 @@ from hearthlog.analyzer.training.method import Learned, Method, prepare
 from hearthlog.analyzer.training.scores import F1Difference, Scores, difference, score
 from hearthlog.analyzer.training.train import Kind, divide
 from hearthlog.analyzer.training.window_methods import PAPER, ROOM
-from hearthlog.models.features.feature_set import FeatureSet, of_segments
+from hearthlog.models.features import FeatureSet, of_segments
 from hearthlog.models.features.floor import FloorTracker, low_power
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.frames import FRAME_SAMPLES

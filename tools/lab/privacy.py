@@ -25,8 +25,8 @@ from hearthlog.models.classes import SPEECH
 from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
 from hearthlog.models.embedding.projection import WINDOW_FRAMES
 from hearthlog.models.embedding.stream import EmbeddingStream
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.auros21 import AUROS21, ENERGY, FLUX
-from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import HOME33
 from hearthlog.schemas.arrays import Float64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE

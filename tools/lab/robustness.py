@@ -44,7 +44,7 @@ from hearthlog.analyzer.workers import in_parallel
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import FeatureSet, of_segments
+from hearthlog.models.features import FeatureSet, of_segments
 from hearthlog.models.features.floor import low_power
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog.schemas.errors import Progress, ignore_progress

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.auros21 import (
     BINS,
     CEPSTRA,
@@ -16,7 +17,6 @@ from hearthlog.models.features.auros21 import (
     mel_bank,
     mel_centres,
 )
-from hearthlog.models.features.feature_set import FeatureSet
 from hearthlog.models.features.home33 import SHAPE_NAMES
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.features.feature_set import FeatureSet, WindowStatistics
+from hearthlog.models.features import FeatureSet, WindowStatistics
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 WINDOW_FRAMES = 24

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hearthlog.models.features.feature_set import FeatureSet, WindowStatistics
+from hearthlog.models.features import FeatureSet, WindowStatistics
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog_feature_sets.frame_level import (
     LEVEL,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.batch_invariant import rowwise_matmul
-from hearthlog.models.features.feature_set import FeatureSet, WindowStatistics
+from hearthlog.models.features import FeatureSet, WindowStatistics
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog_feature_sets.frame_level import (
     LEVEL,

@@ -2,7 +2,7 @@
 
 from hearthlog.analyzer.training.window_methods import SvmMethod
 from hearthlog.models.classifiers.svm_rbf import SVM_RBF
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog_feature_sets.auditory_image import SAI
 from hearthlog_feature_sets.logmel import LOGMEL
 from hearthlog_feature_sets.plp import PLP

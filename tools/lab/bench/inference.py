@@ -18,7 +18,7 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.analyzer.training.window_methods import ROOM, SVM
 from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file

@@ -8,7 +8,7 @@ import numpy as np
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding.networks import Embedder, load_embedder
-from hearthlog.models.features.feature_set import FeatureSet
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings
