@@ -37,7 +37,7 @@ from hearthlog.analyzer.training.train import (
 )
 from hearthlog.analyzer.training.window_methods import BANDS, ROOM, SVM, kept_inputs
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.svm_rbf import HOME_VOTE, home_votes
+from hearthlog.models.classifiers.rbf_machines import HOME_VOTE, home_votes
 from hearthlog.models.errors import ModelError
 from hearthlog.models.features import of_segments
 from hearthlog.models.features.auros21 import FeatureExtractor, augmented, bands_of

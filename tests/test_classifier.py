@@ -16,12 +16,12 @@ from hearthlog.analyzer.training.calibration import softmax
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.analyzer.training.window_methods import PAPER, LearnedSvm, rounded, rounded_to_steps
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.rbf_distances import (
+from hearthlog.models.classifiers.rbf_machines import (
+    SVM_RBF,
     RoundedDistances,
     UnroundedDistances,
     in_steps,
 )
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
 from hearthlog.schemas.errors import ignore_progress
 
 pytestmark = pytest.mark.fast

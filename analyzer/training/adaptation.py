@@ -32,11 +32,6 @@ from hearthlog.analyzer.workers import single_thread
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import classifier_kind
 from hearthlog.models.classifiers.evidence import UNIT, UNTAUGHT, EmbeddingHeads, mixed, sounds_of
-from hearthlog.models.classifiers.landmarks import (
-    RBF_LANDMARKS,
-    LandmarkParameters,
-    LandmarksMachine,
-)
 from hearthlog.models.classifiers.model import (
     FORMAT,
     FORMAT_OF_EMBEDDINGS,
@@ -50,7 +45,12 @@ from hearthlog.models.classifiers.model import (
     NamesHead,
 )
 from hearthlog.models.classifiers.network_names import require_trained
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.rbf_machines import (
+    RBF_LANDMARKS,
+    SVM_RBF,
+    LandmarkParameters,
+    LandmarksMachine,
+)
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int32
 from hearthlog.schemas.errors import ignore_progress
 

@@ -18,15 +18,18 @@ from hearthlog.analyzer.training.heads import regressed
 from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.analyzer.workers import single_thread
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind, Machine
-from hearthlog.models.classifiers.landmarks import (
+from hearthlog.models.classifiers.model import Array, Model
+from hearthlog.models.classifiers.rbf_machines import (
     RBF_LANDMARKS,
+    SVM_RBF,
     LandmarkParameters,
     LandmarksMachine,
+    RoundedDistances,
+    Scaler,
     all_landmarks,
+    in_steps,
+    weakest_pairs,
 )
-from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.rbf_distances import RoundedDistances, Scaler, in_steps
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF, weakest_pairs
 from hearthlog.models.features.network import INPUTS
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 
@@ -58,7 +61,7 @@ def fitted_scaler(inputs: Float32) -> StandardScaler:
 
 
 def scaler_arrays(scaler: StandardScaler) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `hearthlog.models.classifiers.rbf_distances`."""
+    """Return the arrays of `hearthlog.models.classifiers.rbf_machines`."""
     return {"scaler_mean": scaler.mean_, "scaler_scale": scaler.scale_}
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from hearthlog.models.classes import UNKNOWN
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind
 from hearthlog.models.classifiers.evidence import EmbeddingHeads, mixed
-from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.classifiers.model import Description, Model
 from hearthlog.models.classifiers.network_names import (
     BY_NAMES,
@@ -15,7 +14,7 @@ from hearthlog.models.classifiers.network_names import (
     NamesParameters,
     names_parameters,
 )
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.rbf_machines import RBF_LANDMARKS, SVM_RBF
 from hearthlog.models.embedding.projection import DELAY_FRAMES
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.floor import BLOCK_FRAMES

@@ -27,7 +27,7 @@ from hearthlog.analyzer.training.manifest import (
 )
 from hearthlog.analyzer.training.train import CrossValidation, evaluate_method
 from hearthlog.analyzer.training.window_methods import SvmMethod
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.rbf_machines import SVM_RBF
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import FEATURE_SETS, feature_set
 from hearthlog.models.features.network import INPUTS, card_names

@@ -15,7 +15,7 @@ from hearthlog.models.classifiers.classifier_kind import (
     target_problem,
 )
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.rbf_distances import SCALER, Scaler, scaler_problem, scaler_shapes
+from hearthlog.models.classifiers.rbf_machines import SCALER, Scaler, scaler_problem, scaler_shapes
 from hearthlog.schemas.arrays import Float32, Float64
 
 MOST_UNITS = 1024

@@ -14,7 +14,7 @@ from hearthlog.models.classifiers.classifier_kind import (
     target_problem,
 )
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.rbf_distances import (
+from hearthlog.models.classifiers.rbf_machines import (
     SCALER,
     RoundedDistances,
     Scaler,

@@ -1,7 +1,7 @@
 """A way to learn from each set: a support vector machine on means and deviations of a second."""
 
 from hearthlog.analyzer.training.window_methods import SvmMethod
-from hearthlog.models.classifiers.svm_rbf import SVM_RBF
+from hearthlog.models.classifiers.rbf_machines import SVM_RBF
 from hearthlog.models.features import FeatureSet
 from hearthlog_feature_sets.auditory_image import SAI
 from hearthlog_feature_sets.logmel import LOGMEL

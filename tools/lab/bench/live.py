@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
+from hearthlog.models.classifiers.rbf_machines import RBF_LANDMARKS
 from hearthlog.models.embedding.networks import YAMNET, find_network
 from hearthlog.models.modelfile import SUFFIX
 from hearthlog.models.registry import CANDIDATE

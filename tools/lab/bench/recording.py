@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
+from hearthlog.models.classifiers.rbf_machines import RBF_LANDMARKS
 from hearthlog.tools.lab.bench.hours import DENSE, KINDS
 from hearthlog.tools.lab.bench.table import Row, Table, Target
 from hearthlog.tools.lab.bench.timing import Seconds, best_of_processes

@@ -15,8 +15,8 @@ from rosbags.highlevel import AnyReader
 from hearthlog.analyzer.training.dataset import Dataset
 from hearthlog.analyzer.training.hidden_markov import viterbi
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.classifiers.landmarks import RBF_LANDMARKS
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.classifiers.rbf_machines import RBF_LANDMARKS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import (
     LABEL,

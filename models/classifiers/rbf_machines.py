@@ -1,26 +1,149 @@
-"""One-against-one support vector machines with RBF kernel, in numpy alone."""
+"""Machines with RBF kernels, in numpy alone: support vectors, and a linear head on landmarks."""
 
 from collections.abc import Mapping
 from itertools import combinations, pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
 from hearthlog.models.classifiers.classifier_kind import ClassifierKind, target_problem
 from hearthlog.models.classifiers.model import Array, Model
-from hearthlog.models.classifiers.rbf_distances import (
-    SCALER,
-    Distances,
-    Prepared,
-    RoundedDistances,
-    Scaler,
-    UnroundedDistances,
-    scaler_problem,
-    scaler_shapes,
-)
 from hearthlog.schemas.arrays import Float32, Float64
+
+_EXACT = 4096  # steps: its square, 2^24, is the limit up to which float32 holds all whole numbers
+_FARTHEST = 1 << 20  # steps: with a thousand inputs, sums of squares are exact in float64
+
+
+class Prepared(NamedTuple):
+    """Windows or vectors."""
+
+    # [shape=(n, width + 2) or (width + 2, m), float32 or float64] windows in rows, vectors in
+    # columns
+    values: NDArray[Any]
+    longest: float  # length of the longest window or vector, in steps; 0 without steps
+
+
+class Distances(Protocol):
+    """The exponents of a kernel, -gamma |x - s|^2, of scaled inputs x and vectors s."""
+
+    def rows(self, scaled: Float64) -> Prepared:
+        """Prepare scaled inputs, of shape (n, width)."""
+
+    def vectors(self, scaled: Float64) -> Prepared:
+        """Prepare scaled vectors, of shape (m, width)."""
+
+    def between(self, rows: Prepared, vectors: Prepared) -> Float64:
+        """Return the exponents, of shape (n, m), all at most 0."""
+
+
+class RoundedDistances:
+    """Distances of inputs in whole steps: the same bits with any BLAS, on any processor.
+
+    Products of whole numbers and all their sums are exact in any order: in float32 if rows and
+    vectors are close enough to the mean, as almost all are, else in float64.
+    """
+
+    def __init__(self, gamma: float, steps: int) -> None:
+        self._steps = steps
+        self._factor = gamma / steps**2
+
+    def rows(self, scaled: Float64) -> Prepared:
+        """Prepare scaled inputs, of shape (n, width)."""
+        rounded = in_steps(scaled, self._steps)
+        return _exact(_as_rows(rounded), rounded)
+
+    def vectors(self, scaled: Float64) -> Prepared:
+        """Prepare scaled vectors, of shape (m, width)."""
+        rounded = in_steps(scaled, self._steps)
+        values, longest = _exact(_as_columns(rounded, 1.0), rounded)
+        return Prepared(aligned(values), longest)
+
+    def between(self, rows: Prepared, vectors: Prepared) -> Float64:
+        """Return the exponents, of shape (n, m), all at most 0."""
+        # No partial sum of the products is above (|x| + |s|)^2.
+        type_ = np.float32 if rows.longest + vectors.longest <= _EXACT else np.float64
+        product = rows.values.astype(type_, copy=False) @ vectors.values.astype(type_, copy=False)
+        exponents: Float64 = np.multiply(product, self._factor, dtype=np.float64)
+        return exponents
+
+
+class UnroundedDistances:
+    """Distances for models of hearthlog 0.1."""
+
+    def __init__(self, gamma: float) -> None:
+        self._gamma = gamma
+
+    def rows(self, scaled: Float64) -> Prepared:
+        """Prepare scaled inputs, of shape (n, width)."""
+        return Prepared(_as_rows(scaled), 0.0)
+
+    def vectors(self, scaled: Float64) -> Prepared:
+        """Prepare scaled vectors, of shape (m, width)."""
+        return Prepared(aligned(_as_columns(scaled, self._gamma)), 0.0)
+
+    def between(self, rows: Prepared, vectors: Prepared) -> Float64:
+        """Return the exponents, of shape (n, m), all at most 0."""
+        product = rowwise_matmul(rows.values, vectors.values)
+        return np.minimum(product, 0.0, out=product)  # rounding puts a few above 0
+
+
+def in_steps(scaled: Float64, steps: int) -> Float64:
+    """Round standard deviations from the mean [shape=(n, width)] to whole steps, -2^20 to 2^20."""
+    return np.clip(np.rint(steps * scaled), -_FARTHEST, _FARTHEST)
+
+
+def _as_rows(inputs: Float64) -> Float64:
+    """Return inputs x as (x, |x|^2, 1)."""
+    square = np.vecdot(inputs, inputs)[:, np.newaxis]
+    return np.concatenate([inputs, square, np.ones_like(square)], axis=1)
+
+
+def _as_columns(vectors: Float64, gamma: float) -> Float64:
+    """Return columns whose product with (x, |x|^2, 1) is -gamma |x - s|^2."""
+    square = np.vecdot(vectors, vectors)[:, np.newaxis]
+    parts = 2.0 * gamma * vectors, np.full_like(square, -gamma), -gamma * square
+    return np.concatenate(parts, axis=1).T
+
+
+def _exact(values: Float64, rounded: Float64) -> Prepared:
+    """Convert values to float32 if that is exact."""
+    longest = float(np.vecdot(rounded, rounded).max(initial=0.0)) ** 0.5
+    return Prepared(values if longest > _EXACT else values.astype(np.float32), longest)
+
+
+SCALER: Mapping[str, np.dtype[Any]] = {
+    "scaler_mean": np.dtype(np.float64),
+    "scaler_scale": np.dtype(np.float64),
+}
+_SMALLEST_SCALE = 1e-30  # no quotient of finite inputs overflows
+
+
+class Scaler:
+    """Scales inputs by a model's mean and standard deviation."""
+
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
+        self._mean = arrays["scaler_mean"]
+        self._scale = arrays["scaler_scale"]
+
+    def __call__(self, inputs: Float32) -> Float64:
+        """Scale inputs, of shape (n, width)."""
+        return (inputs - self._mean) / self._scale
+
+
+def scaler_shapes(width: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays `SCALER` for a number of inputs."""
+    return dict.fromkeys(SCALER, (width,))
+
+
+def scaler_problem(arrays: Mapping[str, Array]) -> str | None:
+    """Return an error in the arrays of `Scaler`, which are finite and of valid shapes; or None."""
+    if (arrays["scaler_scale"] >= _SMALLEST_SCALE).all():
+        return None
+    return "scaler_scale has values that are not positive"
+
 
 HOME_VOTE = 2.0  # decisions of pairs lie around -1 and 1
 HOME_SHARE = 100.0  # weight of a home vector; a support vector has 1
@@ -262,3 +385,127 @@ def _distances(model: Model) -> Distances:
     if parameters.steps is None:
         return UnroundedDistances(parameters.gamma)
     return RoundedDistances(parameters.gamma, parameters.steps)
+
+
+_LANDMARKS_AT_ONCE = 256  # no BLAS splits a product of this size among threads
+
+
+class LandmarkParameters(BaseModel):
+    """Parameters of the kernel."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+    gamma: Annotated[float, Field(gt=0.0, le=1e6)]  # of the kernel exp(-gamma |x - l|^2)
+    steps: Annotated[int, Field(ge=1, le=1024)]
+
+
+class LandmarksKind(ClassifierKind):
+    """Linear decisions on the kernels of landmarks; the arrays for C classes.
+
+    scaler_mean, scaler_scale : [shape=(width,)], float64
+        Of the inputs.
+    landmarks : [shape=(m, width)], float32
+        Unscaled inputs, sorted by class.
+    landmark_counts : [shape=(C,)], int64
+        Number of landmarks of each class; 0 for a class added by a home.
+    home_landmarks : [shape=(h, width)], float32, optional
+        Landmarks of the home that the model was adapted to, after the others.
+    weights : [shape=(m + h, C)], float64
+        Of the kernels.
+    bias : [shape=(C,)], float64
+    base_weights : [shape=(m, B)], float64, optional
+        Weights before any adaptation to a home, of the B classes at that time.
+    base_bias : [shape=(B,)], float64, optional
+    """
+
+    name = "rbf-landmarks"
+    parameters = LandmarkParameters
+    arrays: Mapping[str, np.dtype[Any]] = {
+        **SCALER,
+        "landmarks": np.dtype(np.float32),
+        "landmark_counts": np.dtype(np.int64),
+        "weights": np.dtype(np.float64),
+        "bias": np.dtype(np.float64),
+    }
+    optional: Mapping[str, np.dtype[Any]] = {
+        "home_landmarks": np.dtype(np.float32),
+        "base_weights": np.dtype(np.float64),
+        "base_bias": np.dtype(np.float64),
+    }
+
+    def shapes(
+        self, classes: int, width: int, arrays: Mapping[str, Array]
+    ) -> dict[str, tuple[int, ...]]:
+        """Return the required shapes, as `ClassifierKind.shapes`."""
+        count, home, before = (
+            len(arrays[name]) if name in arrays and arrays[name].ndim else 0
+            for name in ("landmarks", "home_landmarks", "base_bias")
+        )
+        shapes: dict[str, tuple[int, ...]] = {
+            **scaler_shapes(width),
+            "landmarks": (count, width),
+            "landmark_counts": (classes,),
+            "weights": (count + home, classes),
+            "bias": (classes,),
+        }
+        if home:
+            shapes["home_landmarks"] = (home, width)
+        if before:
+            shapes["base_weights"], shapes["base_bias"] = (count, before), (before,)
+        return shapes
+
+    def problem(self, classes: int, arrays: Mapping[str, Array]) -> str | None:
+        """Return an error in the arrays, as `ClassifierKind.problem`."""
+        counts, total = arrays["landmark_counts"], len(arrays["landmarks"])
+        if (counts < 0).any() or counts.sum() != total or not total:
+            return f"landmark_counts do not add up to the {total} landmarks"
+        before = len(arrays.get("base_bias", counts))
+        if before > classes or not counts[:before].all() or counts[before:].any():
+            return "landmark_counts has classes of the base without landmarks, or others with some"
+        return scaler_problem(arrays)
+
+    def machine(self, model: Model) -> "LandmarksMachine":
+        """Prepare a model for inference."""
+        parameters = LandmarkParameters.model_validate(model.description.parameters)
+        return LandmarksMachine(model.arrays, parameters)
+
+    def summary(self, model: Model) -> str:
+        """Return the number of landmarks in words."""
+        return f"{len(all_landmarks(model.arrays))} landmarks"
+
+
+RBF_LANDMARKS = LandmarksKind()
+
+
+def all_landmarks(arrays: Mapping[str, Array]) -> Float32:
+    """Return the landmarks of a model and of its home, in the order of the weights."""
+    own: Float32 = arrays["landmarks"]
+    home = arrays.get("home_landmarks")
+    return own if home is None else np.concatenate([own, home])
+
+
+class LandmarksMachine:
+    """Inference of one model."""
+
+    def __init__(self, arrays: Mapping[str, Array], parameters: LandmarkParameters) -> None:
+        self._scaled = Scaler(arrays)
+        self._distances = RoundedDistances(parameters.gamma, parameters.steps)
+        landmarks, weights = self._scaled(all_landmarks(arrays)), arrays["weights"]
+        self._bias = arrays["bias"]
+        self._blocks = []
+        for start in range(0, len(landmarks), _LANDMARKS_AT_ONCE):
+            rows = slice(start, start + _LANDMARKS_AT_ONCE)
+            block = self._distances.vectors(landmarks[rows])
+            self._blocks.append((block, aligned(weights[rows])))
+
+    def decide(self, inputs: Float32) -> tuple[Float64, Float64]:
+        """Return decisions [shape=(n, C)] of finite inputs [shape=(n, width)], and novelty, NaN.
+
+        The decisions are logarithms of probabilities up to a constant and a temperature.
+        """
+        rows = self._distances.rows(self._scaled(inputs))
+        decisions = np.tile(self._bias, (len(inputs), 1))
+        for landmarks, weights in self._blocks:
+            exponents = self._distances.between(rows, landmarks)
+            decisions += rowwise_matmul(np.exp(exponents, out=exponents), weights)
+        return decisions, np.full(len(inputs), np.nan)
