@@ -17,7 +17,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.heads import regressed
 from hearthlog.analyzer.training.method import Examples, Method
 from hearthlog.analyzer.workers import single_thread
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind, Machine
+from hearthlog.models.classifiers import ClassifierKind, Machine
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.models.classifiers.rbf_machines import (
     RBF_LANDMARKS,

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.models.classes import UNKNOWN
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers import ClassifierKind
 from hearthlog.models.classifiers.evidence import EmbeddingHeads, mixed
 from hearthlog.models.classifiers.model import Description, Model
 from hearthlog.models.classifiers.network_names import (

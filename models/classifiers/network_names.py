@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from hearthlog.models.classes import CLASS_NAME, SILENCE
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind
+from hearthlog.models.classifiers import ClassifierKind
 from hearthlog.models.classifiers.model import (
     FORMAT,
     MOST_CLASSES,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.models.classifiers.classifier_kind import ClassifierKind, target_problem
+from hearthlog.models.classifiers import ClassifierKind, target_problem
 from hearthlog.models.classifiers.model import Array, Model
 from hearthlog.schemas.arrays import Float32, Float64
 

@@ -41,8 +41,8 @@ from hearthlog.analyzer.training.method import Examples, Method, prepare
 from hearthlog.analyzer.training.scores import Scores, calibration_error, difference, score
 from hearthlog.analyzer.training.train import MOST_FOLDS, method_named
 from hearthlog.analyzer.training.window_methods import ROOM
+from hearthlog.models.classifiers import Machine
 from hearthlog.models.classifiers.classifier import classifier_kind
-from hearthlog.models.classifiers.classifier_kind import Machine
 from hearthlog.models.classifiers.model import Description, Model
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.errors import ignore_progress

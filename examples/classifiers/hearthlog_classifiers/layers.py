@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.models.classifiers.classifier_kind import (
+from hearthlog.models.classifiers import (
     LEARNED,
     ClassifierKind,
     NoParameters,
@@ -34,7 +34,7 @@ class LayersKind(ClassifierKind):
         Of hidden units; of scaled inputs, with shape (width, C), where there are none.
     output_bias : [shape=(C,)], float64
     learned_inputs, learned_target : optional
-        As of `hearthlog.models.classifiers.classifier_kind`.
+        As of `hearthlog.models.classifiers`.
     """
 
     name = "layers"

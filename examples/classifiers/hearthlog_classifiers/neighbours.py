@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from hearthlog.models.classifiers.classifier_kind import (
+from hearthlog.models.classifiers import (
     LEARNED,
     ClassifierKind,
     learned_shapes,
@@ -54,7 +54,7 @@ class NeighboursKind(ClassifierKind):
     vectors_target : [shape=(n,)], int64
         Their classes.
     learned_inputs, learned_target : optional
-        As of `hearthlog.models.classifiers.classifier_kind`, of a model that was adapted: those
+        As of `hearthlog.models.classifiers`, of a model that was adapted: those
         before it was.
     """
 

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from hearthlog.models.batch_invariant import aligned, rowwise_matmul
-from hearthlog.models.classifiers.classifier_kind import (
+from hearthlog.models.classifiers import (
     LEARNED,
     ClassifierKind,
     learned_shapes,
@@ -57,7 +57,7 @@ class OneClassKind(ClassifierKind):
     offsets : [shape=(C,)], float64
         What the weighted kernels must be above where a window is of the class.
     learned_inputs, learned_target : optional
-        As of `hearthlog.models.classifiers.classifier_kind`.
+        As of `hearthlog.models.classifiers`.
     """
 
     name = "one-class"

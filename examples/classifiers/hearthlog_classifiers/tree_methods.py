@@ -13,7 +13,7 @@ from sklearn.ensemble import (
 )
 
 from hearthlog.analyzer.training.window_methods import WindowMethod, as_room, balanced
-from hearthlog.models.classifiers.classifier_kind import Machine
+from hearthlog.models.classifiers import Machine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog_classifiers.trees import TREES, TreesMachine
 

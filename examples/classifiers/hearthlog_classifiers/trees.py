@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from hearthlog.models.classifiers.classifier_kind import (
+from hearthlog.models.classifiers import (
     LEARNED,
     ClassifierKind,
     NoParameters,
@@ -40,7 +40,7 @@ class TreesKind(ClassifierKind):
     importances : [shape=(width,)], float64
         How much each input decides, as scikit-learn's `feature_importances_`.
     learned_inputs, learned_target : optional
-        As of `hearthlog.models.classifiers.classifier_kind`.
+        As of `hearthlog.models.classifiers`.
     """
 
     name = "trees"

@@ -14,7 +14,7 @@ from hearthlog.analyzer.training.window_methods import (
     rounded_to_steps,
     scaler_arrays,
 )
-from hearthlog.models.classifiers.classifier_kind import Machine
+from hearthlog.models.classifiers import Machine
 from hearthlog.schemas.arrays import Float32, Float64, Indices
 from hearthlog_classifiers.neighbours import (
     NEIGHBOURS,

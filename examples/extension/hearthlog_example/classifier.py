@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from hearthlog.models.classifiers.classifier_kind import (
+from hearthlog.models.classifiers import (
     LEARNED,
     ClassifierKind,
     learned_shapes,
