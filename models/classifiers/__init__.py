@@ -1,4 +1,4 @@
-"""A kind of classifier: its arrays, their validation, and inference."""
+"""Classifiers: what a kind of classifier is, its arrays, their validation, and inference."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping

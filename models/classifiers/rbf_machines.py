@@ -485,7 +485,11 @@ def all_landmarks(arrays: Mapping[str, Array]) -> Float32:
 
 
 class LandmarksMachine:
-    """Inference of one model."""
+    """Kernel logistic regression on landmarks: a linear head on a kernel map of the inputs.
+
+    The map is from Williams and Seeger, "Using the Nyström method to speed up kernel machines",
+    2001: kernels of a window with some hundreds of points chosen from the training data.
+    """
 
     def __init__(self, arrays: Mapping[str, Array], parameters: LandmarkParameters) -> None:
         self._scaled = Scaler(arrays)
