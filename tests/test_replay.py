@@ -53,7 +53,7 @@ from hearthlog.schemas.messages.message_types import (
     time_message,
 )
 from hearthlog.schemas.messages.topics import Topic, topics_of
-from hearthlog.tools.cli.replay import replay as verb
+from hearthlog.tools.cli.relabel import replay as verb
 
 SECOND = 1_000_000_000
 START = 1_772_350_200 * SECOND  # half past seven

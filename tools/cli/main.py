@@ -67,6 +67,7 @@ _MODULES = {  # subcommands that share a module
     "enrol": "annotate",
     "manifest": "train",
     "recover": "doctor",
+    "replay": "relabel",
     "report": "events",
     "voices": "discover",
 }
