@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from importlib.metadata import entry_points
 from typing import Generic, Protocol, TypeVar
 
-from hearthlog.models.errors import ModelError
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError, ModelError
 
 _OF_EXAMPLES = {  # extensions in `examples` of a clone of hearthlog, by distribution
     "hearthlog-classifiers": (

@@ -28,7 +28,6 @@ from hearthlog.models.classifiers.model import (
     read_description,
 )
 from hearthlog.models.classifiers.network_names import AUDIOSET, KEY, audioset_file
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.starter import (
@@ -40,7 +39,7 @@ from hearthlog.models.starter import (
     with_network,
 )
 from hearthlog.schemas.arrays import damage, read_sealed, write_sealed
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, ModelError
 from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.writer import Attachment

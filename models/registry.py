@@ -14,10 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import AUDIOSET, is_by_names
-from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import SUFFIX, load_model
 from hearthlog.models.starter import GENERAL, STARTERS, starter_file, with_network
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, ModelError
 from hearthlog.schemas.new_files import (
     locked_folder,
     private_folder,

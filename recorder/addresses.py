@@ -4,7 +4,7 @@ import re
 from typing import NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
-from hearthlog.recorder.errors import SourceError
+from hearthlog.schemas.errors import SourceError
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _SCHEMES = ("rtsp", "http", "https")

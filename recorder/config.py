@@ -19,7 +19,6 @@ from pydantic import (
 
 from hearthlog.recorder.addresses import is_address, public_name
 from hearthlog.recorder.config_problems import ENVIRONMENT, Origins, configuration_error, key_lines
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.pause_schedule import (
     PauseSchedule,
     check_quiet_hours,
@@ -30,7 +29,7 @@ from hearthlog.recorder.pause_schedule import (
 )
 from hearthlog.recorder.retention import KeepingRules, Limits, Size, ThinningDays
 from hearthlog.recorder.stream.messages import LOGGED_EVERY
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import ConfigurationError, HearthlogError
 from hearthlog.schemas.files import exposed_secret, read_toml
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.messages.topics import check_microphone_name, check_scenario_name

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel, ValidationError
 
 from hearthlog._version import __version__
-from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.errors import ConfigurationError
 
 ENVIRONMENT = "HEARTHLOG_"
 DEFAULT = "default"

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
-from hearthlog.recorder.errors import ConfigurationError
-from hearthlog.schemas.errors import LogError, shortened
+from hearthlog.schemas.errors import ConfigurationError, LogError, shortened
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.messages.message_types import PAUSED, QUIET_HOURS
 from hearthlog.schemas.new_files import replaced_file

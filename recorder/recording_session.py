@@ -14,7 +14,6 @@ from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.disk_keeper import DiskKeeper
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import (
     LISTENING,
     OK,
@@ -38,6 +37,7 @@ from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.messages import EncodedMessage, diagnostics, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.messages.message_types import ON_PURPOSE
 from hearthlog.schemas.messages.topics import LIVE

@@ -38,7 +38,6 @@ from hearthlog.analyzer.training.train import (
 from hearthlog.analyzer.training.window_methods import BANDS, ROOM, SVM, kept_inputs
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.rbf_machines import HOME_VOTE, home_votes
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import of_segments
 from hearthlog.models.features.auros21 import FeatureExtractor, augmented, bands_of
 from hearthlog.models.features.floor import FloorTracker
@@ -48,7 +47,7 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import HearthlogWarning, ignore_progress
+from hearthlog.schemas.errors import HearthlogWarning, ModelError, ignore_progress
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.home.clips import SHIPPED

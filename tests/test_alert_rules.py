@@ -30,8 +30,8 @@ from hearthlog.analyzer.bridge.alerts.rules import (
 )
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.pause_schedule import quiet_hours
+from hearthlog.schemas.errors import ConfigurationError
 
 VIENNA = ZoneInfo("Europe/Vienna")
 SECOND = 1_000_000_000

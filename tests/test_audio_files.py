@@ -18,7 +18,6 @@ import soundfile
 from logs import features, read
 from spliced import run
 
-from hearthlog.recorder.errors import ConfigurationError, SourceError
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.sources import ffmpeg
 from hearthlog.recorder.sources.audio_files import FileSource, find_audio
@@ -34,6 +33,7 @@ from hearthlog.recorder.sources.file_times import (
     file_time,
 )
 from hearthlog.recorder.sources.open_audio import _mp3_frame, audio_seconds, is_audio
+from hearthlog.schemas.errors import ConfigurationError, SourceError
 from hearthlog.schemas.frames import NANOSECONDS, read_time
 
 pytestmark = pytest.mark.fast

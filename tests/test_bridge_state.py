@@ -19,7 +19,7 @@ from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import iso_time, today
-from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types

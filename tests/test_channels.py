@@ -14,11 +14,11 @@ from hearthlog import classify, extract_features, load_model
 from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import WARNING, Frames, Gap, SourceHealth
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import StreamMixer, read_audio
+from hearthlog.schemas.errors import SourceError
 
 RATE = 16_000
 START = 1_772_348_400_000_000_000

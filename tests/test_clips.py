@@ -33,7 +33,6 @@ from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.registry import insist
 from hearthlog.recorder.config import Settings, load_settings
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
 from hearthlog.recorder.log.clips import ClipFinder, ClipRetention, ClipWriter, KeptSound
@@ -42,6 +41,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.privacy_filter import PRIVATE_LIMIT
 from hearthlog.recorder.stream.privacy_filter import PRIVATE_LIMIT_ELSEWHERE as ELSEWHERE
+from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import audio_path, find_logs, is_layer, log_path
 from hearthlog.schemas.logs.metadata import provenance

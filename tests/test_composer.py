@@ -20,14 +20,13 @@ import soundfile
 from mcap.reader import make_reader
 
 from hearthlog.models.classifiers.model import may_be_shipped
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.starter import starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import HearthlogError, ModelError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary, frame_powers
 from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, Rooms

@@ -28,7 +28,7 @@ from hearthlog.models.starter import BATHROOM, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.config_problems import key_lines
 from hearthlog.recorder.disk_keeper import keep_disk
-from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.errors import ConfigurationError
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from hearthlog.recorder.errors import DeviceError
 from hearthlog.recorder.sources import process
 from hearthlog.recorder.sources.capture import (
     Device,
@@ -17,6 +16,7 @@ from hearthlog.recorder.sources.capture import (
     list_devices,
     usb_place,
 )
+from hearthlog.schemas.errors import DeviceError
 
 pytestmark = pytest.mark.fast
 

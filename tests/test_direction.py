@@ -29,7 +29,6 @@ from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import MicrophoneSettings, Settings, load_settings
-from hearthlog.recorder.errors import ConfigurationError, SourceError
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -40,7 +39,7 @@ from hearthlog.recorder.stream.directions import (
     DirectionFinder,
     array_geometry,
 )
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import ConfigurationError, LogError, SourceError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logs.files import find_logs
 

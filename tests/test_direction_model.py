@@ -45,7 +45,6 @@ from hearthlog.models.classifiers.evidence import (
     sectors_of,
 )
 from hearthlog.models.classifiers.model import FORMAT_OF_DIRECTIONS
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.floor import Floors, FloorTracker
 from hearthlog.models.labels.labeller import Labeller
 from hearthlog.models.modelfile import load_model, model_card, save_model
@@ -55,7 +54,7 @@ from hearthlog.recorder.events import Gap
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, ModelError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer

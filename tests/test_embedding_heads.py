@@ -20,10 +20,10 @@ from hearthlog.models.classifiers.model import (
     EmbeddingMix,
     NamesHead,
 )
-from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.arrays import read_sealed, write_sealed
+from hearthlog.schemas.errors import ModelError
 
 pytestmark = pytest.mark.fast
 

@@ -26,10 +26,9 @@ from hearthlog.models.embedding.networks import (
     synthetic_sounds,
 )
 from hearthlog.models.embedding.projection import WINDOW_FRAMES, Projection, write_projection
-from hearthlog.models.errors import ModelError
 from hearthlog.recorder.labelling import embedder_probe
 from hearthlog.recorder.labelling.embedder_probe import Probe, open_embedder, probe_network
-from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.errors import HearthlogWarning, ModelError
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.tools.cli.models import _tried
 

@@ -41,10 +41,9 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import UNTAUGHT, EmbeddingHeads
 from hearthlog.models.classifiers.model import FORMAT, FORMAT_OF_EMBEDDINGS
 from hearthlog.models.embedding.networks import YAMNET, load_embedder
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import of_segments
 from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.schemas.errors import ignore_progress
+from hearthlog.schemas.errors import ModelError, ignore_progress
 
 HEARING = head_inputs_of("yamnet")
 WIDTH = len(HEARING.names)

@@ -19,10 +19,9 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.recorder_info import features_of, read_recorder_infos
 from hearthlog.analyzer.training.manifest import load_scenario
 from hearthlog.analyzer.training.train import method_named
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, ModelError
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs

@@ -24,7 +24,6 @@ from hearthlog.models.classifiers.network_names import AUDIOSET, without_classes
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.projection import WINDOW_FRAMES, Embeddings, read_projection
 from hearthlog.models.embedding.sound_names import audioset_names, named_sounds
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.names_labeller import NamesLabeller
 from hearthlog.models.modelfile import load_model
@@ -35,6 +34,7 @@ from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch, ReloadRequests
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
+from hearthlog.schemas.errors import ModelError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.topics import EmbeddingSource

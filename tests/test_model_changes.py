@@ -23,7 +23,6 @@ from logs import features, labelled_frames, read
 from spliced import run
 
 from hearthlog.models.classifiers.classifier import Classifier, label_timing
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, model_card
 from hearthlog.models.registry import insist, promote
@@ -35,7 +34,7 @@ from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, ModelError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 

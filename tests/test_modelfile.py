@@ -17,10 +17,9 @@ from hearthlog.analyzer.training.train import train_model
 from hearthlog.analyzer.training.window_methods import ROOM, SVM
 from hearthlog.models.classifiers.classifier import Classifier, LabelTiming, label_timing
 from hearthlog.models.classifiers.model import read_description
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, model_card, save_model
-from hearthlog.schemas.errors import ignore_progress
+from hearthlog.schemas.errors import ModelError, ignore_progress
 
 pytestmark = pytest.mark.fast
 

@@ -30,10 +30,10 @@ from test_capture import (
 from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.recorder.addresses import check_address, public_name
 from hearthlog.recorder.config import MicrophoneSettings
-from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import SourceHealth
 from hearthlog.recorder.sources.capture import ArrivalPace
 from hearthlog.recorder.sources.microphone import MicrophoneSource
+from hearthlog.schemas.errors import DeviceError, SourceError
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds

@@ -19,11 +19,10 @@ from typer.testing import CliRunner
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.recorder_info import features_of, read_recorder_infos
 from hearthlog.analyzer.training.train import method_named
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.schemas.errors import HearthlogError, HearthlogWarning, LogError
+from hearthlog.schemas.errors import HearthlogError, HearthlogWarning, LogError, ModelError
 from hearthlog.schemas.frames import FRAME_SAMPLES
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs

@@ -36,9 +36,8 @@ from hearthlog.analyzer.training.train import method_named, train_model
 from hearthlog.analyzer.training.window_methods import ROOM, balanced, rounded, rounded_to_steps
 from hearthlog.models.classifiers.classifier import Classifier, classifier_kind
 from hearthlog.models.classifiers.rbf_machines import weakest_pairs
-from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.schemas.errors import ignore_progress
+from hearthlog.schemas.errors import ModelError, ignore_progress
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "classifiers"
 sys.path.insert(0, str(EXAMPLE))

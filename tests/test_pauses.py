@@ -19,7 +19,6 @@ from test_capture import wait_for_frames
 from test_model_changes import wait_for
 
 from hearthlog.analyzer.doctor.examination import examine
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.pause_schedule import (
     PauseSchedule,
     pause,
@@ -27,6 +26,7 @@ from hearthlog.recorder.pause_schedule import (
     quiet_hours,
     resume,
 )
+from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.logs.files import find_logs
 
 

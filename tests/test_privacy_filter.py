@@ -17,7 +17,6 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import ERROR, OK, Frames, SourceHealth
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -27,6 +26,7 @@ from hearthlog.recorder.stream.privacy_filter import (
     PRIVATE_LIMIT_ELSEWHERE,
     PrivacyFilter,
 )
+from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import nanoseconds

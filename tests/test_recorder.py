@@ -18,11 +18,11 @@ from waiting import wait_for
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import OK, READING, Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.audio_files import FileSource, long_blocks
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.schemas.errors import SourceError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.metadata import provenance
 from hearthlog.schemas.messages.message_types import DIAGNOSTICS, LABEL, decode, nanoseconds

@@ -13,7 +13,6 @@ import pytest
 from kept import keep_models, put_by_hand
 from spliced import run
 
-from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.models.registry import (
     first_starter,
@@ -25,6 +24,7 @@ from hearthlog.models.registry import (
     target,
 )
 from hearthlog.models.starter import STARTERS
+from hearthlog.schemas.errors import ModelError
 
 
 @pytest.fixture

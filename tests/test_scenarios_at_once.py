@@ -45,7 +45,6 @@ from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder import recording
 from hearthlog.recorder.config import Settings, load_settings
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import Loaded, ModelWatch, ReloadRequests
 from hearthlog.recorder.log.folder_lock import FolderLock
@@ -53,7 +52,7 @@ from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.recording_session import RecordingSession
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.errors import ConfigurationError, HearthlogError, LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs

@@ -22,7 +22,6 @@ from hearthlog.analyzer.training.train import (
 )
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Smoothing
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.segments import Segmenter, SegmenterInput
@@ -38,6 +37,7 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.stream.pipeline import Pipeline
+from hearthlog.schemas.errors import ModelError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.messages.message_types import (

@@ -25,10 +25,9 @@ from hearthlog.analyzer.training.manifest import (
 from hearthlog.analyzer.training.train import calibration_error, group_folds, train_model
 from hearthlog.analyzer.training.window_methods import ROOM
 from hearthlog.models.classifiers.classifier import Classifier
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, model_card
-from hearthlog.schemas.errors import ignore_progress
+from hearthlog.schemas.errors import ModelError, ignore_progress
 from hearthlog.tools.cli.train import print_figures, train
 from hearthlog.tools.home.simulate import write_training_set
 

@@ -5,7 +5,7 @@ from logreader import LogReader
 
 from hearthlog.recorder import pause_schedule
 from hearthlog.recorder.config import load_settings
-from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.errors import ConfigurationError
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ from hearthlog.recorder.config import (
     load_settings,
 )
 from hearthlog.recorder.config_problems import Origins, configuration_error, key_lines
-from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.files import read_toml
 
 

@@ -36,11 +36,10 @@ from hearthlog.analyzer.doctor.records import MessageBatch
 from hearthlog.analyzer.doctor.sections import DataSection
 from hearthlog.models.classifiers.classifier import LabelTiming, label_timing
 from hearthlog.models.classifiers.model import read_description
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.modelfile import CARD, DESCRIPTION, attachment_of
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, ModelError
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import Columns, decode
 from hearthlog.schemas.logs.metadata import (

@@ -40,7 +40,6 @@ from hearthlog.models.classes import COUGHING, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.installed import feature_set
 from hearthlog.recorder.config import load_settings
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 from hearthlog.recorder.recording_session import RecordingSession
@@ -48,7 +47,7 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.open_audio import audio_seconds
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.errors import Progress, SourceError, ignore_progress
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE
 
 Colour = Literal["white", "pink", "brown"]

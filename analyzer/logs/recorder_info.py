@@ -16,12 +16,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from hearthlog.analyzer.logs.clips import CLIP_FIELDS
 from hearthlog.analyzer.logs.selection import array_names, decode_types, is_compatible
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.auros21 import AUROS21
 from hearthlog.models.features.home33 import HOME33
 from hearthlog.models.features.installed import feature_set
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import LogError, ModelError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.contents import Status
 from hearthlog.schemas.logs.files import check_node_name

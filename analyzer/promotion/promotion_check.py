@@ -22,7 +22,6 @@ from hearthlog.analyzer.promotion.paired_labels import class_words, time_words
 from hearthlog.analyzer.promotion.recent_time import RecentLog, recent_logs
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.registry import (
     CHAMPION,
@@ -33,7 +32,7 @@ from hearthlog.models.registry import (
     write_judgement,
 )
 from hearthlog.schemas.arrays import Float64
-from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.errors import LogError, ModelError, Progress, ignore_progress
 
 LEAST_MINUTES = 10.0  # minimum sound for a decision
 _SILENCE_FALLS = 0.10  # of the time

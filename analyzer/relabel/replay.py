@@ -12,12 +12,11 @@ from hearthlog.analyzer.logs.recorder_info import RecorderInfo, read_recorder_in
 from hearthlog.analyzer.relabel.player import Player, Replay, ReplayOptions
 from hearthlog.analyzer.relabel.recorded import read_recorded
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import SUFFIX, load_model
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.sources.framing import FrameCutter
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.errors import LogError, Progress, ignore_progress, listed
+from hearthlog.schemas.errors import LogError, ModelError, Progress, ignore_progress, listed
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.merged_reading import time_spans
 from hearthlog.schemas.messages.topics import topic

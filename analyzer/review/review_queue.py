@@ -32,9 +32,8 @@ from hearthlog.analyzer.review.review_list import (
 )
 from hearthlog.models.classes import in_words
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.errors import ModelError
 from hearthlog.models.registry import DEFAULT_FOLDER, load
-from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.errors import ModelError, Progress, ignore_progress
 from hearthlog.schemas.messages.topics import is_review, scenario_name
 
 

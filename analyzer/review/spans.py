@@ -18,14 +18,13 @@ from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
 from hearthlog.analyzer.logs.spans import Spans, overlay, ranges, remains
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import FeatureSet, Inputs, WindowStatistics
 from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.registry import find_model
 from hearthlog.schemas.arrays import Bool, Float64, Int64
-from hearthlog.schemas.errors import LogError, Progress, ignore_progress
+from hearthlog.schemas.errors import LogError, ModelError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages.topics import EmbeddingSpace, topic

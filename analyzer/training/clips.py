@@ -13,15 +13,13 @@ from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding.networks import find_network, load_embedder
 from hearthlog.models.embedding.projection import WINDOW_FRAMES, Int8
 from hearthlog.models.embedding.stream import SteadyNoise
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.infrasound import InfrasoundFilter
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.framing import FrameCutter
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices
-from hearthlog.schemas.errors import HearthlogWarning
+from hearthlog.schemas.errors import HearthlogWarning, ModelError, SourceError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource
 

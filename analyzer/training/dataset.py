@@ -31,9 +31,8 @@ from hearthlog.models.embedding.projection import Int8
 from hearthlog.models.features import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.recorder.errors import SourceError
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
-from hearthlog.schemas.errors import Progress
+from hearthlog.schemas.errors import Progress, SourceError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS
 
 HOP_FRAMES = 10

@@ -19,9 +19,8 @@ from pydantic import (
 )
 
 from hearthlog.models.classes import CLASS_NAME
-from hearthlog.models.errors import ModelError
 from hearthlog.schemas.arrays import Float32, Float64, Int32, Int64
-from hearthlog.schemas.errors import printable
+from hearthlog.schemas.errors import ModelError, printable
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.schemas.logs.metadata import update_advice
 from hearthlog.schemas.messages.topics import EmbeddingSpace

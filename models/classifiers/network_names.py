@@ -34,10 +34,10 @@ from hearthlog.models.embedding.projection import (
     read_projection,
 )
 from hearthlog.models.embedding.sound_names import RELEASE, SoundName, audioset_names
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.arrays import Float32, Float64, write_sealed
+from hearthlog.schemas.errors import ModelError
 from hearthlog.schemas.frames import FRAME_SECONDS
 
 BY_NAMES: Final = "names"

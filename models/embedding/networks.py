@@ -21,10 +21,9 @@ from hearthlog.models.embedding.session import (
     OnnxSession,
     TfliteSession,
 )
-from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.errors import HearthlogWarning, printable
+from hearthlog.schemas.errors import HearthlogWarning, ModelError, printable
 from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import SAMPLE_RATE
 from hearthlog.schemas.messages.topics import EmbeddingSource

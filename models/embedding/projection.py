@@ -13,7 +13,6 @@ import safetensors
 from numpy.typing import NDArray
 
 from hearthlog.models.embedding.session import NetworkOutput
-from hearthlog.models.errors import ModelError
 from hearthlog.schemas.arrays import (
     Bool,
     Float32,
@@ -23,6 +22,7 @@ from hearthlog.schemas.arrays import (
     read_sealed,
     write_sealed,
 )
+from hearthlog.schemas.errors import ModelError
 from hearthlog.schemas.files import read_limited
 
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from hearthlog.models.errors import ModelError
 from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.errors import ModelError
 
 # Field numbers of the tables in the TFLite schema.
 _SUBGRAPHS, _TENSORS, _OUTPUTS, _OPERATORS = 2, 0, 2, 3

@@ -1,7 +1,6 @@
 """Lookup of installed feature sets."""
 
 from hearthlog.models.embedding.networks import network_folders
-from hearthlog.models.errors import ModelError
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.auros21 import AUROS21
@@ -11,6 +10,7 @@ from hearthlog.models.features.network import (
     has_card,
     network_features,
 )
+from hearthlog.schemas.errors import ModelError
 from hearthlog.schemas.logs.metadata import feature_entries
 
 DEFAULT = HOME33

@@ -18,10 +18,9 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from hearthlog.models.embedding.networks import network_folders
 from hearthlog.models.embedding.session import OnnxModel
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import FeatureSet
 from hearthlog.schemas.arrays import Float32, Float64
-from hearthlog.schemas.errors import HearthlogWarning, printable
+from hearthlog.schemas.errors import HearthlogWarning, ModelError, printable
 from hearthlog.schemas.files import read_limited, read_toml
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 

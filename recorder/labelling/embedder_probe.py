@@ -24,9 +24,8 @@ from hearthlog.models.embedding.networks import (
     missing_modules,
 )
 from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
-from hearthlog.models.errors import ModelError
 from hearthlog.recorder.host import memory, module_command
-from hearthlog.schemas.errors import printable
+from hearthlog.schemas.errors import ModelError, printable
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 NO_NETWORK = "none"  # instead of a network's name

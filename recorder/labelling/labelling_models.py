@@ -9,13 +9,11 @@ from hearthlog.models.classes import OF_EVERY_SCENARIO, class_name
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import is_by_names, without_classes
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT, feature_set
 from hearthlog.models.modelfile import SUFFIX
 from hearthlog.models.registry import DEFAULT_FOLDER
 from hearthlog.recorder.config import NO_MODEL, Settings
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.host import announce
 from hearthlog.recorder.labelling.model_watch import (
     CandidateWatch,
@@ -23,6 +21,7 @@ from hearthlog.recorder.labelling.model_watch import (
     ModelWatch,
     ReloadRequests,
 )
+from hearthlog.schemas.errors import ConfigurationError, ModelError
 from hearthlog.schemas.messages.topics import CANDIDATE, LIVE, scenario_labelling, spelt
 
 

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.errors import ModelError
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.modelfile import SUFFIX, load_model, name_and_digest, starter_for
 from hearthlog.models.registry import (
@@ -26,6 +25,7 @@ from hearthlog.models.registry import (
 )
 from hearthlog.models.starter import GENERAL, STARTERS
 from hearthlog.recorder.host import announce, give_back
+from hearthlog.schemas.errors import ModelError
 
 LOOK_SECONDS = 1.0
 

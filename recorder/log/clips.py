@@ -13,7 +13,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.config import Keep, Settings
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import OK, WARNING, Event, Frames, Gap, Notice, event_time
 from hearthlog.recorder.pause_schedule import time_zone
 from hearthlog.recorder.retention import recorded_days, start_of, walk
@@ -25,7 +24,7 @@ from hearthlog.recorder.stream.privacy_filter import (
     PrivateFrames,
 )
 from hearthlog.schemas.arrays import Bool, Float32, Int16, Int64
-from hearthlog.schemas.errors import LogError
+from hearthlog.schemas.errors import ConfigurationError, LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.files import AUDIO_LAYER, AUDIO_SUFFIX, audio_path, log_name
 from hearthlog.schemas.logs.metadata import provenance

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import (
     OK,
     READING,
@@ -26,7 +25,7 @@ from hearthlog.recorder.sources.file_times import FileTime
 from hearthlog.recorder.sources.framing import check_times, frames_of
 from hearthlog.recorder.sources.open_audio import audio_seconds, is_audio
 from hearthlog.schemas.arrays import Float32
-from hearthlog.schemas.errors import Progress, ignore_progress
+from hearthlog.schemas.errors import Progress, SourceError, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 
 _REALTIME_FRAMES = 10

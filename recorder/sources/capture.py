@@ -21,7 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from hearthlog.recorder.errors import DeviceError, SourceError
+from hearthlog.schemas.errors import DeviceError, SourceError
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _WINDOW_SAMPLES = 30 * SAMPLE_RATE  # longer than a recoverable stall of the network

@@ -14,9 +14,9 @@ import numpy as np
 import soxr
 from numpy.typing import NDArray
 
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.open_audio import BLOCK_SECONDS, RATES, open_audio
 from hearthlog.schemas.arrays import Bool, Float32, Float64
+from hearthlog.schemas.errors import SourceError
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _BLOCK_SECONDS = 10

@@ -26,8 +26,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from hearthlog.recorder.addresses import public_name
-from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.sources.capture import BLOCK, BLOCK_SECONDS, ArrivalPace, CaptureFormat
+from hearthlog.schemas.errors import DeviceError, SourceError
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _ANSWER_SECONDS = 10

@@ -9,8 +9,8 @@ from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from hearthlog.recorder.errors import ConfigurationError, SourceError
 from hearthlog.recorder.sources.open_audio import audio_seconds, text_fields
+from hearthlog.schemas.errors import ConfigurationError, SourceError
 from hearthlog.schemas.frames import NANOSECONDS, millisecond_text, read_time
 
 NAME, METADATA, GUESS = "its name", "its metadata", "a guess"

@@ -9,9 +9,9 @@ import numpy as np
 import soxr
 from numpy.typing import NDArray
 
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.schemas.arrays import Float32, Float64, Int64
+from hearthlog.schemas.errors import SourceError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.messages.message_types import CLOCK_SET
 

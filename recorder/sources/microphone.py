@@ -12,7 +12,6 @@ import numpy as np
 from hearthlog.models.features.floor import decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.recorder.addresses import check_address, is_address, is_topic, public_name
-from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.events import (
     ERROR,
     LISTENING,
@@ -38,6 +37,7 @@ from hearthlog.recorder.sources.process import (
 )
 from hearthlog.recorder.stream.sound_watch import DEAD_STEPS
 from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.errors import DeviceError, SourceError
 from hearthlog.schemas.frames import NANOSECONDS
 
 _FIRST_BLOCK_SECONDS = 5.0  # PulseAudio wakes a sleeping source

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import soundfile
 
-from hearthlog.recorder.errors import SourceError
 from hearthlog.schemas.arrays import Float32
+from hearthlog.schemas.errors import SourceError
 
 if TYPE_CHECKING:
     from hearthlog.recorder.sources.ffmpeg import FileDecoder

@@ -16,10 +16,10 @@ from threading import Lock, Thread
 import numpy as np
 
 from hearthlog.recorder.addresses import is_topic
-from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.host import module_command
 from hearthlog.recorder.sources.capture import BLOCK, LATENCY_SECONDS, CaptureFormat, Device
 from hearthlog.recorder.sources.framing import SampleBlock
+from hearthlog.schemas.errors import DeviceError, SourceError
 
 _CAPTURE = module_command("hearthlog.recorder.sources.capture")
 _NETWORK_CAPTURE = module_command("hearthlog.recorder.sources.ffmpeg")

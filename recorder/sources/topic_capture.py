@@ -17,8 +17,8 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 from hearthlog.recorder.addresses import TopicAddress, read_topic
-from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.sources.capture import BLOCK, BLOCK_SECONDS, ArrivalPace, CaptureFormat
+from hearthlog.schemas.errors import DeviceError, SourceError
 from hearthlog.schemas.frames import SAMPLE_RATE
 
 _FIND_SECONDS = 15.0  # timeout for a publisher and for sound

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, NOWHERE, Directions
 from hearthlog.models.features.floor import FloorTracker
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.events import Frames
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int64
+from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
 
 SPEED_OF_SOUND = 343.0  # m/s, in air of 20 °C

@@ -20,11 +20,10 @@ import numpy as np
 from rich.cells import cell_len, set_cell_size
 
 from hearthlog.models.classes import in_words
-from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.host import lines_to
 from hearthlog.recorder.pause_schedule import time_zone
 from hearthlog.recorder.sources.process import open_device
-from hearthlog.schemas.errors import printable, shortened
+from hearthlog.schemas.errors import DeviceError, SourceError, printable, shortened
 from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.tools.cli.terminal import long_bar
 

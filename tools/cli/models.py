@@ -84,7 +84,7 @@ def fetch(
 def _download(network: "EmbeddingNetwork", path: Path) -> None:
     """Download a network unless present."""
     from hearthlog.models.embedding.networks import read_network_file
-    from hearthlog.models.errors import ModelError
+    from hearthlog.schemas.errors import ModelError
     from hearthlog.tools.download import DownloadError, download
 
     with suppress(ModelError):
@@ -106,8 +106,8 @@ def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
     """Test a network as a recorder would use it; return the problems."""
     from hearthlog.analyzer.errors import missing
     from hearthlog.models.embedding.networks import missing_modules
-    from hearthlog.models.errors import ModelError
     from hearthlog.recorder.labelling.embedder_probe import check_pace, probe_network
+    from hearthlog.schemas.errors import ModelError
 
     if absent := missing_modules(network.suffix):
         return [missing(*absent)]
@@ -128,7 +128,7 @@ def _tried(network: "EmbeddingNetwork", path: Path) -> list[str]:
 
 def _list() -> None:
     from hearthlog.models.embedding.networks import NETWORKS, find_network
-    from hearthlog.models.errors import ModelError
+    from hearthlog.schemas.errors import ModelError
 
     problems = []
     for name in NETWORKS.names():
@@ -323,9 +323,9 @@ def rollback(folder: _Folder = None) -> None:
 def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) -> None:
     """Raise ModelError if a model was judged harmful; judge a model without a verdict first."""
     from hearthlog.analyzer.promotion.promotion_check import judge, judged_against
-    from hearthlog.models.errors import ModelError
     from hearthlog.models.registry import first_starter, insist, is_starter, load
     from hearthlog.models.starter import BY_FEATURES, with_network
+    from hearthlog.schemas.errors import ModelError
     from hearthlog.tools.cli.promotion import print_verdict, refusal
 
     model, first = load(folder, name), first_starter(folder)
@@ -351,8 +351,8 @@ def _starter_here(folder: Path, name: str) -> str:
 
     A starter promoted before a network was installed is in the folder, too.
     """
-    from hearthlog.models.errors import ModelError
     from hearthlog.models.registry import is_starter, load
+    from hearthlog.schemas.errors import ModelError
 
     other = str(starter_here(Path(name)))
     if other == name:
@@ -366,8 +366,8 @@ def _starter_here(folder: Path, name: str) -> str:
 
 def _check_against_champion(folder: Path, name: str) -> None:
     """Raise ModelError if a candidate's feature set differs from that of an existing champion."""
-    from hearthlog.models.errors import ModelError
     from hearthlog.models.registry import CHAMPION, load
+    from hearthlog.schemas.errors import ModelError
 
     model = load(folder, name)
     try:

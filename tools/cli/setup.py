@@ -169,7 +169,7 @@ def _check_disk(questions: Questions) -> None:
 
 def _text(questions: Questions, answers: "Answers") -> str:
     from hearthlog.recorder.addresses import public_name
-    from hearthlog.recorder.errors import ConfigurationError
+    from hearthlog.schemas.errors import ConfigurationError
     from hearthlog.tools.service.configuration_file import configuration_text
 
     devices, rooms = zip(*answers.microphones, strict=True)
@@ -255,7 +255,7 @@ def _carry_out(installation: Installation, answers: "Answers", text: str) -> boo
 
 
 def _check_configuration(installation: Installation, answers: "Answers") -> None:
-    from hearthlog.recorder.errors import ConfigurationError
+    from hearthlog.schemas.errors import ConfigurationError
     from hearthlog.tools.cli.recorder import findings
     from hearthlog.tools.service import unit
 

@@ -321,8 +321,8 @@ def _checked(option: str, text: str, check: Callable[[str], _Value]) -> _Value:
 
 def _found(devices: "list[Device]", name: str) -> "Device":
     """Find a device; the error for a missing one names what uses the microphones."""
-    from hearthlog.recorder.errors import DeviceError
     from hearthlog.recorder.sources.capture import closed_card, find_device
+    from hearthlog.schemas.errors import DeviceError
     from hearthlog.tools.cli.live_display import users_of_microphones
 
     try:

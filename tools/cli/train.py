@@ -183,7 +183,7 @@ def _print_json(
 
 def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
     from hearthlog.analyzer.promotion.promotion_check import judge
-    from hearthlog.models.errors import ModelError
+    from hearthlog.schemas.errors import ModelError
 
     try:
         with share_done("comparing it with the current model", announce=True) as report:

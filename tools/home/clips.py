@@ -24,10 +24,10 @@ from hearthlog.models.classes import (
     TAP_WATER,
     YELLING,
 )
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.recorder.sources.open_audio import audio_seconds
 from hearthlog.schemas.arrays import Float32, Float64
+from hearthlog.schemas.errors import SourceError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.sounds import SimulationError, dry_sound, generator
 

@@ -31,10 +31,9 @@ from tomlkit.exceptions import TOMLKitError
 
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.recorder.config_problems import Origins, configuration_error
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.host import module_command
 from hearthlog.recorder.pause_schedule import machine_zone
-from hearthlog.schemas.errors import HearthlogError, printable
+from hearthlog.schemas.errors import ConfigurationError, HearthlogError, printable
 from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.logs.files import check_node_name
 from hearthlog.schemas.messages.topics import check_microphone_name

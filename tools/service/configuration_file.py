@@ -15,7 +15,7 @@ from tomlkit.items import AoT
 
 from hearthlog.recorder.addresses import public_name
 from hearthlog.recorder.config import load_settings
-from hearthlog.recorder.errors import ConfigurationError
+from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.new_files import make_folders, replaced_file
 
 PAGE_PORT = 8380

@@ -15,9 +15,8 @@ from pathlib import Path
 
 from hearthlog.recorder.addresses import is_address
 from hearthlog.recorder.config import Settings, load_settings
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.recording import recording_problems
-from hearthlog.schemas.errors import HearthlogError, LogError
+from hearthlog.schemas.errors import ConfigurationError, HearthlogError, LogError
 from hearthlog.tools.service.unit import STATE, Needs
 
 

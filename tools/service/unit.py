@@ -18,9 +18,8 @@ from typing import Any
 
 import hearthlog.recorder
 from hearthlog.analyzer.bridge.settings import BridgeSettings, load_bridge_settings
-from hearthlog.recorder.errors import ConfigurationError
 from hearthlog.recorder.host import module_command
-from hearthlog.schemas.errors import HearthlogError
+from hearthlog.schemas.errors import ConfigurationError, HearthlogError
 
 
 class ServiceError(HearthlogError):

@@ -21,13 +21,12 @@ from hearthlog.analyzer.bridge.alerts.rules import (
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
 from hearthlog.models.classifiers.network_names import AUDIOSET
 from hearthlog.models.embedding.sound_names import audioset_names
-from hearthlog.models.errors import ModelError
 from hearthlog.models.modelfile import SUFFIX, load_model, starter_for
 from hearthlog.models.registry import DEFAULT_FOLDER, DEFAULT_MODEL, list_models
 from hearthlog.models.starter import GENERAL
 from hearthlog.recorder.config import NO_MODEL, Settings
 from hearthlog.recorder.labelling.embedder_probe import likely_network
-from hearthlog.schemas.errors import listed
+from hearthlog.schemas.errors import ModelError, listed
 
 
 def unknown_class(rule: AlertRule, classes: Mapping[str, Collection[str]]) -> str:

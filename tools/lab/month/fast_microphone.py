@@ -6,10 +6,10 @@ from typing import Protocol
 
 import numpy as np
 
-from hearthlog.recorder.errors import DeviceError, SourceError
 from hearthlog.recorder.sources.capture import BLOCK_SECONDS, CaptureFormat
 from hearthlog.recorder.sources.framing import SampleBlock
 from hearthlog.schemas.arrays import Int16
+from hearthlog.schemas.errors import DeviceError, SourceError
 from hearthlog.schemas.frames import NANOSECONDS, SAMPLE_RATE
 from hearthlog.tools.lab.month.faults import Fault, Kind
 from hearthlog.tools.lab.month.shared_state import SharedState

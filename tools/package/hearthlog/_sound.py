@@ -15,9 +15,9 @@ from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.features.installed import feature_set as installed
 from hearthlog.models.labels.labeller import Labeller
-from hearthlog.recorder.errors import SourceError
 from hearthlog.recorder.sources.decoding import convert_sound
 from hearthlog.schemas.arrays import Float32, Int64
+from hearthlog.schemas.errors import SourceError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 
 __all__ = [
