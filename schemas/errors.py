@@ -42,6 +42,28 @@ class LogError(HearthlogError):
     """Log or folder of logs that cannot be read or written."""
 
 
+class ModelError(HearthlogError):
+    """A model file is missing, damaged, or incompatible."""
+
+
+class SourceError(HearthlogError):
+    """An unreadable audio file, or a microphone that cannot be opened."""
+
+
+class ConfigurationError(HearthlogError):
+    """An unknown, invalid or contradictory configuration."""
+
+    status = 2
+
+    def __init__(self, *lines: str) -> None:
+        super().__init__("; ".join(lines))
+        self.lines = lines
+
+
+class DeviceError(SourceError):
+    """A missing microphone, or one that cannot be opened now."""
+
+
 class HearthlogWarning(UserWarning):
     """Partially read data; the command line prints a line, and exits with 3.
 
@@ -66,25 +88,3 @@ Progress = Callable[[float], None]  # called with the completed share, from 0 to
 
 def ignore_progress(_share: float) -> None:
     """Ignore a progress report of a share, 0 to 1."""
-
-
-class ModelError(HearthlogError):
-    """A model file is missing, damaged, or incompatible."""
-
-
-class SourceError(HearthlogError):
-    """An unreadable audio file, or a microphone that cannot be opened."""
-
-
-class ConfigurationError(HearthlogError):
-    """An unknown, invalid or contradictory configuration."""
-
-    status = 2
-
-    def __init__(self, *lines: str) -> None:
-        super().__init__("; ".join(lines))
-        self.lines = lines
-
-
-class DeviceError(SourceError):
-    """A missing microphone, or one that cannot be opened now."""
