@@ -20,8 +20,8 @@ from hearthlog.schemas.messages.fields import missing_fields
 from hearthlog.schemas.messages.message_types import GAP, definition, type_hash
 from hearthlog.schemas.messages.topics import LIVE, Quality, parse_topic, topic
 from hearthlog.schemas.messages.type_definitions import message_type
+from hearthlog.schemas.salvage import Salvage
 from hearthlog.schemas.salvage.intact_records import IntactChunk
-from hearthlog.schemas.salvage.salvage import Salvage
 
 _FEATURES, _LABEL, _GAP, _INFO = "features", "label", "gap", "info"
 _STAMP = "header.stamp"

@@ -44,6 +44,7 @@ from hearthlog.schemas.new_files import (
     sync_file,
     sync_folder,
 )
+from hearthlog.schemas.salvage import Piece, Salvage
 from hearthlog.schemas.salvage.damage import Damage
 from hearthlog.schemas.salvage.intact_records import (
     IntactAttachment,
@@ -54,7 +55,6 @@ from hearthlog.schemas.salvage.intact_records import (
     encode_attachment,
 )
 from hearthlog.schemas.salvage.lost_frames import FrameSearch, LostFrames, gap_channel
-from hearthlog.schemas.salvage.salvage import Piece, Salvage
 
 
 @dataclass

@@ -21,8 +21,8 @@ from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import rows_by_layout
 from hearthlog.schemas.messages.topics import is_review, parse_topic
 from hearthlog.schemas.messages.type_definitions import MessageType, message_type
+from hearthlog.schemas.salvage import Salvage
 from hearthlog.schemas.salvage.intact_records import IntactAttachment, IntactChunk
-from hearthlog.schemas.salvage.salvage import Salvage
 
 _TIME = "builtin_interfaces/msg/Time"
 _SPAN = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])  # of a stamp, and of a duration
