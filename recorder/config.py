@@ -28,7 +28,7 @@ from hearthlog.recorder.pause_schedule import (
     time_zone,
 )
 from hearthlog.recorder.retention import KeepingRules, Limits, Size, ThinningDays
-from hearthlog.recorder.stream.messages import LOGGED_EVERY
+from hearthlog.recorder.stream import LOGGED_EVERY
 from hearthlog.schemas.errors import ConfigurationError, HearthlogError
 from hearthlog.schemas.files import exposed_secret, read_toml
 from hearthlog.schemas.logs.files import check_node_name

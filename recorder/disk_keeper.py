@@ -30,7 +30,7 @@ from hearthlog.recorder.retention import (
     recorded_logs,
     size_text,
 )
-from hearthlog.recorder.stream.messages import EncodedMessage, diagnostics, notice_line
+from hearthlog.recorder.stream import EncodedMessage, diagnostics, notice_line
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.new_files import (

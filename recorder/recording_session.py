@@ -35,7 +35,7 @@ from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.recovery import LogFinisher, Recovered
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.recorder.stream.messages import EncodedMessage, diagnostics, stream_info
+from hearthlog.recorder.stream import EncodedMessage, diagnostics, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import ConfigurationError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS

@@ -50,7 +50,7 @@ from hearthlog.recorder.log.recovery import recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
-from hearthlog.recorder.stream.messages import stream_info
+from hearthlog.recorder.stream import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, review_path

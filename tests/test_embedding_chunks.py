@@ -15,7 +15,7 @@ from hearthlog.recorder.events import Frames
 from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.recovery import LogFinisher, finish_log
 from hearthlog.recorder.log.rolling_log import RollingLog
-from hearthlog.recorder.stream.messages import stream_info
+from hearthlog.recorder.stream import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns

@@ -27,7 +27,7 @@ from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.recovery import LogFinisher, finish_log, recover_active
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
-from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
+from hearthlog.recorder.stream import EncodedMessage, stream_info
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.schemas.logs.metadata import ROSBAG2_METADATA

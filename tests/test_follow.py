@@ -15,7 +15,7 @@ from conftest import HEARTHLOG
 from logs import features
 
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.recorder.stream.messages import stream_info
+from hearthlog.recorder.stream import stream_info
 from hearthlog.schemas import files
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import read_time

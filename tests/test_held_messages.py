@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from hearthlog.recorder.log.description import LogDescription
 from hearthlog.recorder.log.rolling_log import HeldMessages
-from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.stream import EncodedMessage
 
 MESSAGES = st.builds(
     EncodedMessage,

@@ -15,7 +15,7 @@ from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.log.description import LogDescription, describe_log
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.recording import record
-from hearthlog.recorder.stream.messages import stream_info
+from hearthlog.recorder.stream import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs

@@ -8,7 +8,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.sources.decoding import read_audio
-from hearthlog.recorder.stream.messages import gap_line, opening_messages
+from hearthlog.recorder.stream import gap_line, opening_messages
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
 from hearthlog.schemas.messages.message_types import (

@@ -19,7 +19,7 @@ from hearthlog.recorder.events import Frames, Gap, SourceHealth
 from hearthlog.recorder.labelling.labelling_models import class_conflict, shared_classes
 from hearthlog.recorder.log.description import LogDescription, with_scenarios
 from hearthlog.recorder.log.rolling_log import RollingLog
-from hearthlog.recorder.stream.messages import LOGGED_EVERY, EncodedMessage, stream_info
+from hearthlog.recorder.stream import LOGGED_EVERY, EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, NANOSECONDS

@@ -19,7 +19,7 @@ from hearthlog.analyzer.logs.sound_vectors import (
 from hearthlog.models.classifiers.evidence import NO_AUXILIARY, NOWHERE, Auxiliary, Directions
 from hearthlog.models.embedding.projection import NO_EMBEDDINGS, Embeddings
 from hearthlog.recorder.events import Gap, SourceHealth
-from hearthlog.recorder.stream.messages import EncodedMessage
+from hearthlog.recorder.stream import EncodedMessage
 from hearthlog.schemas.arrays import Bytes, Float32, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import Columns, decode

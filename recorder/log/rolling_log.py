@@ -17,7 +17,7 @@ from hearthlog.recorder.host import give_back
 from hearthlog.recorder.log.description import LogDescription
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.log.recovery import LogFinisher, active_logs
-from hearthlog.recorder.stream.messages import EncodedMessage, opening_messages
+from hearthlog.recorder.stream import EncodedMessage, opening_messages
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import free_log_path, log_path

@@ -24,7 +24,7 @@ from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.recorder.events import OK, READING, WARNING, Event, Frames, Gap, Notice, SourceHealth
-from hearthlog.recorder.stream.messages import (
+from hearthlog.recorder.stream import (
     LOGGED_EVERY,
     EncodedMessage,
     diagnostics,

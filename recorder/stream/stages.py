@@ -13,7 +13,7 @@ from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.labels.labeller import FrameLabels, segment_columns
 from hearthlog.models.labels.names_labeller import labeller_of
 from hearthlog.models.labels.segments import Segment
-from hearthlog.recorder.stream.messages import EncodedMessage, column_messages, segment_line
+from hearthlog.recorder.stream import EncodedMessage, column_messages, segment_line
 from hearthlog.schemas.arrays import Bool, Float32, Indices, Int64
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.cdr_codec import Column

@@ -16,7 +16,7 @@ from hearthlog.recorder.events import OK, Frames, SourceHealth
 from hearthlog.recorder.labelling.embedder_probe import network_path
 from hearthlog.recorder.log.description import describe_log
 from hearthlog.recorder.log.rolling_log import RollingLog
-from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
+from hearthlog.recorder.stream import EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Bool, Float32, Int16
 from hearthlog.schemas.errors import Progress, ignore_progress

@@ -12,7 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.events import Gap
-from hearthlog.recorder.stream.messages import EncodedMessage, stream_info
+from hearthlog.recorder.stream import EncodedMessage, stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
