@@ -13,6 +13,7 @@ import soundfile
 from networks import model
 from onnx import helper
 
+from hearthlog.models.embedding import WINDOW_FRAMES, Projection, write_projection
 from hearthlog.models.embedding import session as sessions
 from hearthlog.models.embedding.networks import (
     NETWORKS,
@@ -25,7 +26,6 @@ from hearthlog.models.embedding.networks import (
     find_network,
     synthetic_sounds,
 )
-from hearthlog.models.embedding.projection import WINDOW_FRAMES, Projection, write_projection
 from hearthlog.recorder.labelling import embedder_probe
 from hearthlog.recorder.labelling.embedder_probe import Probe, open_embedder, probe_network
 from hearthlog.schemas.errors import HearthlogWarning, ModelError

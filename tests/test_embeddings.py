@@ -12,8 +12,8 @@ from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import NO_AUXILIARY, Auxiliary, EmbeddingEvidence
+from hearthlog.models.embedding import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.networks import YAMNET, load_embedder
-from hearthlog.models.embedding.projection import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.stream import EmbeddingStream, SteadyNoise
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model

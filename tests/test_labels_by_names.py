@@ -21,8 +21,8 @@ from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import Auxiliary
 from hearthlog.models.classifiers.network_names import AUDIOSET, without_classes
+from hearthlog.models.embedding import WINDOW_FRAMES, Embeddings, read_projection
 from hearthlog.models.embedding.networks import YAMNET
-from hearthlog.models.embedding.projection import WINDOW_FRAMES, Embeddings, read_projection
 from hearthlog.models.embedding.sound_names import audioset_names, named_sounds
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.names_labeller import NamesLabeller

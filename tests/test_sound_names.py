@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hearthlog.models.classes import CLASS_NAME, find_class
+from hearthlog.models.embedding import Embeddings, Projection, read_projection
 from hearthlog.models.embedding.networks import YAMNET
-from hearthlog.models.embedding.projection import Embeddings, Projection, read_projection
 from hearthlog.models.embedding.sound_names import (
     SoundName,
     audioset_names,

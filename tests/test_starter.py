@@ -13,8 +13,8 @@ from conftest import HEARTHLOG
 
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.model import PublicCollection, may_be_shipped
+from hearthlog.models.embedding import read_projection
 from hearthlog.models.embedding.networks import YAMNET
-from hearthlog.models.embedding.projection import read_projection
 from hearthlog.models.modelfile import load_model, model_card
 from hearthlog.models.starter import (
     BY_FEATURES,

@@ -10,7 +10,7 @@ import numpy as np
 
 from hearthlog.analyzer.doctor import Findings, Level
 from hearthlog.models.classifiers.network_names import MOST_AHEAD_FRAMES
-from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
+from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns

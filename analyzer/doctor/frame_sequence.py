@@ -16,7 +16,7 @@ from hearthlog.analyzer.doctor.column_checks import (
 )
 from hearthlog.models.classifiers.classifier import LabelTiming
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
-from hearthlog.models.embedding.projection import WINDOW_FRAMES
+from hearthlog.models.embedding import WINDOW_FRAMES
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 

@@ -40,7 +40,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import Auxiliary
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import require_trained
-from hearthlog.models.embedding.projection import (
+from hearthlog.models.embedding import (
     HOP_FRAMES,
     NO_EMBEDDINGS,
     WINDOW_FRAMES,

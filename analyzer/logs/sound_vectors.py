@@ -6,7 +6,7 @@ import numpy as np
 
 from hearthlog.analyzer.logs.spans import ranges
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, Directions
-from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Embeddings
+from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES, Embeddings
 from hearthlog.schemas.arrays import Float32, Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS

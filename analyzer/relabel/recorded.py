@@ -17,7 +17,7 @@ from hearthlog.analyzer.logs.sound_vectors import (
     embeddings_of,
 )
 from hearthlog.models.classifiers.evidence import NO_AUXILIARY, NOWHERE, Auxiliary, Directions
-from hearthlog.models.embedding.projection import NO_EMBEDDINGS, Embeddings
+from hearthlog.models.embedding import NO_EMBEDDINGS, Embeddings
 from hearthlog.recorder.events import Gap, SourceHealth
 from hearthlog.recorder.stream import EncodedMessage
 from hearthlog.schemas.arrays import Bytes, Float32, Int64

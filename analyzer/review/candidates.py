@@ -22,8 +22,8 @@ from hearthlog.analyzer.review.spans import JudgeableSpans, judgeable_spans, oth
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import AUDIOSET
+from hearthlog.models.embedding import Embeddings, Projection, read_projection
 from hearthlog.models.embedding.networks import YAMNET
-from hearthlog.models.embedding.projection import Embeddings, Projection, read_projection
 from hearthlog.models.embedding.sound_names import SoundName, audioset_names, named_sounds
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress

@@ -10,8 +10,8 @@ import numpy as np
 
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.embedding import WINDOW_FRAMES, Int8
 from hearthlog.models.embedding.networks import find_network, load_embedder
-from hearthlog.models.embedding.projection import WINDOW_FRAMES, Int8
 from hearthlog.models.embedding.stream import SteadyNoise
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.floor import low_power

@@ -27,7 +27,7 @@ from hearthlog.analyzer.training.direction_samples import DirectionSample
 from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, SkippedClip
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Amount, Model
-from hearthlog.models.embedding.projection import Int8
+from hearthlog.models.embedding import Int8
 from hearthlog.models.features import SILENCE_POWER, FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.installed import DEFAULT

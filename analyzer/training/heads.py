@@ -14,8 +14,8 @@ from hearthlog.analyzer.training.manifest import BUILTIN
 from hearthlog.models.classes import FLUSHING_WATER, OTHER, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.evidence import UNIT, UNTAUGHT, EmbeddingHeads, mixed, sounds_of
 from hearthlog.models.classifiers.model import EmbeddingMix, NamesHead
+from hearthlog.models.embedding import read_projection
 from hearthlog.models.embedding.networks import NETWORKS
-from hearthlog.models.embedding.projection import read_projection
 from hearthlog.schemas.arrays import Bool, Float64, Indices, Int32
 
 _ALPHA = 30.0  # for standardised inputs, independent of the window count

@@ -25,7 +25,7 @@ from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.direction_samples import sighting_of
 from hearthlog.models.classes import SILENCE, UNDECIDED, UNKNOWN, class_name
 from hearthlog.models.classifiers.evidence import NOWHERE, Directions
-from hearthlog.models.embedding.projection import (
+from hearthlog.models.embedding import (
     HOP_FRAMES,
     NO_EMBEDDINGS,
     WINDOW_FRAMES,

@@ -15,7 +15,7 @@ from hearthlog.models.classifiers.network_names import (
     names_parameters,
 )
 from hearthlog.models.classifiers.rbf_machines import RBF_LANDMARKS, SVM_RBF
-from hearthlog.models.embedding.projection import DELAY_FRAMES
+from hearthlog.models.embedding import DELAY_FRAMES
 from hearthlog.models.extensions import Extensions
 from hearthlog.models.features.floor import BLOCK_FRAMES
 from hearthlog.models.features.installed import feature_set

@@ -8,7 +8,7 @@ import numpy as np
 
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.model import EmbeddingMix, NamesHead
-from hearthlog.models.embedding.projection import (
+from hearthlog.models.embedding import (
     HOP_FRAMES,
     NO_EMBEDDINGS,
     WINDOW_FRAMES,

@@ -26,13 +26,13 @@ from hearthlog.models.classifiers.model import (
     Smoothing,
     TrainingData,
 )
-from hearthlog.models.embedding.networks import YAMNET
-from hearthlog.models.embedding.projection import (
+from hearthlog.models.embedding import (
     HOP_FRAMES,
     WINDOW_FRAMES,
     Projection,
     read_projection,
 )
+from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.sound_names import RELEASE, SoundName, audioset_names
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.models.embedding.projection import Int8, Projection, read_projection
+from hearthlog.models.embedding import Int8, Projection, read_projection
 from hearthlog.models.embedding.session import (
     NetworkOutput,
     NetworkSession,

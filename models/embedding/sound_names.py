@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Embeddings, Projection
+from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES, Embeddings, Projection
 from hearthlog.schemas.arrays import Float64, Int64
 
 _FILE = Path(__file__).with_name("audioset_names.csv")

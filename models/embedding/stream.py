@@ -4,13 +4,13 @@ from functools import cache
 
 import numpy as np
 
-from hearthlog.models.embedding.networks import Embedder
-from hearthlog.models.embedding.projection import (
+from hearthlog.models.embedding import (
     HOP_FRAMES,
     NO_EMBEDDINGS,
     WINDOW_FRAMES,
     Embeddings,
 )
+from hearthlog.models.embedding.networks import Embedder
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.frames import FRAME_SAMPLES
 

@@ -15,7 +15,7 @@ from hearthlog.models.classifiers.evidence import (
     DirectionEvidence,
     EmbeddingEvidence,
 )
-from hearthlog.models.embedding.projection import Int8
+from hearthlog.models.embedding import Int8
 from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.labels.segments import Segment, Segmenter, SegmenterInput
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64

@@ -10,7 +10,7 @@ from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.network_names import MARGIN_FRAMES
-from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Embeddings
+from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES, Embeddings
 from hearthlog.models.features.floor import Floors
 from hearthlog.models.labels.labeller import FrameLabels, Labeller
 from hearthlog.models.labels.segments import Segment, Segmenter, SegmenterInput

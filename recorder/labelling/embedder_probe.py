@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.models.embedding.networks import (
     NETWORKS,
     YAMNET,
@@ -23,7 +24,6 @@ from hearthlog.models.embedding.networks import (
     load_embedder,
     missing_modules,
 )
-from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES
 from hearthlog.recorder.host import memory, module_command
 from hearthlog.schemas.errors import ModelError, printable
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE

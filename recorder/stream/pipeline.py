@@ -17,8 +17,8 @@ from hearthlog.models.classifiers.evidence import (
     Directions,
 )
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.embedding import DELAY_FRAMES, NO_EMBEDDINGS
 from hearthlog.models.embedding.networks import Embedder
-from hearthlog.models.embedding.projection import DELAY_FRAMES, NO_EMBEDDINGS
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.floor import Floors, FloorTracker, decibels
 from hearthlog.models.features.infrasound import InfrasoundFilter

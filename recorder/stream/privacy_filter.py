@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from hearthlog.models.embedding.projection import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
+from hearthlog.models.embedding import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS

@@ -6,8 +6,8 @@ import numpy as np
 
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import Auxiliary, Directions
+from hearthlog.models.embedding import WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.networks import Embedder
-from hearthlog.models.embedding.projection import WINDOW_FRAMES, Embeddings
 from hearthlog.models.features import SILENCE_POWER, FeatureSet, mean_and_std
 from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.labels.labeller import FrameLabels, segment_columns

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
-from hearthlog.models.embedding.projection import NO_EMBEDDINGS
+from hearthlog.models.embedding import NO_EMBEDDINGS
 from hearthlog.models.embedding.sound_names import NamedSound, SoundName, audioset_names
 from hearthlog.tools.lab import names as bench
 from hearthlog.tools.lab.names import KINDS, LIKE, Counts, Laid, Scene, count, table

@@ -24,8 +24,8 @@ import typer
 from hearthlog.analyzer.evaluation.scenes import background
 from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LabelledClip
+from hearthlog.models.embedding import HOP_FRAMES, NO_EMBEDDINGS, Embeddings, Projection
 from hearthlog.models.embedding.networks import YAMNET, Embedder
-from hearthlog.models.embedding.projection import HOP_FRAMES, NO_EMBEDDINGS, Embeddings, Projection
 from hearthlog.models.embedding.sound_names import (
     NamedSound,
     SoundName,

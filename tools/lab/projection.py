@@ -16,8 +16,8 @@ from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.model import may_be_shipped
+from hearthlog.models.embedding import Projection, write_projection
 from hearthlog.models.embedding.networks import YAMNET
-from hearthlog.models.embedding.projection import Projection, write_projection
 from hearthlog.models.embedding.session import TfliteSession
 from hearthlog.models.embedding.sound_names import GROUPS
 from hearthlog.schemas.arrays import Float32

@@ -29,7 +29,7 @@ from hearthlog.analyzer.training.manifest import BUILTIN, LabelledClip, read_man
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
-from hearthlog.models.embedding.projection import HOP_FRAMES, WINDOW_FRAMES, Int8
+from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES, Int8
 from hearthlog.models.features.floor import FloorTracker, is_quiet
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
