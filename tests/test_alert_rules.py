@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from livehome import rule
 from pydantic import TypeAdapter, ValidationError
 
-from hearthlog.analyzer.activity.events import LONGEST_PAUSE
+from hearthlog.analyzer.activity import LONGEST_PAUSE
 from hearthlog.analyzer.activity.segments import SegmentCollector, read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import (
     end_of_quiet,

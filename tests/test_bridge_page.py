@@ -20,8 +20,8 @@ from servedhome import JSON, PALE_TEXTS, Phone, pages, proxying, serving
 from viewers import address_of, browsing, free_port, patiently
 
 from hearthlog.analyzer import http
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.event_counts import SET_APART
-from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.bridge import open_outputs
 from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import REVIEWER, EventCorrections

@@ -18,9 +18,9 @@ from pydantic import ValidationError
 from servedhome import JSON, PALE_TEXTS, Phone, proxying, serving
 from viewers import browsing, patiently
 
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import Sureness
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
-from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hearthlog.analyzer.activity import ANY_SOUND, ActiveClasses, EventRecord
 from hearthlog.analyzer.activity.event_counts import events_of
-from hearthlog.analyzer.activity.events import ANY_SOUND, ActiveClasses, EventRecord
 from hearthlog.analyzer.bridge.bridge import ProblemReporter
 from hearthlog.analyzer.bridge.home_state import Health, HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.topics import Place, Topics, identifier

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.activity.events import LONGEST_PAUSE
+from hearthlog.analyzer.activity import LONGEST_PAUSE
 from hearthlog.analyzer.activity.segments import (
     SEGMENT_FIELDS,
     HomeActivity,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.activity.events import ANY_SOUND
+from hearthlog.analyzer.activity import ANY_SOUND
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.layers import readable_span
 from hearthlog.analyzer.logs.selection import array_names, select

@@ -13,7 +13,7 @@ from threading import Event as Flag
 from threading import Lock, Thread
 from typing import Any
 
-from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, follow_home
 from hearthlog.analyzer.bridge.output import RECENT, News, Output, Totals
 from hearthlog.analyzer.bridge.secret_files import (

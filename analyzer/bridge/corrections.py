@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE
 from hearthlog.analyzer.marks import Mark, read_marks, write_marks

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.activity import ActiveClasses, EventRecord, SoundEvent
 from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE, SET_APART, television_minutes
-from hearthlog.analyzer.activity.events import ActiveClasses, EventRecord, SoundEvent
 from hearthlog.analyzer.activity.segments import (
     GrowingSpans,
     is_of_activity,

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 from pydantic import BaseModel, Field
 
-from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.state import BridgeState, Report, StateEntry
 from hearthlog.analyzer.logs.local_time import Today

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.activity import ANY_SOUND
 from hearthlog.analyzer.activity.day_anomaly import Routines
 from hearthlog.analyzer.activity.day_profile import (
     APART_IN_LENGTH,
@@ -15,7 +16,6 @@ from hearthlog.analyzer.activity.day_profile import (
     television_spans,
 )
 from hearthlog.analyzer.activity.event_counts import SET_APART
-from hearthlog.analyzer.activity.events import ANY_SOUND
 from hearthlog.analyzer.activity.segments import HomeActivity, is_of_scenario
 from hearthlog.analyzer.activity.values import (
     BASELINE_DAYS,

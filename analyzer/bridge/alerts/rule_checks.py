@@ -3,8 +3,8 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
+from hearthlog.analyzer.activity import ANY_SOUND
 from hearthlog.analyzer.activity.day_anomaly import FEWEST as FEWEST_ROUTINE
-from hearthlog.analyzer.activity.events import ANY_SOUND
 from hearthlog.analyzer.activity.segments import source_microphone, source_name
 from hearthlog.analyzer.activity.values import FEWEST as FEWEST_USUAL
 from hearthlog.analyzer.bridge.alerts.rules import (

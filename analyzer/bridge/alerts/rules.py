@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeGuard
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from hearthlog.analyzer.activity import ANY_SOUND, LONGEST_PAUSE
 from hearthlog.analyzer.activity.day_anomaly import LONGEST
-from hearthlog.analyzer.activity.events import ANY_SOUND, LONGEST_PAUSE
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NEVER
 from hearthlog.models.classes import SILENCE, class_name, in_words
 from hearthlog.recorder.pause_schedule import QuietHours, check_quiet_hours, quiet_hours

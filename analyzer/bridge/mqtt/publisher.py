@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from paho.mqtt.client import MQTTMessage
 
-from hearthlog.analyzer.activity.events import ANY_SOUND, SoundEvent
+from hearthlog.analyzer.activity import ANY_SOUND, SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.mqtt.home_assistant import (

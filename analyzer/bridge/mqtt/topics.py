@@ -8,7 +8,7 @@ from urllib.parse import quote, unquote
 
 from pydantic import BaseModel
 
-from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.bridge.state import RETAINED, BridgeState, Report, StateEntry
 
 _KEPT = "".join(chr(code) for code in range(33, 127) if chr(code) not in "%+#/$")

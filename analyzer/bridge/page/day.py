@@ -4,8 +4,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import date, tzinfo
 from typing import Any, NamedTuple
 
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness
-from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.corrections import EventCorrections
 from hearthlog.analyzer.bridge.home_state import (
     MOST,

@@ -7,6 +7,7 @@ from threading import Thread
 
 import numpy as np
 
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.doubtful_sounds import (
     WORRYING,
     DoubtfulSound,
@@ -14,7 +15,6 @@ from hearthlog.analyzer.activity.doubtful_sounds import (
     perhaps,
     read_doubtful_sounds,
 )
-from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.logs.home_logs import HomeLog, find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling

@@ -10,8 +10,8 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from typing import Any
 
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, read_sureness
-from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.values import BASELINE_DAYS
 from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import EventCorrections, explained

@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
 
-from hearthlog.analyzer.activity.events import SoundEvent
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.segments import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
 from hearthlog.analyzer.bridge.page.doubts import Doubts, doubtful, read_doubts

@@ -8,10 +8,10 @@ from threading import Lock
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import SURE, UNMEASURED, Sureness
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
 from hearthlog.analyzer.activity.event_counts import SET_APART
-from hearthlog.analyzer.activity.events import SoundEvent
 from hearthlog.analyzer.activity.segments import source_microphone
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.bridge.page.day import IMPORTANT

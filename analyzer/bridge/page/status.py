@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from hearthlog.analyzer.activity.events import ANY_SOUND, HOLD_SECONDS
+from hearthlog.analyzer.activity import ANY_SOUND, HOLD_SECONDS
 from hearthlog.analyzer.activity.segments import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import News

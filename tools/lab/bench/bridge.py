@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.activity.events import ANY_SOUND, ActiveClasses
+from hearthlog.analyzer.activity import ANY_SOUND, ActiveClasses
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import Columns, read_columns
