@@ -201,22 +201,25 @@ def _unknown_key(
     name: str, table: Schema, others: Mapping[str, type[BaseModel]]
 ) -> tuple[str, str]:
     """Return the suggested key and the text of the suggestion; both may be empty."""
-    known = table.get("properties", {})
-    if f"{name}_file" in known:
+    properties = table.get("properties", {})
+    if f"{name}_file" in properties:
         near = f"{name}_file"
-        return near, f"; write {near} = {_example(near, known[near])}, a file that holds it"
+        return near, f"; write {near} = {_example(near, properties[near])}, a file that holds it"
     from difflib import get_close_matches  # noqa: PLC0415  not at each start
 
     for head, model in others.items():
         if name in model.model_json_schema()["properties"]:
             return "", f"; it belongs {head}"
-    near = next(iter(get_close_matches(name.lower(), known, 1, 0.6)), "")
+    near = next(iter(get_close_matches(name.lower(), properties, 1, 0.6)), "")
     if near:
         return near, f"; is {near} meant?"
-    if 0 < len(known) <= _MOST_LISTED:
-        return "", f"; the keys of this table are {', '.join(known)}, in hearthlog {__version__}"
+    if 0 < len(properties) <= _MOST_LISTED:
+        return (
+            "",
+            f"; the keys of this table are {', '.join(properties)}, in hearthlog {__version__}",
+        )
     words = f"; `hearthlog config schema` lists the keys of hearthlog {__version__}"
-    return "", words if known else ""
+    return "", words if properties else ""
 
 
 def _words(error: Any, place: _Place, key: Key) -> str:

@@ -71,9 +71,9 @@ def machine_health(stamp: int, folder: Path, sys: Path = _SYS) -> SourceHealth:
         "disk_free_bytes": _free_bytes(folder),
         "memory_bytes": memory("RssAnon"),
     }
-    known = {name: str(value) for name, value in values.items() if value is not None}
+    present = {name: str(value) for name, value in values.items() if value is not None}
     problem = _problem(temperature, throttled or 0)
-    return SourceHealth(stamp, WARNING if problem else OK, problem or "well", known)
+    return SourceHealth(stamp, WARNING if problem else OK, problem or "well", present)
 
 
 def clock_is_synchronized() -> bool | None:

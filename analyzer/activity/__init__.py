@@ -109,15 +109,15 @@ class ActiveClasses:
             self._last_labels = self._last_labels[:0]
         places = {name: place for place, name in enumerate(self._classes)}
         new = np.array([places.get(label, -1) for label in labels])
-        known = np.concatenate([self._last_labels, new])
+        recent = np.concatenate([self._last_labels, new])
         silence = places.get(SILENCE, -2)
         for name in self._last_active:
-            is_of = known != silence if name == ANY_SOUND else known == places[name]
+            is_of = recent != silence if name == ANY_SOUND else recent == places[name]
             sums = np.concatenate([np.zeros(_SECOND, np.int64), np.cumsum(is_of)])
             active = (sums[_SECOND:] - sums[:-_SECOND])[len(self._last_labels) :] >= _LEAST
             if active.any():
                 self._last_active[name] = int(times[np.flatnonzero(active)[-1]])
-        self._last_labels = known[-_SECOND + 1 :]
+        self._last_labels = recent[-_SECOND + 1 :]
         self.time = int(times[-1])
 
     def is_active(self, name: str) -> bool:

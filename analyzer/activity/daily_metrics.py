@@ -264,7 +264,7 @@ class DayMetrics:
     def minutes(self, name: str) -> Duration | None:
         """Return the duration of a class; None if unknown."""
         minutes = _length(common(self.home.spans.get(name, NONE), self.span))
-        return _if_known(minutes, self.share_of(name))
+        return _if_covered(minutes, self.share_of(name))
 
     def events(self, name: str) -> Int64:
         """Return the event starts of a class, if any, on this day, in nanoseconds of UTC."""
@@ -276,12 +276,12 @@ class DayMetrics:
 
     def count(self, name: str) -> Count | None:
         """Return the number of events of a class on this day; None if unknown."""
-        return _if_known(self._count(name, self.span), self.share_of(name))
+        return _if_covered(self._count(name, self.span), self.share_of(name))
 
     def night_count(self, name: str) -> Count | None:
         """Return the number of events of a class in the night; None if unknown."""
         share = _share(self.home.listened.get(name, NONE), self.night)
-        return _if_known(self._count(name, self.night), share)
+        return _if_covered(self._count(name, self.night), share)
 
     def beside_television(self, name: str) -> int:
         """Return the number of events of a class not counted because of a television."""
@@ -293,12 +293,12 @@ class DayMetrics:
     @property
     def sound(self) -> Duration | None:
         """Duration of any sound on this day; None if unknown."""
-        return _if_known(_length(common(self.home.sound, self.span)), self.share)
+        return _if_covered(_length(common(self.home.sound, self.span)), self.share)
 
     @property
     def night_sound(self) -> Duration | None:
         """Duration of any sound in the night; None if unknown."""
-        return _if_known(_length(common(self.home.sound, self.night)), self._share_of(self.night))
+        return _if_covered(_length(common(self.home.sound, self.night)), self._share_of(self.night))
 
     @property
     def night_stretches(self) -> Count | None:
@@ -307,7 +307,7 @@ class DayMetrics:
         A stretch has at least half a minute of sound. None if unknown.
         """
         count = exactly(stretches(self.home.sound, self.night))
-        return _if_known(count, self._share_of(self.night))
+        return _if_covered(count, self._share_of(self.night))
 
     @property
     def hours(self) -> Int64:
@@ -387,7 +387,7 @@ def _share(covered: Spans, span: Spans) -> float:
     return common(covered, span).length / span.length
 
 
-def _if_known(value: _Figure, share: float) -> _Figure | None:
+def _if_covered(value: _Figure, share: float) -> _Figure | None:
     """Return a figure; None without coverage, or for a 0 with too little coverage."""
     return value if share >= MOST or (share and value.middle) else None
 

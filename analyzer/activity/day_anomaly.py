@@ -153,9 +153,9 @@ def _widened(free: Bool, first: int, last: int) -> tuple[int, int]:
 def _regular(minutes: Float64, width: int) -> tuple[Float64, Float64]:
     """Return the share of days with sound, and the mean length, for each span of a width."""
     sums = sliding_window_view(minutes, width, axis=1).sum(axis=-1)
-    known = np.maximum(np.isfinite(sums).sum(axis=0), 1)
+    counts = np.maximum(np.isfinite(sums).sum(axis=0), 1)
     amounts = np.nan_to_num(sums)
-    return (amounts >= _PRESENT).sum(axis=0) / known, amounts.sum(axis=0) / known
+    return (amounts >= _PRESENT).sum(axis=0) / counts, amounts.sum(axis=0) / counts
 
 
 def figure_table(
@@ -289,7 +289,7 @@ class Routines:
 
     def __init__(self, profiles: Profiles) -> None:
         self._profiles = profiles
-        self._known: dict[date, DayProfile | None] = {}
+        self._profile_of_day: dict[date, DayProfile | None] = {}
 
     def judge(self, day: date) -> DayAnomaly | None:
         """Compute the anomaly of a day.
@@ -313,10 +313,10 @@ class Routines:
         return [each for each in days if each is not None]
 
     def _of(self, day: date) -> DayProfile | None:
-        if day not in self._known:
+        if day not in self._profile_of_day:
             profile = self._profiles.of(day)
-            self._known[day] = profile if profile.is_known else None
-        return self._known[day]
+            self._profile_of_day[day] = profile if profile.is_known else None
+        return self._profile_of_day[day]
 
 
 class Compared(NamedTuple):
@@ -343,7 +343,7 @@ def compare(
     weekend = np.array([day.day.weekday() >= 5 for day in (*earlier, *span)])
     days = len(earlier)
     often = np.isfinite(table[:days]).sum(axis=0) >= days / 2
-    kept = [figure for figure, is_known in zip(every, often, strict=True) if is_known]
+    kept = [figure for figure, is_frequent in zip(every, often, strict=True) if is_frequent]
     before, rows = table[:days, often], table[days:, often]
     usual = fit_baseline(before, weekend[:days], kept)
     own = usual.deviations(rows, weekend[days:])
@@ -392,9 +392,9 @@ def rarity(own: Float64, compared: Compared) -> float:
 
 def _mean_of_finite(rows: Float64) -> Float64:
     """Return the mean over rows without missing values; NaN without any value."""
-    known = np.isfinite(rows)
-    sums = np.where(known, rows, 0.0).sum(axis=0)
-    return np.where(known.any(axis=0), sums / np.maximum(known.sum(axis=0), 1), np.nan)
+    finite = np.isfinite(rows)
+    sums = np.where(finite, rows, 0.0).sum(axis=0)
+    return np.where(finite.any(axis=0), sums / np.maximum(finite.sum(axis=0), 1), np.nan)
 
 
 def _differences(compared: Compared, length: int) -> Iterator[FigureDifference]:

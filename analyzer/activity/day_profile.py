@@ -187,8 +187,8 @@ class Profiles:
         time = int(lasts[is_busy][-1] if last else firsts[is_busy][0])
         outside = (time, end) if last else (begin, time)
         covered = cut(self._coverage, *outside).length
-        known = covered >= _LEAST_AROUND * (outside[1] - outside[0])
-        return self._clock(time, day) if known else np.nan
+        enough = covered >= _LEAST_AROUND * (outside[1] - outside[0])
+        return self._clock(time, day) if enough else np.nan
 
     def _clock(self, time: int, day: date) -> float:
         """Return the clock time in minutes since the midnight of a day."""

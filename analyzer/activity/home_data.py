@@ -332,6 +332,6 @@ def _add(
         lengths = np.maximum(np.minimum(ends, end) - np.maximum(starts, begin), 0)
         sums = np.bincount(numbers, lengths, len(names)) / _MINUTE
         for name, length in zip(names.tolist(), sums.tolist(), strict=True):
-            is_known = name in counted or len(counted) < _MOST_CLASSES
-            if length and is_known and class_name(name) not in left_out:
+            has_room = name in counted or len(counted) < _MOST_CLASSES
+            if length and has_room and class_name(name) not in left_out:
                 counted[name] += length

@@ -189,9 +189,9 @@ class LiveActivity:
                 self._cut(source, pending.last)
                 pending.begin(pending.last)
                 continue
-            known = pending.start if run is None else run.end
+            reached = pending.start if run is None else run.end
             is_away = pending.last < now - self._patience
-            until = min(until, max(known, now - self._patience) if is_away else known)
+            until = min(until, max(reached, now - self._patience) if is_away else reached)
         return until if self._pending else now - self._patience
 
     def activity(self) -> HomeActivity:

@@ -169,10 +169,10 @@ class HomeActivity:
         return union(*knowing)
 
     def _has_class(self, source: str, label: str) -> bool:
-        known = self.classes.get(source)
+        classes = self.classes.get(source)
         if is_of_scenario(source):
-            return known is not None and label in known
-        return known is None or label == ANY_SOUND or label in known
+            return classes is not None and label in classes
+        return classes is None or label == ANY_SOUND or label in classes
 
     def between(self, start: int, end: int, pause: int) -> "HomeActivity":
         """Return the activity in a span, with the complete events ongoing at its start.
@@ -196,25 +196,25 @@ class _Rows:
 
     def __init__(self) -> None:
         self._rows: list[tuple[int, int, float, str]] = []
-        self._known: Sounds | None = NO_SOUNDS
+        self._joined: Sounds | None = NO_SOUNDS
 
     def add(self, *row: *tuple[int, int, float, str]) -> None:
         self._rows.append(row)
-        self._known = None
+        self._joined = None
 
     def sounds(self) -> Sounds:
-        if self._known is None:
+        if self._joined is None:
             kinds = np.int64, np.int64, np.float32, object
             columns = zip(*self._rows, strict=True)
             every = Sounds(*(np.array(c, kind) for c, kind in zip(columns, kinds, strict=True)))
-            self._known = every.rows(np.argsort(every.starts, kind="stable"))
-        return self._known
+            self._joined = every.rows(np.argsort(every.starts, kind="stable"))
+        return self._joined
 
     def keep(self, sounds: Sounds) -> None:
         if len(sounds.starts) < len(self._rows):
             columns = sounds.starts, sounds.ends, sounds.confidences, sounds.microphones
             self._rows = [*zip(*(column.tolist() for column in columns), strict=True)]
-            self._known = sounds
+            self._joined = sounds
 
 
 class GrowingSpans:

@@ -246,7 +246,7 @@ class FrameSequence:
         self,
         features: Int64,
         labels: Int64,
-        known_start: Bool,
+        has_start: Bool,
         timing: LabelTiming,
     ) -> Bool:
         """Return which frames end a window without a gap.
@@ -258,7 +258,7 @@ class FrameSequence:
             frame = int(features[start, 1])
             self._first_end = timing.first_window_end(frame)
             later = labels[labels[:, 1] >= frame, 1]
-            if len(later) and not known_start[start]:  # the sound may have begun before the file
+            if len(later) and not has_start[start]:  # the sound may have begun before the file
                 self._first_end = min(self._first_end, int(later[0]))
             first_end[start:] = self._first_end
         return features[:, 1] >= first_end

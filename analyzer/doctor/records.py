@@ -216,14 +216,14 @@ class CheckedDefinitions(Definitions):
         """
         record = parse_strictly(self._findings, opcode, offset, content)
         if isinstance(record, Schema):
-            is_known, name = record.id in self.schemas, record.name
+            is_defined, name = record.id in self.schemas, record.name
         elif isinstance(record, Channel):
-            is_known, name = record.id in self.channels, record.topic
+            is_defined, name = record.id in self.channels, record.topic
         else:
             return None
         if isinstance(record, Schema) and record.id == 0:
             self._error("schema-id", f"schema {name} has the number 0", offset)
-        elif is_known:
+        elif is_defined:
             if not self.add(record):
                 what = f"{name_of(opcode).lower()} {record.id} ({name})"
                 self._error("redefined", f"{what} differs from the first of its number", offset)

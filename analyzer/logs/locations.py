@@ -92,21 +92,21 @@ class Listing(NamedTuple):
     unchanged: list[str]  # known folders that were not listed again
 
 
-def list_logs(folder: Path, known: Mapping[str, int] = MappingProxyType({})) -> Listing:
+def list_logs(folder: Path, earlier: Mapping[str, int] = MappingProxyType({})) -> Listing:
     """List the logs in a folder with size and modification time, without opening them.
 
-    `known` has change times of folders by name, as in `Listing`; local folders only. Logs of
+    `earlier` has change times of folders by name, as in `Listing`; local folders only. Logs of
     unchanged folders are not listed.
     """
-    found = _list_local(folder, known) if is_local(folder) else _list_stored(folder)
+    found = _list_local(folder, earlier) if is_local(folder) else _list_stored(folder)
     found.logs.sort(key=_NAME)
     return found
 
 
-def _list_local(folder: Path, known: Mapping[str, int]) -> Listing:
+def _list_local(folder: Path, earlier: Mapping[str, int]) -> Listing:
     found = Listing([], {}, [])
-    inner: dict[str, list[str]] = {name: [] for name in known}
-    for name in filter(None, known):
+    inner: dict[str, list[str]] = {name: [] for name in earlier}
+    for name in filter(None, earlier):
         inner.get(name.rpartition("/")[0], []).append(name)
     sure = time_ns() - _YOUNG
     waiting = [""]
@@ -117,7 +117,7 @@ def _list_local(folder: Path, known: Mapping[str, int]) -> Listing:
             changed = os.stat(path).st_ctime_ns  # noqa: PTH116  no Path for each folder
         except OSError:  # deleted, or no permission
             continue
-        if known.get(name) == changed and os.access(path, os.R_OK):
+        if earlier.get(name) == changed and os.access(path, os.R_OK):
             found.unchanged.append(name)
             waiting += inner[name]
             continue

@@ -14,8 +14,8 @@ from hearthlog.analyzer.evaluation.event_scores import compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
 from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.analyzer.promotion.paired_labels import (
-    KnownSounds,
     LabelChanges,
+    LoggedReferences,
     PairedFrames,
     TwoModels,
     changes_of_labellings,
@@ -121,11 +121,11 @@ def gather_evidence(
     or a kind of classifier, is not installed.
     """
     losses: list[str] = []
-    known = reference_sounds(logs, losses)
-    learned = learned_by(before, after, known)
+    references = reference_sounds(logs, losses)
+    learned = learned_by(before, after, references)
     chosen = unlearned_sample(logs, learned)
-    unlearned = [[s for s in own if s.random or not _is_in(learned, s)] for _, own in known]
-    places = _places([(log, own) for (log, _), own in zip(known, unlearned, strict=True)])
+    unlearned = [[s for s in own if s.random or not _is_in(learned, s)] for _, own in references]
+    places = _places([(log, own) for (log, _), own in zip(references, unlearned, strict=True)])
     models = TwoModels(before, after)
     taught = _taught(models, after)
     count = len(chosen) + len(places)
@@ -133,7 +133,7 @@ def gather_evidence(
     if of_home:
         rest = [
             (log, [*left_alone(log.path), *(s for s in own if s not in new)])
-            for (log, own), new in zip(known, unlearned, strict=True)
+            for (log, own), new in zip(references, unlearned, strict=True)
         ]
         places += _places(rest, _LEARNED_SECONDS)
     parts = [*chosen, *(part for part, _ in places)]
@@ -165,8 +165,8 @@ def right_at_random(before: Model, after: Model, logs: Sequence[RecentLog]) -> P
     Raise `ModelError` as `gather_evidence`.
     """
     losses: list[str] = []
-    known = reference_sounds(logs, losses)
-    places = _places([(log, [sound for sound in own if sound.random]) for log, own in known])
+    references = reference_sounds(logs, losses)
+    places = _places([(log, [sound for sound in own if sound.random]) for log, own in references])
     models = TwoModels(before, after)
     labelled = label_parts(models, [part for part, _ in places], losses, ignore_progress)
     return _right(
@@ -192,13 +192,13 @@ def _is_in(spans: Spans, sound: ReferenceSound) -> bool:
 
 
 def _places(
-    known: KnownSounds, most: float = _REFERENCE_SECONDS
+    references: LoggedReferences, most: float = _REFERENCE_SECONDS
 ) -> list[tuple[LogSpan, list[ReferenceSound]]]:
     """Merge nearby sounds, to label them at once; the latest ones."""
     places: list[tuple[LogSpan, list[ReferenceSound]]] = []
     by_microphone = (
         (log.path, name, [sound for sound in sounds if sound.microphone == name])
-        for log, sounds in known
+        for log, sounds in references
         for name in sorted({sound.microphone for sound in sounds})
     )
     for log, microphone, sounds in by_microphone:
@@ -246,8 +246,8 @@ def _outcomes(
 
 def _named(outcomes: Iterable[_Outcome], classes: Sequence[str]) -> NamedSounds:
     """Count the sounds with a class by a person and by the first model, of the model's classes."""
-    known = set(classes) - {SILENCE, UNKNOWN, OTHER}
-    pairs = [(one.label, one.before) for one in outcomes if {one.label, one.before} <= known]
+    named = set(classes) - {SILENCE, UNKNOWN, OTHER}
+    pairs = [(one.label, one.before) for one in outcomes if {one.label, one.before} <= named]
     right = sum(label == before for label, before in pairs)
     return NamedSounds(len(pairs), right, len({label for label, _ in pairs}))
 
@@ -307,12 +307,12 @@ def compare_on_trial(folders: Sequence[Path]) -> Trial:
         names = f"{last.get('candidate', '')} with {last.get('model', '')}"
         raise DataError(f"nothing to compare {names} by yet: {error}") from error
     difference = compare_labellings(live, candidate)
-    known: list[ReferenceSound] = []
+    references: list[ReferenceSound] = []
     for place, log in enumerate(logs, 1):
         with collect_errors(losses, LogError):
             sounds = reference(log, logs[place:])
-            known += [sound for sound in sounds if sound.microphone == name]
-    sounding = [sound for sound in known if class_name(sound.label) != SILENCE]
+            references += [sound for sound in sounds if sound.microphone == name]
+    sounding = [sound for sound in references if class_name(sound.label) != SILENCE]
     sides = [unified(side.labelling) for side in (live, candidate)]
     return Trial(
         champion=last.get("model", ""),
@@ -323,7 +323,9 @@ def compare_on_trial(folders: Sequence[Path]) -> Trial:
         random=_right_on_trial([one for one in sounding if one.random], *sides),
         marks=_right_on_trial([one for one in sounding if not one.random], *sides),
         losses=[*sources.losses, *losses],
-        quiet=_right_on_trial([one for one in known if one.random and one not in sounding], *sides),
+        quiet=_right_on_trial(
+            [one for one in references if one.random and one not in sounding], *sides
+        ),
     )
 
 

@@ -173,10 +173,10 @@ def time_words(minutes: float) -> str:
     return f"{hours} h {rest:02} min" if hours else f"{rest} min"
 
 
-KnownSounds = list[tuple[RecentLog, list[ReferenceSound]]]
+LoggedReferences = list[tuple[RecentLog, list[ReferenceSound]]]
 
 
-def reference_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSounds:
+def reference_sounds(logs: Sequence[RecentLog], losses: list[str]) -> LoggedReferences:
     """Read the sounds of known label of each log."""
     references, paths = [], [log.path for log in logs]
     for place, log in enumerate(logs, 1):
@@ -185,7 +185,7 @@ def reference_sounds(logs: Sequence[RecentLog], losses: list[str]) -> KnownSound
     return references
 
 
-def learned_by(before: Model, after: Model, references: KnownSounds) -> Spans:
+def learned_by(before: Model, after: Model, references: LoggedReferences) -> Spans:
     """Return the training time of two models together."""
     chosen = [(s.start, s.end) for _, sounds in references for s in sounds if not s.random]
     marked = spans_of(chosen)

@@ -214,8 +214,8 @@ def _takes_silence(evidence: HomeComparison, new: str) -> bool:
     column = changes.minutes[:, changes.classes.index(new)]
     silence = column[changes.classes.index(SILENCE)]
     much = silence > _SILENCE_OF_NEW * column.sum() and silence >= _MUCH * changes.minutes.sum()
-    known = any(true == before == SILENCE for true, before, _ in evidence.known)
-    return bool(much) and not (known and _is_correction(evidence, SILENCE, new))
+    has_silence = any(true == before == SILENCE for true, before, _ in evidence.known)
+    return bool(much) and not (has_silence and _is_correction(evidence, SILENCE, new))
 
 
 def _taken(evidence: HomeComparison, new: str) -> Iterator[tuple[str, int, int]]:

@@ -88,9 +88,9 @@ def score(
         macro_recall=float(np.nanmean(recall)),
         per_class={
             name: ClassScores(
-                precision=_known(precision[i]),
-                recall=_known(recall[i]),
-                f1=_known(f1[i]),
+                precision=_finite(precision[i]),
+                recall=_finite(recall[i]),
+                f1=_finite(f1[i]),
                 f1_interval=_interval(resampled[:, i], confusions) if support[i] else None,
                 support=int(support[i]),
             )
@@ -217,5 +217,5 @@ def _interval(resampled: Float64, confusions: Float64) -> Interval | None:
     return float(low), float(high)
 
 
-def _known(value: float) -> float | None:
+def _finite(value: float) -> float | None:
     return None if np.isnan(value) else float(value)

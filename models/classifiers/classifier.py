@@ -111,7 +111,7 @@ class Classifier:
         self._inverse_temperature = description.inverse_temperature
         self._bias = np.array([description.decision_bias.get(name, 0.0) for name in self.classes])
         self._doubts = description.novelty == "doubt"
-        self._known = np.array([name != UNKNOWN for name in self.classes])
+        self._is_named = np.array([name != UNKNOWN for name in self.classes])
         self._machine = classifier_kind(description.kind).machine(model)
         arrays = description.direction_microphones
         self._direction_weights = dict(zip(arrays, model.direction_weights, strict=True))
@@ -247,7 +247,7 @@ class Classifier:
         """Round probabilities and return them with the novelty."""
         np.rint(_STEPS * probabilities, out=probabilities)
         probabilities /= _STEPS
-        return probabilities, 1.0 - probabilities[:, self._known].max(axis=1, initial=0.0)
+        return probabilities, 1.0 - probabilities[:, self._is_named].max(axis=1, initial=0.0)
 
 
 def _shares(decision: Float64) -> Float64:

@@ -78,26 +78,26 @@ class DirectionEvidence:
         """
         if self._full_from is None:
             self._full_from = first + BLOCK_FRAMES * (MEMORY_BLOCKS + 1)
-        known = self._recent.followed_by(directions)
+        recent = self._recent.followed_by(directions)
         end = first + count
         # The last block that is complete at the last frame of each window.
         newest = np.arange(end - windows + 1, end + 1) // BLOCK_FRAMES - 1
-        evidence = self._of_blocks(known, newest)
+        evidence = self._of_blocks(recent, newest)
         oldest = (end // BLOCK_FRAMES - MEMORY_BLOCKS) * BLOCK_FRAMES
-        self._recent = known.rows(slice(np.searchsorted(known.frames, oldest), None))
+        self._recent = recent.rows(slice(np.searchsorted(recent.frames, oldest), None))
         return evidence
 
-    def _of_blocks(self, known: Directions, newest: Int64) -> Float64:
+    def _of_blocks(self, recent: Directions, newest: Int64) -> Float64:
         """Return the evidence of the last second of blocks before each block number."""
         if not len(newest):
             return np.zeros((0, self._weights.shape[1]))
         count = int(newest[-1] - newest[0]) + 1
-        places = known.frames // BLOCK_FRAMES - newest[0] + MEMORY_BLOCKS - 1
+        places = recent.frames // BLOCK_FRAMES - newest[0] + MEMORY_BLOCKS - 1
         inside = (places >= 0) & (places < count + MEMORY_BLOCKS - 1)
-        weights = self._weights[sectors_of(known.azimuths[inside])]
+        weights = self._weights[sectors_of(recent.azimuths[inside])]
         witnesses = np.zeros((count + MEMORY_BLOCKS - 1, self._weights.shape[1] + 1))
         witnesses[places[inside]] = np.pad(weights, ((0, 0), (0, 1)), constant_values=1.0)
-        witnesses[places[inside]] *= known.confidences[inside].astype(np.float64)[:, np.newaxis]
+        witnesses[places[inside]] *= recent.confidences[inside].astype(np.float64)[:, np.newaxis]
         total = np.zeros((count, witnesses.shape[1]))
         for age in range(MEMORY_BLOCKS):
             total += witnesses[age : age + count]

@@ -106,15 +106,15 @@ class _Persistence:
 
     def __call__(self, powers: Float64, rest: Float64) -> Bool:
         out = powers > np.maximum(_STANDS_OUT * rest, _LEAST_POWER)
-        known = out if self._recent is None else np.concatenate([self._recent, out])
-        if not self._held and not known.any():
-            self._recent = known[-_WINDOW:].copy()
+        loud = out if self._recent is None else np.concatenate([self._recent, out])
+        if not self._held and not loud.any():
+            self._recent = loud[-_WINDOW:].copy()
             return out
-        count = np.cumsum(np.concatenate([np.zeros(_WINDOW, np.intp), known]))
-        begins = (count[_WINDOW:] - count[:-_WINDOW] >= _MOST)[len(known) - len(out) :]
+        count = np.cumsum(np.concatenate([np.zeros(_WINDOW, np.intp), loud]))
+        begins = (count[_WINDOW:] - count[:-_WINDOW] >= _MOST)[len(loud) - len(out) :]
         if self._recent is None:
             begins[0] |= bool(out[0]) and powers[0] > _IS_PLAIN * rest[0]
-        self._recent = known[-_WINDOW:].copy()
+        self._recent = loud[-_WINDOW:].copy()
         if not self._held and not begins.any():
             return begins
         lasting = np.zeros(len(out), bool)

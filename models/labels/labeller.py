@@ -143,11 +143,11 @@ class Labeller:
             Of at least the last second before the frame.
         """
         self._first_label, self._first_segment = unlabelled, frame
-        powers, known = self._classifier.feature_set.band_powers, None
+        powers, replayed = self._classifier.feature_set.band_powers, None
         if self.timing.needs_floor and floors is not None and powers is not None:
             sound = powers(features[len(features) - len(floors) :])
-            known = Floors(floors, floors, sound, converged=False)
-        self._advance(features, known, stamps)
+            replayed = Floors(floors, floors, sound, converged=False)
+        self._advance(features, replayed, stamps)
         if self._evidence is not None:
             before = frame - len(features), len(features)
             self._evidence.push(auxiliary.directions, *before, 0)
@@ -273,8 +273,8 @@ class Labeller:
 
     def _advance(self, features: Float32, floors: Floors | None, stamps: Int64) -> "_Frames":
         """Return the frames of the windows that are complete now or pending."""
-        known = len(features) if floors is None else len(floors.powers)
-        features, stamps = features[len(features) - known :], stamps[len(stamps) - known :]
+        count = len(features) if floors is None else len(floors.powers)
+        features, stamps = features[len(features) - count :], stamps[len(stamps) - count :]
         frames = _Frames(features, self._classifier.feature_set.power(features), stamps)
         if floors is not None:
             frames = frames._replace(floors=floors.powers, bands=floors.sound)

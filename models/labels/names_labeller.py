@@ -66,7 +66,9 @@ class NamesLabeller:
         # Whether the last windows lie in labelled sounds.
         self._named = np.zeros((self._later + 1, count), bool)
         self._below = np.zeros(count, np.int64)  # successive windows without a continuing sound
-        self._known = np.zeros(count, bool)  # whether a sound is independent of earlier windows
+        self._independent = np.zeros(
+            count, bool
+        )  # whether a sound is independent of earlier windows
         self._converged: int | None = None  # from this window on, all sounds are
 
     @property
@@ -104,16 +106,16 @@ class NamesLabeller:
             self._window = -(-first // HOP_FRAMES)
         self._end = end = first + len(stamps)
         window, named = self._add_windows(auxiliary.embeddings)
-        known = np.append(self._stamps, stamps)
-        count = max(len(known) - self.timing.ahead, 0)
-        frames = np.arange(end - len(known), end - len(known) + count)
+        pending = np.append(self._stamps, stamps)
+        count = max(len(pending) - self.timing.ahead, 0)
+        frames = np.arange(end - len(pending), end - len(pending) + count)
         labelled = SegmenterInput(
             self._probabilities(frames, window, named),
             np.zeros(count),
-            known[:count],
-            known[self.timing.ahead :],
+            pending[:count],
+            pending[self.timing.ahead :],
         )
-        self._stamps = known[count:]
+        self._stamps = pending[count:]
         labels = FrameLabels(
             self.classes,
             frames,
@@ -125,7 +127,7 @@ class NamesLabeller:
             self._calibrated_elsewhere,
             self.timing.ahead,
         )
-        return labels, self._segments(labelled, end - len(known))
+        return labels, self._segments(labelled, end - len(pending))
 
     def close(self, end: int) -> list[Segment]:
         """Return the remaining segments at the end, in nanoseconds of UTC, and reset."""
@@ -182,8 +184,8 @@ class NamesLabeller:
         self._above[above] += 1
         counts = self._open & (self._above >= self._least)
         self._below = np.where(goes_on, 0, self._below + 1)
-        self._known |= counts | (self._below > _PAUSE)
-        if self._converged is None and self._known.all():
+        self._independent |= counts | (self._below > _PAUSE)
+        if self._converged is None and self._independent.all():
             self._converged = window
         active: Bool = goes_on_here & counts
         return active

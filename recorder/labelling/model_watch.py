@@ -121,9 +121,9 @@ class ModelWatch:
     def refuse_ready(self, reason: str, in_use: Model) -> str:
         """Hold the ready model, and return the refusal; empty if it was reported before."""
         assert self.ready is not None
-        is_known, self.held, self.ready = self.ready is self.held, self.ready, None
+        is_held, self.held, self.ready = self.ready is self.held, self.ready, None
         self._last = in_use
-        if is_known:
+        if is_held:
             return ""
         text = self._refusal(self.held.model.name, reason)
         announce(text)
@@ -221,8 +221,8 @@ def _warn_if_simulated(model: Model) -> None:
 def _warn_if_changed(path: Path, champion: Model) -> None:
     """Warn if a champion has no promotion check: its file was replaced or damaged."""
     is_kept = path.is_symlink() and judgements_of(path.parent)
-    is_known = is_starter(champion.name, champion.sha256)
-    if is_kept and not is_known and read_judgement(path.parent, champion.sha256) is None:
+    is_shipped = is_starter(champion.name, champion.sha256)
+    if is_kept and not is_shipped and read_judgement(path.parent, champion.sha256) is None:
         announce(
             f"model {champion.name} is not the file that was promoted: it was replaced, or the "
             "disk has changed a bit of it; it keeps labelling. Restore it from a backup, or "

@@ -126,7 +126,7 @@ class FileDecoder:
         text = self._messages.decode(errors="replace")
         if not text.strip() and not self._process.returncode:
             return ""
-        found = (meaning for known, meaning in _FILE_MEANINGS.items() if re.search(known, text))
+        found = (meaning for pattern, meaning in _FILE_MEANINGS.items() if re.search(pattern, text))
         return next(found, _NO_SOUND)
 
     def close(self) -> None:

@@ -152,8 +152,8 @@ def check_pattern(pattern: str) -> None:
     dated = used & {"Y", "y"} and ((used & {"m", "b", "B"} and "d" in used) or "j" in used)
     timed = "M" in used and ("H" in used or {"I", "p"} <= used)
     if unknown or pattern.replace("%%", "").endswith("%"):
-        known = ", ".join(f"%{name}" for name in _DIRECTIVES)
-        raise ConfigurationError(f"{pattern[:80]!r}: a pattern of names has {known}")
+        directives = ", ".join(f"%{name}" for name in _DIRECTIVES)
+        raise ConfigurationError(f"{pattern[:80]!r}: a pattern of names has {directives}")
     if again := [name for name in sorted(used - {"%"}) if found.count(name) > 1]:
         raise ConfigurationError(f"{pattern[:80]!r}: a pattern of names has %{again[0]} once only")
     if not (dated and timed):

@@ -239,11 +239,11 @@ class DirectionFinder:
         """Return the weight of each bin of each hop, 0 to 1."""
         bands = np.add.reduceat(power, _STARTS, axis=1) + _TINY
         floor = np.repeat(self._floors(bands, first), _HOPS, axis=0)
-        known = np.concatenate([self._past, bands])
-        self._past = known[-_ECHO_HOPS:].copy()
+        spectra = np.concatenate([self._past, bands])
+        self._past = spectra[-_ECHO_HOPS:].copy()
         echo = np.zeros_like(bands)
         for age in range(1, _ECHO_HOPS + 1):
-            before = known[_ECHO_HOPS - age : len(known) - age]
+            before = spectra[_ECHO_HOPS - age : len(spectra) - age]
             echo = np.maximum(echo, before * np.float32(_ECHO_SHARE * _ECHO_DECAY**age))
         of_sound = np.maximum(1 - floor / bands, 0) * np.maximum(1 - echo / bands, 0)
         return np.repeat(of_sound.astype(np.float32), _WIDTHS, axis=1)

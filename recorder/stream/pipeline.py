@@ -143,8 +143,8 @@ class Pipeline:
                 embeddings = self._embeddings.push(
                     samples, features, floors, event.first, event.stamps
                 )
-            known = Auxiliary(directions, embeddings)
-            return self._push_frames(features, floors, event.first, event.stamps, known, health)
+            auxiliary = Auxiliary(directions, embeddings)
+            return self._push_frames(features, floors, event.first, event.stamps, auxiliary, health)
         if isinstance(event, Gap):
             return self.release(self._push_gap(event))
         return self.release(self._push_health(event))
@@ -215,9 +215,9 @@ class Pipeline:
             self._embedding_filter.push(auxiliary.embeddings)
             messages = self._filtered(self._privacy_filter.push(*logged, self.last_labels))
         else:
-            known = stamps[auxiliary.embeddings.last_frames - first]
+            times = stamps[auxiliary.embeddings.last_frames - first]
             messages = self._feature_messages(*logged)
-            messages += embedding_messages(self.microphone, auxiliary.embeddings, known)
+            messages += embedding_messages(self.microphone, auxiliary.embeddings, times)
         messages = [*health, *messages, *self._located(auxiliary, first, stamps), *labels]
         messages.sort(key=attrgetter("log_time"))
         self._remember(features, stamps)
@@ -229,9 +229,9 @@ class Pipeline:
         Streams that label by names get only these embeddings: possible speech has none, so no name.
         """
         embeddings = self._embedding_filter.release(frames)
-        known = frames.stamps[embeddings.last_frames - frames.first]
+        times = frames.stamps[embeddings.last_frames - frames.first]
         messages = self._feature_messages(frames.features, frames.first, frames.stamps)
-        messages += embedding_messages(self.microphone, embeddings, known)
+        messages += embedding_messages(self.microphone, embeddings, times)
         sound = frames.features, None, frames.first, frames.stamps
         for stream in self._streams.values():
             if stream.by_names and len(frames.stamps):
@@ -247,8 +247,8 @@ class Pipeline:
             return []
         recent = self._recent_directions.followed_by(directions)
         self._recent_directions = recent.rows(slice(-MEMORY_BLOCKS, None))
-        known = stamps[directions.last_frames - first]
-        return direction_messages(self.microphone, directions, known)
+        times = stamps[directions.last_frames - first]
+        return direction_messages(self.microphone, directions, times)
 
     def _remember(self, features: Float32, stamps: Int64) -> None:
         before = features[:0] if self._recent is None else self._recent
@@ -325,8 +325,8 @@ class Pipeline:
         stamps = self._recent_stamps[len(self._recent_stamps) - len(recent) :]
         if floors is not None:
             floors = floors[max(len(floors) - len(recent), 0) :]
-        known = Auxiliary(self._recent_directions, self._recent_embeddings)
-        stream.labeller.follow(recent, floors, stamps, frame, unlabelled, known)
+        auxiliary = Auxiliary(self._recent_directions, self._recent_embeddings)
+        stream.labeller.follow(recent, floors, stamps, frame, unlabelled, auxiliary)
 
     def notice_messages(self, subject: str, stamp: int, notice: Notice) -> list[EncodedMessage]:
         """Convert a notice at a time in nanoseconds of UTC to messages."""

@@ -82,11 +82,11 @@ class PrivateFrames:
 
     def _decide(self) -> Bool:
         span = _BEHIND_FRAMES + self._window
-        known = self._likely[: len(self._likely) - self._ahead]
-        count = len(known) - span + 1
+        decided = self._likely[: len(self._likely) - self._ahead]
+        count = len(decided) - span + 1
         if count <= 0:
             return np.zeros(0, bool)
-        private = np.asarray(sliding_window_view(known, span).any(axis=1))
+        private = np.asarray(sliding_window_view(decided, span).any(axis=1))
         self._likely = self._likely[count:]
         return private
 

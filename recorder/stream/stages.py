@@ -146,17 +146,17 @@ class MicrophoneEmbeddings:
             loud: Bool = np.convolve(powers > SILENCE_POWER, np.ones(_GATE_FRAMES), "valid") > 0
             return loud
         sound = np.zeros(count, bool)
-        known = min(len(floors.room), count)
-        if known:
-            powers = powers_of(features[-known - _GATE_FRAMES + 1 :])
-            sound[-known:] = ~is_quiet(powers, floors.room[-known:], _GATE_FRAMES, _GATE)
+        tracked = min(len(floors.room), count)
+        if tracked:
+            powers = powers_of(features[-tracked - _GATE_FRAMES + 1 :])
+            sound[-tracked:] = ~is_quiet(powers, floors.room[-tracked:], _GATE_FRAMES, _GATE)
         return sound
 
 
 def embedding_messages(
-    microphone: str, embeddings: Embeddings, known: Int64
+    microphone: str, embeddings: Embeddings, times: Int64
 ) -> list[EncodedMessage]:
-    """Encode embeddings; `known` [shape=(m,)] are the log times.
+    """Encode embeddings; `times` [shape=(m,)] are the log times.
 
     They are the starts of the last frames of the windows, in nanoseconds of UTC.
     """
@@ -164,17 +164,17 @@ def embedding_messages(
         "header.stamp": embeddings.stamps,
         "header.frame_id": microphone,
         "frame": embeddings.frames,
-        "frames": np.full(len(known), WINDOW_FRAMES, np.uint32),
+        "frames": np.full(len(times), WINDOW_FRAMES, np.uint32),
         "values": embeddings.values,
     }
     name = topic(microphone, "embedding")
-    return column_messages(name, message_types.EMBEDDING, known, columns)
+    return column_messages(name, message_types.EMBEDDING, times, columns)
 
 
 def direction_messages(
-    microphone: str, directions: Directions, known: Int64
+    microphone: str, directions: Directions, times: Int64
 ) -> list[EncodedMessage]:
-    """Encode directions; `known` [shape=(m,)] are the log times.
+    """Encode directions; `times` [shape=(m,)] are the log times.
 
     They are the starts of the last frames of the blocks, in nanoseconds of UTC.
     """
@@ -186,7 +186,7 @@ def direction_messages(
         "confidence": directions.confidences,
     }
     name = topic(microphone, "direction")
-    return column_messages(name, message_types.DIRECTION, known, columns)
+    return column_messages(name, message_types.DIRECTION, times, columns)
 
 
 class LabelStream:

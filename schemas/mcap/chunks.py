@@ -457,8 +457,8 @@ class _Batch(NamedTuple):
             int(identities[i]): [self._entries(by_channel[i])] for i in np.argsort(firsts).tolist()
         }
         channels = self.file.channels.keys()
-        known = entries_of.keys() <= channels
-        for number in np.flatnonzero(without).tolist() if known else range(len(self.chunks)):
+        complete = entries_of.keys() <= channels
+        for number in np.flatnonzero(without).tolist() if complete else range(len(self.chunks)):
             if not without[number] and entries_of.keys() <= channels:
                 continue  # earlier chunks define all channels
             made = self.index_records(number)

@@ -69,9 +69,9 @@ def demo(
     record_files(settings, FileSource([day], start), Flag())
     took = time.perf_counter() - began
     print(f"recorded and labelled at {60 * minutes / took:.0f} times real time")
-    right, of_known = _agreement(logs, start, truth.spans, model)
+    right, of_classes = _agreement(logs, start, truth.spans, model)
     print(
-        f"{right:.0%} of all labels are correct, and {of_known:.0%} of the labels of known sounds"
+        f"{right:.0%} of all labels are correct, and {of_classes:.0%} of the labels of known sounds"
     )
     print(
         "(none of these recordings were used for training; for any other sound, unknown is correct)"
@@ -127,8 +127,8 @@ def _agreement(
     names = [name if name in model.classes else UNKNOWN for *_, name in truth]
     true = np.array([*names, names[-1]], object)[meant]
     right = labels["label"] == true
-    known = (true != UNKNOWN) & (true != SILENCE)
-    return float(np.mean(right)), float(np.mean(right[known])) if known.any() else 1.0
+    is_class = (true != UNKNOWN) & (true != SILENCE)
+    return float(np.mean(right)), float(np.mean(right[is_class])) if is_class.any() else 1.0
 
 
 def _command(name: str) -> str:
