@@ -98,10 +98,10 @@ def has_token(target: str, token: str) -> bool:
     return secrets.compare_digest(target.encode(), f"/?token={token}".encode())
 
 
-def busiest_address(asking: Mapping[_Connected, str]) -> list[_Connected]:
+def busiest_address(pending: Mapping[_Connected, str]) -> list[_Connected]:
     """Return the connections of the address with the most of them, in the given order."""
-    ((most, _),) = Counter(asking.values()).most_common(1)
-    return [each for each, host in asking.items() if host == most]
+    ((most, _),) = Counter(pending.values()).most_common(1)
+    return [each for each, host in pending.items() if host == most]
 
 
 def host_name(url: str) -> str:
@@ -222,10 +222,10 @@ class HttpServer(ThreadingHTTPServer):
         """Ignore clients that disconnect or send invalid requests."""
 
     def _make_room(self) -> None:
-        asking = {each: a.host for each, a in self._connections.items() if not a.is_admitted}
-        if len(asking) < MOST_ASKING:
+        pending = {each: a.host for each, a in self._connections.items() if not a.is_admitted}
+        if len(pending) < MOST_ASKING:
             return
-        those = busiest_address(asking)
+        those = busiest_address(pending)
         with suppress(OSError, ValueError):  # a connection was closed meanwhile
             waiting = select.select(those, [], [], 0)[0]  # their data is about to be read
             those = [each for each in those if each not in waiting] or those

@@ -71,17 +71,22 @@ class HomeMinutes:
         if name not in own.events:
             return Count(rates=rates)
         labelled, corrected, certain = own.events[name]
-        beside = int(self.events[name][2].sum() - certain.sum())
+        near_television = int(self.events[name][2].sum() - certain.sum())
         rest = ~own.gone_through
         strata = strata_of(labelled[rest], own.sounding[rest])
-        return Count(int(corrected.sum()) + beside, int(certain.sum()) + beside, strata, rates)
+        return Count(
+            int(corrected.sum()) + near_television,
+            int(certain.sum()) + near_television,
+            strata,
+            rates,
+        )
 
     def counted(self, name: str, starts: Int64) -> Int64:
         """Return the events of a class, by starts within these minutes, that `count` counts."""
         if name not in SET_APART:
             return starts
-        beside = np.isin(starts // MINUTE * MINUTE, self.starts[self.television])
-        return starts[~beside | (rows_at(self.reviewed, starts) >= 0)]
+        near_television = np.isin(starts // MINUTE * MINUTE, self.starts[self.television])
+        return starts[~near_television | (rows_at(self.reviewed, starts) >= 0)]
 
     def beside_television(self, name: str) -> int:
         """Count the events of a `SET_APART` class that `count` leaves out; 0 for other classes."""

@@ -191,7 +191,7 @@ def topics_of(  # noqa: PLR0913
     microphone: str,
     feature_names: Sequence[str],
     classes: Sequence[str] | None,
-    beside: Mapping[str, Sequence[str]] | None = None,
+    secondary: Mapping[str, Sequence[str]] | None = None,
     *,
     directions: bool = False,
     embedding: EmbeddingSource | None = None,
@@ -227,7 +227,7 @@ def topics_of(  # noqa: PLR0913
         )
     if classes is not None:
         topics += label_topics(microphone, LIVE, classes)
-    for labelling, names in (beside or {}).items():
+    for labelling, names in (secondary or {}).items():
         topics += label_topics(microphone, labelling, names)
     return topics
 

@@ -74,13 +74,13 @@ class Questions:
         self._yes = yes
         self._is_terminal = sys.stdin.isatty() and sys.stderr.isatty()
 
-    def _asks(self, question: str, option: str) -> bool:
+    def _may_prompt(self, question: str, option: str) -> bool:
         """Return whether to ask; end with a line if the question cannot be asked."""
         if not self._yes and not self._is_terminal:
             wrong_use(f"{question}: there is no terminal to ask on; give {option}, or --yes")
         return not self._yes
 
-    def _ask(
+    def _prompt(
         self,
         question: str,
         option: str,
@@ -89,7 +89,7 @@ class Questions:
         given: str | None = None,
     ) -> _Value:
         """Check the given answer, or ask until one passes a check that raises HearthlogError."""
-        if given is not None or not self._asks(question, option):
+        if given is not None or not self._may_prompt(question, option):
             return _checked(option, default if given is None else given, check)
         while True:
             answer = typer.prompt(question, default=default, err=True)
@@ -100,7 +100,7 @@ class Questions:
 
     def confirm(self, question: str, option: str, *, default: bool) -> bool:
         """Ask a question for yes or no."""
-        if not self._asks(question, option):
+        if not self._may_prompt(question, option):
             return default
         return typer.confirm(question, default=default, err=True)
 
@@ -115,7 +115,7 @@ class Questions:
         ours = [device for device, _ in chosen] if self.installation.is_running(NAME) else []
         if given:
             chosen = [_device_and_room(text) for text in given]
-        elif self._asks("the microphone", "--microphone DEVICE=ROOM"):
+        elif self._may_prompt("the microphone", "--microphone DEVICE=ROOM"):
             devices = query_devices()
             names = {name for each in devices for name in (each.identity, each.name)}
             # PortAudio does not list a device that the recorder uses.
@@ -155,7 +155,7 @@ class Questions:
                 return name
 
             question = f"Room of {device.name}, such as kitchen"
-            answer = self._ask(question, "--microphone", room or "mic", check)
+            answer = self._prompt(question, "--microphone", room or "mic", check)
             pairs.append((device.identity, answer))
         return pairs
 
@@ -164,14 +164,14 @@ class Questions:
         from hearthlog.schemas.logs.files import check_node_name
 
         default = self.settings.node
-        return self._ask("Name of the home", "--node", default, check_node_name, given)
+        return self._prompt("Name of the home", "--node", default, check_node_name, given)
 
     def timezone(self, given: str | None) -> str:
         """Return the time zone of the home."""
         from hearthlog.recorder.pause_schedule import check_time_zone
 
         default = self.settings.timezone
-        return self._ask("Time zone of the home", "--timezone", default, check_time_zone, given)
+        return self._prompt("Time zone of the home", "--timezone", default, check_time_zone, given)
 
     def keep_sound(self, given: bool | None) -> bool:
         """Return whether clips of sound are kept."""
@@ -200,7 +200,7 @@ class Questions:
         now = self.settings.embedding
         if now or find_network(NETWORK):
             return now
-        if not self._asks("the network", f"--network {NETWORK} or --network {NONE}"):
+        if not self._may_prompt("the network", f"--network {NETWORK} or --network {NONE}"):
             return now
         if absent:
             print_notice(
@@ -251,9 +251,9 @@ class Questions:
         try:
             return check(str(before))
         except SetupError as error:
-            if not self._asks(str(error), "--page-port"):
+            if not self._may_prompt(str(error), "--page-port"):
                 raise
-            return self._ask(str(error), "--page-port", str(before + 1), check)
+            return self._prompt(str(error), "--page-port", str(before + 1), check)
 
     def broker(
         self, given: str | None, user: str | None, password_file: Path | None
@@ -275,10 +275,10 @@ class Questions:
                 self.secrets[file] = _secret(password_file)
                 old = file
             return Broker(host, user, old if user else None)
-        host = self._ask(
+        host = self._prompt(
             "Broker, such as homeassistant.local", "--mqtt", now.host if now else "", _host
         )
-        user = self._ask(
+        user = self._prompt(
             "User at the broker, empty for none", "--mqtt-user", now.user if now else "", str
         )
         if not user:
@@ -308,7 +308,7 @@ class Questions:
             return now
         else:
             question = "Address for alerts, such as ntfy://ntfy.sh/a-topic-of-yours (Apprise)"
-            self.secrets[file] = self._ask(question, "--alerts", "", _alert_urls)
+            self.secrets[file] = self._prompt(question, "--alerts", "", _alert_urls)
         return file
 
 
