@@ -390,7 +390,7 @@ def ping(url: str, *, is_well: bool) -> str:
     """
     problems = [f"no answer within {_PING_SECONDS:.0f} s"]
 
-    def ask() -> None:
+    def send() -> None:
         try:
             with urllib.request.urlopen(  # noqa: S310  the scheme was checked
                 url if is_well else f"{url.rstrip('/')}/fail", timeout=_PING_SECONDS
@@ -405,7 +405,7 @@ def ping(url: str, *, is_well: bool) -> str:
             what = "timed out" if is_late else getattr(reason, "strerror", None)
             problems[:] = [what or type(reason).__name__]
 
-    thread = threading.Thread(target=ask, daemon=True)
+    thread = threading.Thread(target=send, daemon=True)
     try:
         thread.start()
     except RuntimeError:
