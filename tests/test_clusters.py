@@ -13,7 +13,7 @@ import spliced
 from recurring import two_recurring_days
 from spoken import two_spoken_days
 
-from hearthlog.analyzer.discover.clusters import ClusterKind
+from hearthlog.analyzer.discover import ClusterKind
 from hearthlog.analyzer.discover.groups import GROUPS, load_groups
 from hearthlog.analyzer.discover.voices import VOICES, load_voices
 from hearthlog.analyzer.errors import DataError

@@ -20,9 +20,8 @@ from hypothesis import strategies as st
 from recurring import RECURRING, names_of, two_recurring_days
 from sklearn.metrics import adjusted_rand_score
 
-from hearthlog.analyzer.discover import groups
+from hearthlog.analyzer.discover import NO_CLUSTER, groups
 from hearthlog.analyzer.discover import sounds as sounds_module
-from hearthlog.analyzer.discover.clusters import NO_CLUSTER
 from hearthlog.analyzer.discover.groups import (
     GROUPS,
     add_groups,

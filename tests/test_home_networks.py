@@ -11,7 +11,7 @@ import numpy as np
 import spliced
 from recurring import record_recurring
 
-from hearthlog.analyzer.discover.clusters import NO_CLUSTER
+from hearthlog.analyzer.discover import NO_CLUSTER
 from hearthlog.analyzer.discover.groups import load_groups, save_groups
 from hearthlog.analyzer.discover.sounds import (
     discover,

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import save_file
 from spoken import ALLISON, DAY, START, THEO, record_conversation, two_spoken_days, two_voices
 
-from hearthlog.analyzer.discover.clusters import NO_CLUSTER
+from hearthlog.analyzer.discover import NO_CLUSTER
 from hearthlog.analyzer.discover.speech import (
     HomeSpeech,
     SpeechFrames,

@@ -1,1 +1,226 @@
-"""Discovery of recurring sounds and voices in a home."""
+"""Recurring sounds and voices of a home: their clusters, with kinds, files, names, occurrences."""
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import tzinfo
+from pathlib import Path
+from typing import Annotated, Any, Generic, NamedTuple, Self, TypeVar
+
+import numpy as np
+import safetensors
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from hearthlog.analyzer.errors import DataError, collect_errors
+from hearthlog.analyzer.logs.home_logs import HomeLog
+from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.spans import Timed
+from hearthlog.models.classes import CLASS_NAME
+from hearthlog.schemas.arrays import Int64, read_sealed, write_sealed
+from hearthlog.schemas.errors import LogError, Progress
+from hearthlog.schemas.files import read_limited
+from hearthlog.schemas.logs.files import log_readers
+from hearthlog.schemas.new_files import open_lock, replaced_file
+
+NO_CLUSTER = -1
+MOST_CLUSTERS = 1_000  # per file
+HOURS = 24
+_LARGEST_HEADER = 1 << 20  # bytes
+_LEAST_NUMBER, MOST_NUMBER = 1, (1 << 31) - 1
+
+ClusterId = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{8}$")]
+ClusterName = Annotated[str, StringConstraints(pattern=rf"^({CLASS_NAME.pattern})?$")]
+ClusterNames = Annotated[list[ClusterName], Field(max_length=MOST_CLUSTERS)]
+
+
+class StrictModel(BaseModel):
+    """A part of a file that may come from elsewhere."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+_Header = TypeVar("_Header", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class ClusterKind(Generic[_Header]):
+    """A kind of cluster: groups of sounds, or voices."""
+
+    noun: str  # for messages, such as `group`
+    verb: str  # the command that finds them
+    example: str  # a name of one for messages, as `3=doorbell`
+    header: type[_Header]  # of their file
+    largest: int  # limit of the file in bytes
+
+    @property
+    def plural(self) -> str:
+        """The noun for several; also the option of their file."""
+        return f"{self.noun}s"
+
+    @property
+    def file(self) -> str:
+        """Name of their file in a folder of logs."""
+        return f"{self.plural}.safetensors"
+
+    def write(self, path: Path, arrays: Mapping[str, NDArray[Any]], header: _Header) -> None:
+        """Write a file, replacing an existing one of other content.
+
+        Raise `LogError` if it cannot be written.
+        """
+        contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        text = header.model_dump_json(exclude_none=True)
+        data = write_sealed(contiguous, f"hearthlog_{self.plural}", text)
+        if not _has_content(path, data):
+            with replaced_file(path, readers=log_readers(path.parent)) as temporary:
+                temporary.write_bytes(data)
+
+    def read(self, path: Path) -> tuple[dict[str, NDArray[Any]], _Header] | None:
+        """Read a file; None if it does not exist.
+
+        Raise `DataError` if it is no such file, is too large, or damaged.
+        """
+        if not path.exists():
+            return None
+        data = read_limited(path, f"file of {self.plural}", self.largest, DataError)
+        if int.from_bytes(data[:8], "little") > _LARGEST_HEADER:
+            raise DataError(f"{path}: is no file of {self.plural} (its header is too large)")
+        try:
+            arrays, text, damaged = read_sealed(path, data, f"hearthlog_{self.plural}")
+            header = self.header.model_validate_json(text)
+        except (safetensors.SafetensorError, KeyError, ValidationError) as error:
+            raise DataError(
+                f"{path}: is no file of {self.plural} of this version of hearthlog; if a later one "
+                "wrote it, update hearthlog"
+            ) from error
+        if damaged:
+            raise DataError(damaged)
+        return arrays, header
+
+
+def _has_content(path: Path, data: bytes) -> bool:
+    try:
+        return path.stat().st_size == len(data) and path.read_bytes() == data
+    except OSError:
+        return False
+
+
+@contextmanager
+def locked_file(path: Path) -> Iterator[None]:
+    """Hold an exclusive lock on a file of clusters.
+
+    Raise `DataError` if its folder cannot be written.
+    """
+    lock_file = path.with_name(f".{path.name}.lock")
+    try:
+        lock = os.fdopen(open_lock(lock_file), "rb")
+    except OSError as error:
+        raise DataError(f"{lock_file}: cannot be written ({error.strerror})") from error
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def are_numbers(numbers: NDArray[Any], names: Sequence[str]) -> bool:
+    """Return whether an array from a file can hold the numbers of clusters with these names."""
+    return bool(
+        numbers.shape == (len(names),)
+        and len(np.unique(numbers)) == len(numbers)
+        and ((numbers >= _LEAST_NUMBER) & (numbers <= MOST_NUMBER)).all()
+    )
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Groups or voices of a home."""
+
+    numbers: Int64  # [shape=(g,)]; never reused
+    # assigned by a person; empty if unnamed
+    names: list[str] = field(default_factory=list, kw_only=True)
+    id: str = field(default="", kw_only=True)  # unique; identifies the file that a mark refers to
+
+    def named(self, names: Mapping[int, str]) -> Self:
+        """Return a copy with other names, by number."""
+        pairs = zip(self.numbers.tolist(), self.names, strict=True)
+        return replace(self, names=[names.get(number, name) for number, name in pairs])
+
+    def with_new(self, count: int, **changes: Any) -> Self:
+        """Return a copy with new unnamed clusters."""
+        first = self.numbers.max(initial=0) + 1
+        numbers = np.append(self.numbers, np.arange(first, first + count))
+        return replace(self, numbers=numbers, names=[*self.names, *[""] * count], **changes)
+
+    def identified(self, arrays: Iterable[NDArray[Any]]) -> Self:
+        """Return a copy with the id of arrays; equal ids mean equal clusters."""
+        digest = hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
+        return replace(self, id=digest[:8])
+
+    def texts(self, kind: ClusterKind[Any]) -> list[str]:
+        """Return the name of each cluster, or `group 3`."""
+        pairs = zip(self.names, self.numbers.tolist(), strict=True)
+        return [name or f"{kind.noun} {number}" for name, number in pairs]
+
+
+class NamedSpans(NamedTuple):
+    """Spans of time with the names of clusters, in time order."""
+
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC
+    ends: Int64  # likewise
+    texts: NDArray[np.object_]  # [shape=(n,)] of str
+
+
+@dataclass(frozen=True)
+class Occurrences:
+    """Sounds or turns of speech of a home, in the order of logs, and by time within a log."""
+
+    logs: list[Path]  # one for each microphone in it
+    microphones: list[str]
+    log: Int64  # [shape=(n,)]; index into `logs`
+    microphone: Int64  # [shape=(n,)]; index into `microphones`
+    starts: Int64  # [shape=(n,)], in nanoseconds of UTC
+    ends: Int64  # likewise
+    losses: list[str]
+    without: int  # number of logs without what is to be found
+
+    def spans(self, of: Int64, texts: Sequence[str]) -> dict[str, NamedSpans]:
+        """Return the spans of each microphone; `of` is the row of `texts`, or `NO_CLUSTER`."""
+        order, names = np.argsort(self.starts, kind="stable"), np.array(texts, object)
+        found = {}
+        for place, microphone in enumerate(self.microphones):
+            rows = order[(self.microphone[order] == place) & (of[order] != NO_CLUSTER)]
+            found[microphone] = NamedSpans(self.starts[rows], self.ends[rows], names[of[rows]])
+        return found
+
+    def days_and_hours(self, rows: Int64, zone: tzinfo) -> tuple[int, list[int]]:
+        """Return the number of local days of some occurrences, and how many began in each hour."""
+        moments = [local_time(start, zone) for start in self.starts[rows].tolist()]
+        hours = np.bincount([moment.hour for moment in moments], minlength=HOURS)
+        return len({moment.date() for moment in moments}), hours.tolist()
+
+
+def places(parts: Sequence[tuple[Path, str, Timed]]) -> tuple[list[Path], list[str], Int64, Int64]:
+    """Return `logs`, `microphones`, `log` and `microphone` of `Occurrences`.
+
+    Each part is of one log and microphone.
+    """
+    microphones = list(dict.fromkeys(name for _, name, _ in parts))
+    counts = np.array([len(spans.starts) for _, _, spans in parts], np.int64)
+    of_microphone = np.array([microphones.index(name) for _, name, _ in parts], np.int64)
+    log = np.repeat(np.arange(len(parts)), counts)
+    return [log for log, _, _ in parts], microphones, log, of_microphone[log]
+
+
+def read_each(
+    entries: Sequence[HomeLog],
+    read: Callable[[HomeLog], None],
+    losses: list[str],
+    progress: Progress,
+) -> None:
+    """Read logs one by one, and add the errors of those that cannot be read to the losses."""
+    for number, entry in enumerate(entries, 1):
+        with collect_errors(losses, LogError):
+            read(entry)
+        progress(number / len(entries))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, StringConstraints
 
-from hearthlog.analyzer.discover.clusters import (
+from hearthlog.analyzer.discover import (
     MOST_CLUSTERS,
     NO_CLUSTER,
     ClusterId,

@@ -12,7 +12,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.discover.clusters import (
+from hearthlog.analyzer.discover import (
     NO_CLUSTER,
     NamedSpans,
     Occurrences,

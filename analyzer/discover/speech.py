@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.discover.clusters import (
+from hearthlog.analyzer.discover import (
     NO_CLUSTER,
     NamedSpans,
     Occurrences,

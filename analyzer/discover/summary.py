@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
-from hearthlog.analyzer.discover.clusters import (
+from hearthlog.analyzer.discover import (
     HOURS,
     MOST_CLUSTERS,
     MOST_NUMBER,

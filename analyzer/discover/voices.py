@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from safetensors.numpy import load
 
-from hearthlog.analyzer.discover.clusters import (
+from hearthlog.analyzer.discover import (
     MOST_CLUSTERS,
     NO_CLUSTER,
     ClusterId,

@@ -35,7 +35,7 @@ from hearthlog.tools.cli.terminal import (
 if TYPE_CHECKING:
     from datetime import tzinfo
 
-    from hearthlog.analyzer.discover.clusters import ClusterKind, Clusters, NamedSpans
+    from hearthlog.analyzer.discover import ClusterKind, Clusters, NamedSpans
     from hearthlog.analyzer.discover.groups import Groups
     from hearthlog.analyzer.discover.sounds import Looked
     from hearthlog.analyzer.discover.speech import HomeSpeech
@@ -85,7 +85,7 @@ def discover(
     Groups keep their numbers in later runs. Sounds that a person has marked keep their marks.
     Exit status 3: a log is damaged, unfinished or has other features; the others were used.
     """
-    from hearthlog.analyzer.discover.clusters import locked_file
+    from hearthlog.analyzer.discover import locked_file
     from hearthlog.analyzer.discover.groups import GROUPS
     from hearthlog.analyzer.discover.sounds import CHOICES, Looked
     from hearthlog.analyzer.errors import require
@@ -322,7 +322,7 @@ def voices(
     Voices keep their numbers in later runs. Exit status 3: a log is damaged, or its features
     cannot separate voices; the others were used.
     """
-    from hearthlog.analyzer.discover.clusters import locked_file
+    from hearthlog.analyzer.discover import locked_file
     from hearthlog.analyzer.discover.speech import find_voices, read_speech
     from hearthlog.analyzer.discover.summary import summarise_voices
     from hearthlog.analyzer.discover.voices import VOICES, load_voices, save_voices

@@ -19,7 +19,7 @@ import typer
 from numpy.typing import NDArray
 from sklearn.metrics import adjusted_rand_score
 
-from hearthlog.analyzer.discover.clusters import NO_CLUSTER
+from hearthlog.analyzer.discover import NO_CLUSTER
 from hearthlog.analyzer.discover.sounds import ALL, HomeSounds, discover, read_sounds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
