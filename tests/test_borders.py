@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.models.classifiers.model import Smoothing
-from hearthlog.models.labels.segments import Borders, Segmenter, SegmenterInput
+from hearthlog.models.labels import Borders, Segmenter, SegmenterInput
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
 
 pytestmark = pytest.mark.fast

@@ -24,7 +24,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.features.floor import FloorTracker
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.labels.segments import Segmenter, SegmenterInput
+from hearthlog.models.labels import Segmenter, SegmenterInput
 from hearthlog.models.labels.smoothing import (
     ClassesApart,
     FixedLagSmoother,

@@ -27,8 +27,8 @@ from hearthlog.analyzer.relabel.stream_labeller import (
 )
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
+from hearthlog.models.labels import Segment, StateRun
 from hearthlog.models.labels.labeller import FrameLabels, label_columns, segment_columns
-from hearthlog.models.labels.segments import Segment, StateRun
 from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.errors import HearthlogError, LogError, ModelError
 from hearthlog.schemas.frames import NANOSECONDS

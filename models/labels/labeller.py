@@ -17,7 +17,7 @@ from hearthlog.models.classifiers.evidence import (
 )
 from hearthlog.models.embedding import Int8
 from hearthlog.models.features.floor import Floors, is_quiet
-from hearthlog.models.labels.segments import Segment, Segmenter, SegmenterInput
+from hearthlog.models.labels import Segment, Segmenter, SegmenterInput
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.messages.cdr_codec import Column
 from hearthlog.schemas.messages.topics import EmbeddingSource

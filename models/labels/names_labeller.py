@@ -12,8 +12,8 @@ from hearthlog.models.classifiers.evidence import NO_AUXILIARY, Auxiliary
 from hearthlog.models.classifiers.network_names import MARGIN_FRAMES
 from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES, Embeddings
 from hearthlog.models.features.floor import Floors
+from hearthlog.models.labels import Segment, Segmenter, SegmenterInput
 from hearthlog.models.labels.labeller import FrameLabels, Labeller
-from hearthlog.models.labels.segments import Segment, Segmenter, SegmenterInput
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.messages.topics import EmbeddingSource
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features import FeatureSet
-from hearthlog.models.labels.segments import Segment
+from hearthlog.models.labels import Segment
 from hearthlog.recorder.events import OK, WARNING, Gap, Notice, SourceHealth
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS, SAMPLE_RATE

@@ -10,9 +10,9 @@ from hearthlog.models.embedding import WINDOW_FRAMES, Embeddings
 from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.features import SILENCE_POWER, FeatureSet, mean_and_std
 from hearthlog.models.features.floor import Floors, is_quiet
+from hearthlog.models.labels import Segment
 from hearthlog.models.labels.labeller import FrameLabels, segment_columns
 from hearthlog.models.labels.names_labeller import labeller_of
-from hearthlog.models.labels.segments import Segment
 from hearthlog.recorder.stream import EncodedMessage, column_messages, segment_line
 from hearthlog.schemas.arrays import Bool, Float32, Indices, Int64
 from hearthlog.schemas.messages import message_types
