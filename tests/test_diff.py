@@ -15,7 +15,7 @@ from spliced import record_logs, run
 from stores import put
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import Events, compare_labellings
+from hearthlog.analyzer.evaluation import Events, compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.spans import NONE

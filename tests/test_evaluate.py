@@ -12,7 +12,7 @@ from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import (
+from hearthlog.analyzer.evaluation import (
     Events,
     event_based,
     false_alarms_per_day,

@@ -15,7 +15,7 @@ import pytest
 from spliced import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import compare_labellings
+from hearthlog.analyzer.evaluation import compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, common
 from hearthlog.analyzer.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks

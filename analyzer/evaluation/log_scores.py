@@ -10,7 +10,7 @@ import numpy as np
 
 from hearthlog.analyzer.activity.event_counts import events_of
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import (
+from hearthlog.analyzer.evaluation import (
     Detections,
     Events,
     detect,

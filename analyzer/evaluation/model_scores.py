@@ -7,7 +7,7 @@ from itertools import compress
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import Detections, Events, detect
+from hearthlog.analyzer.evaluation import Detections, Events, detect
 from hearthlog.analyzer.training.calibration import softmax
 from hearthlog.analyzer.training.clips import AS_IT_IS, captured, model_embedder, steady_noise
 from hearthlog.analyzer.training.dataset import (

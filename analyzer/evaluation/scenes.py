@@ -18,7 +18,7 @@ import numpy as np
 from scipy.fft import irfft, rfft
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import Detections
+from hearthlog.analyzer.evaluation import Detections
 from hearthlog.analyzer.evaluation.log_scores import evaluate_labelling, read_labelling
 from hearthlog.analyzer.evaluation.model_scores import check_classes
 from hearthlog.analyzer.logs.labelling import Labelling

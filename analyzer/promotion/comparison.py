@@ -10,7 +10,7 @@ import numpy as np
 
 from hearthlog.analyzer.activity.event_counts import beta_quantile
 from hearthlog.analyzer.errors import DataError, collect_errors
-from hearthlog.analyzer.evaluation.event_scores import compare_labellings
+from hearthlog.analyzer.evaluation import compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
 from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.analyzer.promotion.paired_labels import (

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError, collect_errors
-from hearthlog.analyzer.evaluation.event_scores import Events, LabellingDifference
+from hearthlog.analyzer.evaluation import Events, LabellingDifference
 from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.analyzer.logs.spans import Spans, union
 from hearthlog.analyzer.promotion.recent_time import (

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import Events, indexed_events
+from hearthlog.analyzer.evaluation import Events, indexed_events
 from hearthlog.analyzer.logs.labelling import LabelledFile, Labelling, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, overlay

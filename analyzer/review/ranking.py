@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import DAY, indexed_events
+from hearthlog.analyzer.evaluation import DAY, indexed_events
 from hearthlog.analyzer.logs.labelling import LABEL_FIELDS, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.spans import Spans, pieces
 from hearthlog.analyzer.review.spans import (

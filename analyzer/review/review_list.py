@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.errors import DataError, collect_errors
-from hearthlog.analyzer.evaluation.event_scores import LabellingDifference
+from hearthlog.analyzer.evaluation import LabellingDifference
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
 from hearthlog.analyzer.logs.layers import Coverage

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.evaluation.event_scores import Events
+from hearthlog.analyzer.evaluation import Events
 from hearthlog.analyzer.logs.labelling import LabelledFile, Labellings
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.logs.selection import array_names

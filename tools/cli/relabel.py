@@ -214,7 +214,7 @@ class _Result(NamedTuple):
 
 
 def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _Result:
-    from hearthlog.analyzer.evaluation.event_scores import compare_labellings
+    from hearthlog.analyzer.evaluation import compare_labellings
     from hearthlog.analyzer.review.review_list import disagreements
 
     difference = compare_labellings(*sides)

@@ -8,7 +8,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.terminal import GAP, NAME_WIDTH, moment, print_table, terminal_width
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.evaluation.event_scores import Amounts, Detections, LabellingDifference
+    from hearthlog.analyzer.evaluation import Amounts, Detections, LabellingDifference
     from hearthlog.analyzer.evaluation.log_scores import EventCount
     from hearthlog.analyzer.evaluation.scenes import SceneScores, SingleCoughs
     from hearthlog.analyzer.review.ranking import ReviewQueue

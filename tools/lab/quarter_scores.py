@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hearthlog.analyzer.evaluation.event_scores import false_alarms_per_day, indexed_events
+from hearthlog.analyzer.evaluation import false_alarms_per_day, indexed_events
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import overlay
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN, class_name

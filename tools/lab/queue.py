@@ -15,7 +15,7 @@ import numpy as np
 import soundfile
 import typer
 
-from hearthlog.analyzer.evaluation.event_scores import indexed_events
+from hearthlog.analyzer.evaluation import indexed_events
 from hearthlog.analyzer.evaluation.scenes import Colour, background, compose
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
