@@ -1,4 +1,4 @@
-"""Scores of labelled spans against a reference, and differences between two labellings."""
+"""Evaluation: scores of labelled spans against a reference, and differences of labellings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
