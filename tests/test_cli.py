@@ -84,7 +84,8 @@ def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(
     doubt = figures["unsure"]["hall"]
     assert rest[len(rows)] == f"hall is unsure of {60 * doubt['minutes']:.0f} s of these"
     counts = figures["day"]["counts"]
-    parts = [f"{in_words(name).lower()} {counts[name]['counted']}" for name in ordered(counts)]
+    sure = {name: own["counted"] - own["unsure"] for name, own in counts.items()}
+    parts = [f"{in_words(name).lower()} {sure[name] or 'none'}" for name in ordered(counts)]
     assert rest[len(rows) + 1].startswith(
         "Labelled on Sunday, 2026-03-01, counted as in the report: "
     )

@@ -17,6 +17,7 @@ from hearthlog.analyzer.activity.event_counts import (
     CheckedRates,
     beta_quantile,
     checked_rates,
+    events_and_confidences,
     events_of,
     overlapping,
     sounding_minutes,
@@ -363,7 +364,7 @@ def _sounding(logs: HomeLogs, start: int, microphone: str) -> Iterator[Bool]:
 
 SURE, NOT_SURE = "sure", "not sure"
 _RIGHT = 0.9  # of the labels
-_DOUBTFUL = 0.7  # probability below which a model itself is in doubt
+DOUBTFUL = 0.7  # probability below which a model itself is in doubt
 _FEWEST = 10  # labelled events
 _LOWER = 0.25  # quantile of the share that is right
 _NO_SOUNDS = {SILENCE, TELEVISION, UNKNOWN}
@@ -378,7 +379,7 @@ class Sureness(NamedTuple):
         """Return a word for a confidence; empty if none can be justified."""
         if confidence >= self.sure:
             return SURE
-        return NOT_SURE if confidence < _DOUBTFUL else ""
+        return NOT_SURE if confidence < DOUBTFUL else ""
 
     def is_unsure(self, confidence: float) -> bool:
         """Whether a confidence is shown as not sure."""
@@ -401,10 +402,8 @@ def checked_confidences(reviewed: Iterable[ReviewedLabels]) -> tuple[Float64, Bo
         for name in sorted(set(one.labels.labels) - _NO_SOUNDS):
             own = one.labels.labels == name
             segments = Spans(one.labels.starts[own], np.minimum(one.labels.ends[own], end))
-            events = events_of(one.labels, name)
-            row = rows_at(events, segments.starts)
-            highest, right = np.zeros(len(events.starts)), np.zeros(len(events.starts), bool)
-            np.maximum.at(highest, row, one.labels.confidences[own])
+            events, highest = events_and_confidences(one.labels, name)
+            row, right = rows_at(events, segments.starts), np.zeros(len(events.starts), bool)
             correct = without(cut(true.get(name, NONE), start, end), one.undecided)
             np.logical_or.at(right, row, overlapping(segments, correct))
             begun = (events.starts >= start) & (events.starts < end)

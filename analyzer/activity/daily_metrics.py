@@ -10,12 +10,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
+from hearthlog.analyzer.activity.checked_minutes import DOUBTFUL, CheckedMinutes
 from hearthlog.analyzer.activity.day_profile import HomeSegments, longest_quiet, stretches
 from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
     SET_APART,
     CheckedRates,
+    events_and_confidences,
     events_of,
     sounding_minutes,
     strata_of,
@@ -39,7 +40,7 @@ from hearthlog.analyzer.logs.spans import (
     without,
 )
 from hearthlog.models.classes import SILENCE, TELEVISION, UNKNOWN, class_name, ordered
-from hearthlog.schemas.arrays import Bool, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
 
@@ -53,8 +54,8 @@ class HomeMinutes:
     television: Bool  # [shape=(n,)]; whether they have a television-like sound
     gone_through: Bool  # [shape=(n,)]; whether a person reviewed the complete minute
     reviewed: Spans  # by a person, at all microphones
-    # [shape=(3, n)]; events that begin in each minute: labelled ones outside of reviewed spans, all
-    # after corrections, and those of them that begin in reviewed spans
+    # [shape=(4, n)]; events that begin in each minute: labelled ones outside of reviewed spans, all
+    # after corrections, and those of them that begin in reviewed spans, or are not sure elsewhere
     events: dict[str, Int64]
 
     def between(self, spans: Spans) -> "HomeMinutes":
@@ -70,7 +71,7 @@ class HomeMinutes:
         own = self.rows(~self.television) if name in SET_APART else self
         if name not in own.events:
             return Count(rates=rates)
-        labelled, corrected, certain = own.events[name]
+        labelled, corrected, certain, unsure = own.events[name]
         near_television = int(self.events[name][2].sum() - certain.sum())
         rest = ~own.gone_through
         strata = strata_of(labelled[rest], own.sounding[rest])
@@ -79,6 +80,7 @@ class HomeMinutes:
             int(certain.sum()) + near_television,
             strata,
             rates,
+            int(unsure.sum()),
         )
 
     def counted(self, name: str, starts: Int64) -> Int64:
@@ -92,7 +94,7 @@ class HomeMinutes:
         """Count the events of a `SET_APART` class that `count` leaves out; 0 for other classes."""
         if name not in SET_APART or name not in self.events:
             return 0
-        _, corrected, certain = self.events[name]
+        _, corrected, certain, _ = self.events[name]
         return int((corrected - certain)[self.television].sum())
 
     def rows(self, rows: Bool) -> "HomeMinutes":
@@ -108,20 +110,25 @@ class HomeMinutes:
 
 
 def home_minutes(
-    labels: Labelling, gone_through: Sequence[Spans], coverage: Spans, events: Mapping[str, Int64]
+    labels: Labelling,
+    gone_through: Sequence[Spans],
+    coverage: Spans,
+    events: Mapping[str, tuple[Int64, Float32]],
 ) -> HomeMinutes:
     """Count the events that begin in each minute with coverage by at least one microphone.
 
-    `events` has the event starts of each class except silence, after corrections.
+    `events` has the starts and highest confidences of the events of each class except silence,
+    after corrections.
     """
     first, last = int(coverage.starts[0]) // MINUTE, -(-int(coverage.ends[-1]) // MINUTE)
     edges = np.arange(first, last + 1) * MINUTE
     reviewed = reduce(common, gone_through)
     begun = {}
-    for name, starts in events.items():
-        labelled = events_of(labels, name).starts
+    for name, (starts, confidences) in events.items():
+        labelled, certain = events_of(labels, name).starts, rows_at(reviewed, starts) >= 0
         unreviewed = labelled[rows_at(reviewed, labelled) < 0]
-        kinds = unreviewed, starts, starts[rows_at(reviewed, starts) >= 0]
+        unsure = starts[~certain & (confidences < DOUBTFUL)]
+        kinds = unreviewed, starts, starts[certain], unsure
         begun[name] = np.array([np.diff(np.searchsorted(kind, edges)) for kind in kinds])
     minutes = HomeMinutes(
         edges[:-1],
@@ -199,7 +206,8 @@ def metrics_of_home(data: HomeData, checks: CheckedMinutes | None = None) -> Hom
         knowing = [part for source, part in data.segments.items() if name in data.classes[source]]
         listened[name] = in_order(knowing).spans()
         spans[name] = labels.spans(labels.labels == name)
-        events[name] = events_of(labels, name).starts
+        own, highest = events_and_confidences(labels, name)
+        events[name] = own.starts, highest
     if SILENCE in spans:
         spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone has a sound
         del events[SILENCE]
@@ -207,7 +215,8 @@ def metrics_of_home(data: HomeData, checks: CheckedMinutes | None = None) -> Hom
     labelled = in_order(data.labelled.values())
     minutes = home_minutes(labelled, gone_through, everything, events)
     rates = {} if checks is None else checked_rates_of(minutes, checks)
-    return HomeMetrics(classes, everything, listened, sound, spans, events, minutes, rates)
+    starts = {name: own for name, (own, _) in events.items()}
+    return HomeMetrics(classes, everything, listened, sound, spans, starts, minutes, rates)
 
 
 def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSegments:
@@ -417,12 +426,18 @@ class HomeEvent(NamedTuple):
     reviewed: bool  # whether a person reviewed its start, at all microphones
     television: bool  # beside something like a television; no report counts it
 
+    @property
+    def is_unsure(self) -> bool:
+        """Whether the model is not sure of it, and nobody reviewed it."""
+        return self.confidence < DOUBTFUL and not self.reviewed
+
 
 class EventTotal(NamedTuple):
     """Events of a class that a report counts, and those beside something like a television."""
 
     counted: int
     television: int
+    unsure: int = 0  # counted, but the model is not sure, and nobody reviewed them
 
 
 def event_totals(metrics: HomeMetrics, start: int, end: int) -> dict[str, EventTotal]:
@@ -433,7 +448,8 @@ def event_totals(metrics: HomeMetrics, start: int, end: int) -> dict[str, EventT
         starts = own.events.get(name, NONE.starts)
         counted = len(own.minutes.counted(name, starts))
         if len(starts):
-            totals[name] = EventTotal(counted, len(starts) - counted)
+            unsure = own.minutes.count(name, None).unsure
+            totals[name] = EventTotal(counted, len(starts) - counted, unsure)
     return totals
 
 

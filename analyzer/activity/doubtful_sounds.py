@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.activity.event_counts import events_of
+from hearthlog.analyzer.activity.event_counts import events_and_confidences
 from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.selection import array_names
-from hearthlog.analyzer.logs.spans import rows_at
 from hearthlog.models.classes import (
     COUGHING,
     CRYING,
@@ -83,9 +82,7 @@ def doubtful_events(labels: Labelling) -> Labelling:
     """Return the events that are in doubt, with the highest confidence of their segments."""
     parts = []
     for name in sorted(set(labels.labels[labels.confidences < _DOUBTFUL])):
-        own, events = labels.labels == name, events_of(labels, name)
-        highest = np.zeros(len(events.starts), np.float32)
-        np.maximum.at(highest, rows_at(events, labels.starts[own]), labels.confidences[own])
+        events, highest = events_and_confidences(labels, name)
         rows = [is_doubtful(name, confidence) for confidence in highest.tolist()]
         names = np.full(sum(rows), name, object)
         parts.append(Labelling(events.starts[rows], events.ends[rows], names, highest[rows]))

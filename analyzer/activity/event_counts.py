@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, lengths
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, lengths, rows_at
 from hearthlog.models.classes import (
     COUGHING,
     CRYING,
@@ -19,7 +19,7 @@ from hearthlog.models.classes import (
     SPEECH,
     YELLING,
 )
-from hearthlog.schemas.arrays import Bool, Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
 MINUTE = 60 * NANOSECONDS
@@ -36,6 +36,14 @@ _VOICED = 0.4  # of the minutes
 def events_of(labels: Labelling, name: str) -> Spans:
     """Return the events of a class: its spans, merged across pauses of at most ten seconds."""
     return labels.spans(labels.labels == name, EVENT_PAUSE)
+
+
+def events_and_confidences(labels: Labelling, name: str) -> tuple[Spans, Float32]:
+    """Return the events of a class, and the highest confidence of the segments of each."""
+    own, events = labels.labels == name, events_of(labels, name)
+    highest = np.zeros(len(events.starts), np.float32)
+    np.maximum.at(highest, rows_at(events, labels.starts[own]), labels.confidences[own])
+    return events, highest
 
 
 def sounding_minutes(labels: Labelling, edges: Int64) -> Bool:

@@ -47,6 +47,7 @@ class Count(_Quantity):
     certain: int = 0  # events within reviewed minutes
     unchecked: Strata = NO_MINUTES  # events in minutes without review
     rates: CheckedRates | None = None  # None if too few minutes were checked
+    unsure: int = 0  # labelled events of which the model is not sure, and that nobody reviewed
 
     def __add__(self, other: "Count") -> "Count":
         return Count(
@@ -54,6 +55,7 @@ class Count(_Quantity):
             self.certain + other.certain,
             self.unchecked.plus(other.unchecked),
             self.rates or other.rates,
+            self.unsure + other.unsure,
         )
 
     @property
@@ -73,7 +75,9 @@ class Count(_Quantity):
 
     @property
     def text(self) -> str:
-        """In words: `4 to 6 (7 labelled)`; the labelled number alone without checks."""
+        """In words: `4 to 6 (7 labelled)`; without checks `4`, or `4 (+3?)` if 3 are not sure."""
+        if self.range is None and self.unsure:
+            return f"{self.labelled - self.unsure} (+{self.unsure}?)"
         if self.range is None or self.range == (self.labelled, self.labelled):
             return f"{self.labelled}"
         low, high = self.range

@@ -1,6 +1,6 @@
 """Headline of a report: what a day or a week was like, in two or three short sentences."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -92,19 +92,29 @@ def is_quiet(day: DayMetrics) -> bool:
 def amount(name: str, count: Count, *, named: bool = True) -> str:
     """Return a number of events in words, as labelled: `two bouts of coughing`, `crying once`.
 
-    Without the name of the class, just `two`, `once`.
+    Without the name of the class, just `two`, `once`. With events that are not sure, `two (perhaps
+    four) bouts of coughing`.
     """
-    several, number = several_in_words(name).lower(), number_in_words(count.labelled)
+    several = several_in_words(name).lower()
+    sure = count.labelled - (count.unsure if count.range is None else 0)
     if several.startswith("times of "):
-        often = _REPEATED.get(count.labelled, f"{number} times")
+        often = _with_unsure(sure, count.labelled, _often)
         return f"{in_words(name).lower()} {often}" if named else often
+    number = _with_unsure(sure, count.labelled, number_in_words)
     if count.labelled == 1:
         bouts = several.startswith("bouts ")
         several = several.replace("bouts", "bout", 1) if bouts else in_words(name).lower()
     return f"{number} {several}" if named else number
 
 
-_REPEATED = {1: "once", 2: "twice"}
+def _with_unsure(sure: int, labelled: int, words: Callable[[int], str]) -> str:
+    if sure == labelled:
+        return words(labelled)
+    return f"{words(sure)} (perhaps {words(labelled)})" if sure else f"perhaps {words(labelled)}"
+
+
+def _often(number: int) -> str:
+    return {1: "once", 2: "twice"}.get(number, f"{number_in_words(number)} times")
 
 
 def _day(day: DayMetrics) -> str:

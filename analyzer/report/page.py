@@ -208,6 +208,7 @@ def _page(account: Account, picture: PagePicture, **parts: Any) -> str:
         confused=_listed(account.confused),
         uncounted=_listed(uncounted),
         television=_television(account),
+        unsure=any(_is_unsure(account, name) for name in names),
         scenarios=[(plain(name), _scenario(account, name)) for name in account.scenarios],
         days_before=BASELINE_DAYS,
         interrai=_interrai(account, days),
@@ -313,6 +314,12 @@ def _occurs(account: Account, name: str) -> bool:
     uncounted = any(day.beside_television(name) for day in account.days)
     now = any(value and value.labelled for value in values)
     return uncounted or now or bool(baseline and baseline[0].highest)
+
+
+def _is_unsure(account: Account, name: str) -> bool:
+    """Whether the page shows how many events of a class are not sure."""
+    counts = [count for day in account.days if (count := day.count(name)) is not None]
+    return any(count.unsure and count.range is None for count in counts)
 
 
 def _is_known(account: Account, name: str) -> bool:

@@ -218,8 +218,9 @@ def _still(day: DayMetrics) -> str:
     last = f"after {day.last.text}" if day.last.minutes < _MIDNIGHT else ""
     times = listed([time for time in (first, last) if time], "and")
     partly = day.span.length - day.coverage.length >= _MINUTE
-    known = "as far as it was recorded" if partly else "as labelled"
-    return f"There were only short sounds, if any, {times}, {known}." if times else ""
+    recorded = ", as far as it was recorded" * partly
+    steady = "steady sound, such as a fan's, counts as quiet"
+    return f"Hardly any sound was labelled {times}{recorded}; {steady}." if times else ""
 
 
 def _changes(account: Account, day: DayMetrics) -> str:

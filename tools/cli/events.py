@@ -282,9 +282,12 @@ def _print(
         if not own and len(classes) > 1:
             continue
         apart = sum(event.television for event in own)
+        unsure = sum(event.is_unsure and not event.television for event in own)
+        sure = len(own) - apart - unsure or "none"
+        doubt = f", and perhaps {unsure} more" if unsure else ""
         television = f", and {apart} while something like a television sounded" if apart else ""
         by_hand = ", only what people marked: the model does not know it" * (name in marked)
-        print(f"{in_words(name)} {span.words}: {len(own) - apart or 'none'}{television}{by_hand}")
+        print(f"{in_words(name)} {span.words}: {sure}{doubt}{television}{by_hand}")
     pauses = [
         f"{local_time(start, zone):{form[:-3]}} to {local_time(end, zone):{form[:-3]}}"
         for start, end in missing.pairs()

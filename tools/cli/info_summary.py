@@ -206,11 +206,13 @@ def _minutes(minutes: float) -> str:
 
 
 def day_line(day: date, totals: Mapping[str, EventTotal]) -> str:
-    """Return how often each sound occurred on a day, those beside a television apart."""
+    """Return how often each sound occurred on a day; apart: not sure, beside a television."""
     parts = []
-    for name, (counted, television) in totals.items():
-        text = f"{in_words(name).lower()} {counted or 'none'}"
-        parts.append(f"{text} (and {television} beside a television)" if television else text)
+    for name, (counted, television, unsure) in totals.items():
+        notes = [f"+{unsure} not sure"] * bool(unsure)
+        notes += [f"+{television} beside a television"] * bool(television)
+        text = f"{in_words(name).lower()} {counted - unsure or 'none'}"
+        parts.append(f"{text} ({', '.join(notes)})" if notes else text)
     return f"Labelled on {day:%A, %Y-%m-%d}, counted as in the report: {listed(parts, 'and')}"
 
 

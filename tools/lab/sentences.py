@@ -333,6 +333,9 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
                 high = _number(match[2]) if match.lastindex == 2 else low
                 span = next((own for when, own in parts.items() if when in part), day.span)
                 true = day.home.minutes.between(span).count(name, None).labelled
+                if doubtful := re.search(rf"\(?perhaps ({_NUMBER})", part):
+                    high = _number(doubtful[1])
+                    low = low if doubtful[0].startswith("(") else 0
                 yield _counted(surface, part, (low, high), true, modest=modest)
                 if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
                     yield _at_times(surface, part, name, clocks, truth, modest=modest)
@@ -370,7 +373,7 @@ def _gist(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
         yield from _counts_in(REPORT, text, truth)
         if (stated := read_minutes(text)) is not None and true.night_sound is not None:
             yield _lasted(REPORT, text, stated, true.night_sound.minutes, modest=modest)
-    elif match := re.search(r"only short sounds", text):
+    elif match := re.search(r"Hardly any sound", text):
         before = re.search(r"until (\d\d:\d\d)", text)
         after = re.search(r"after (\d\d:\d\d)", text)
         spans = [(int(true.span.starts[0]), _time(true, before[1]))] if before else []
