@@ -7,11 +7,14 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import hearthlog
+from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs
@@ -59,6 +62,15 @@ def command(env, *arguments):
         env=os.environ | env,
         check=False,
     )
+
+
+def test_a_module_that_moved_is_imported_with_a_warning_that_names_the_new_one():
+    with pytest.warns(DeprecationWarning, match=r"is now hearthlog\.models\.features$") as caught:
+        import hearthlog.models.features.feature_set as moved  # noqa: PLC0415
+    assert moved.FeatureSet is FeatureSet
+    assert caught[0].filename == __file__
+    for new in hearthlog._MOVED.values():
+        assert find_spec(new) is not None
 
 
 def test_a_log_has_the_features_and_labels_of_the_example(logs):

@@ -4,7 +4,10 @@ The public API is `__all__`; all other modules may change between versions. Name
 first use, so `import hearthlog` costs a recorder nothing.
 """
 
+import sys
+import warnings
 from importlib import import_module
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -77,3 +80,42 @@ def _imported(module: str) -> ModuleType:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+_MOVED = {  # modules that documents of earlier versions name, mostly for extensions
+    "hearthlog.analyzer.evaluation.event_scores": "hearthlog.analyzer.evaluation",
+    "hearthlog.analyzer.marks.marks": "hearthlog.analyzer.marks",
+    "hearthlog.analyzer.training.landmark_method": "hearthlog.analyzer.training.window_methods",
+    "hearthlog.analyzer.training.learned_inputs": "hearthlog.analyzer.training.window_methods",
+    "hearthlog.analyzer.training.svm_method": "hearthlog.analyzer.training.window_methods",
+    "hearthlog.analyzer.training.window_method": "hearthlog.analyzer.training.window_methods",
+    "hearthlog.models.classifiers.classifier_kind": "hearthlog.models.classifiers",
+    "hearthlog.models.classifiers.learned_windows": "hearthlog.models.classifiers",
+    "hearthlog.models.classifiers.rbf_distances": "hearthlog.models.classifiers.rbf_machines",
+    "hearthlog.models.classifiers.svm_rbf": "hearthlog.models.classifiers.rbf_machines",
+    "hearthlog.models.embedding.projection": "hearthlog.models.embedding",
+    "hearthlog.models.features.feature_set": "hearthlog.models.features",
+    "hearthlog.models.features.window_inputs": "hearthlog.models.features",
+}
+
+
+class _MovedModules:
+    """Finds moved modules under their former names, with a warning that has the new one."""
+
+    @classmethod
+    def find_spec(cls, name: str, *_: object) -> ModuleSpec | None:
+        if name not in _MOVED:
+            return None
+        warnings.warn(f"{name} is now {_MOVED[name]}", DeprecationWarning, stacklevel=2)
+        return ModuleSpec(name, cls)  # type: ignore[arg-type]  a loader by its methods
+
+    @staticmethod
+    def create_module(_spec: ModuleSpec) -> None:
+        return None
+
+    @staticmethod
+    def exec_module(module: ModuleType) -> None:
+        sys.modules[module.__name__] = import_module(_MOVED[module.__name__])
+
+
+sys.meta_path.append(_MovedModules)  # after those that find what exists
