@@ -107,7 +107,7 @@ class _MovedModules:
         if name not in _MOVED:
             return None
         warnings.warn(f"{name} is now {_MOVED[name]}", DeprecationWarning, stacklevel=2)
-        return ModuleSpec(name, cls)  # type: ignore[arg-type]  a loader by its methods
+        return ModuleSpec(name, cls)  # type: ignore[arg-type]
 
     @staticmethod
     def create_module(_spec: ModuleSpec) -> None:
