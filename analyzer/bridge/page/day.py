@@ -24,11 +24,26 @@ from hearthlog.analyzer.logs.local_time import (
     local_time,
 )
 from hearthlog.analyzer.logs.spans import joined
-from hearthlog.models.classes import COUGHING, CRYING, PHONE_RING, YELLING, colour_on_paper, ordered
+from hearthlog.models.classes import (
+    COUGHING,
+    CRYING,
+    FLUSHING_WATER,
+    PHONE_RING,
+    RUNNING_WATER,
+    SHOWER,
+    SPEECH,
+    TAP_WATER,
+    YELLING,
+    colour_on_paper,
+    ordered,
+)
 from hearthlog.schemas.frames import NANOSECONDS
 
 BIN = 120 * NANOSECONDS  # as in the picture of the report
 IMPORTANT = frozenset({COUGHING, CRYING, YELLING, PHONE_RING})  # classes that need a look
+# What people ask about: the page states which of these no model of the home can tell.
+_EXPECTED = frozenset({*IMPORTANT, SPEECH, FLUSHING_WATER, SHOWER, TAP_WATER})
+_BATHROOM = frozenset({FLUSHING_WATER, SHOWER, TAP_WATER})
 _HOUR = 3600 * NANOSECONDS
 _LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
 _MOST_TIMES = 40  # of a count
@@ -140,7 +155,36 @@ def picture_of(home: HomeDay) -> Any:
         "nights": [(day.place(start), day.place(end)) for start, end in nights],
         "columns": [part.name for part in home.times_of_day()],
         "rooms": [_room(microphone, day, home) for microphone in home.microphones],
+        "missing": _missing_classes(home),
     }
+
+
+def _missing_classes(home: HomeDay) -> str:
+    """Return a note on the sounds that people ask about and no model of the home can tell.
+
+    Empty while the classes of the models are not known.
+    """
+    if not home.microphones or not all(each.names for each in home.microphones):
+        return ""
+    words = home.words
+    known = {
+        each.common_names.get(name, name) for each in home.microphones for name in each.names
+    }
+    hidden = frozenset[str]().union(*(each.never_tell for each in home.microphones))
+    missing = _EXPECTED - known - hidden
+    notes = []
+    if RUNNING_WATER in known and (joined_classes := missing & _BATHROOM):
+        missing -= _BATHROOM
+        water = words.inside(words.class_words(RUNNING_WATER))
+        classes = _listed_classes(joined_classes, words)
+        notes.append(words.text("missing.joined", classes=classes, water=water))
+    if missing:
+        notes.append(words.text("missing", classes=_listed_classes(missing, words)))
+    return " ".join(notes)
+
+
+def _listed_classes(names: Iterable[str], words: Words) -> str:
+    return words.listed([words.inside(words.class_words(name)) for name in ordered(names)])
 
 
 def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
@@ -199,7 +243,8 @@ def _lane(
     count = len(of_day) if of_day or None not in counts else None
     uncounted = sorted({*events} - {*counted})
     beside = sum(e.start >= day.start for e in uncounted)
-    last = (events if home.is_past and events else [None, *sounds.events])[-1]
+    of_last_days = [event for event in counted if event.start >= day.start - 24 * _HOUR]
+    last = (of_last_days if home.is_past and of_last_days else [None, *sounds.counted])[-1]
     at = "" if last is None else home.when(last.end)
     name = words.class_words(label)
     often = words.text("count.not known") if count is None else words.times(count)
@@ -212,6 +257,7 @@ def _lane(
         "label": label,
         "words": name,
         "colour": colour_on_paper(label),
+        "important": label in IMPORTANT,
         "bars": bars((event for event in counted if event.end > day.start), day),
         "pale": bars((event for event in uncounted if event.end > day.start), day),
         "told": description,
@@ -264,7 +310,7 @@ _QUIET_EVENTS = 5  # most events of important classes in a quiet night
 _PARTLY = ("night.partly", "day.partly", "day.past partly")
 _NOON = 12
 _MOST_CLASSES = 3  # in the sentence
-_MOST_CLOCKS = 3  # of a class
+_MOST_CLOCKS = 4  # of a class
 _LONGEST = 72  # characters of a sentence about several classes: four lines of a phone
 
 
@@ -348,11 +394,12 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     is_brief = len(names) > 1
     while True:
         shown = {name: found[name] for name in names}
-        for times in (_MOST_CLOCKS, 1, 0):
+        is_dispensable = names[-1] not in IMPORTANT - {PHONE_RING}
+        for times in (_MOST_CLOCKS,) if is_dispensable and names[1:] else (_MOST_CLOCKS, 1, 0):
             sentence = _sentence_of(when, shown, home, times if is_brief else None)
             if not names[1:] or len(sentence) <= _LONGEST:
                 return sentence
-        if names[-1] in IMPORTANT - {PHONE_RING}:
+        if not is_dispensable:
             return sentence
         names.pop()
 
@@ -402,8 +449,12 @@ def _class_and_times(
             count = len(unsure)
             times = words.more_times(count) if sure else words.times(count)
             where = _where(name, "" if sure else microphone, unsure, home, most)
-            text = _times_of(times, where, "" if parts else shown, words)
-            parts.append(words.text("perhaps", what=text))
+            if parts:
+                text = _times_of(times, where, "", words)
+                parts.append(words.text("perhaps", what=text))
+            else:
+                alike = words.text("alike", **{"class": shown})
+                parts.append(_times_of(times, where, alike, words))
     return parts
 
 

@@ -39,18 +39,30 @@ function fill(element, attributes, children) {
   return element;
 }
 
+// A number stays on the line of what it counts.
 export function write(element, text) {
-  if (element.textContent !== text) element.textContent = text;
+  const glued = text.replace(/(\d) (?=\p{L})/gu, "$1\u00a0");
+  if (element.textContent !== glued) element.textContent = glued;
 }
 
 export function set(element, name, value) {
   if (element.getAttribute(name) !== String(value)) element.setAttribute(name, value);
 }
 
-export function swatch(colour) {
+export function swatch(of) {
   const element = make("span", { class: "swatch", "aria-hidden": "true" });
-  element.style.backgroundColor = `rgb(${colour.join(" ")})`;
+  colour(element, of);
   return element;
+}
+
+// The colour of a class, also for a dark ground: there a dark one is made lighter, and so stays apart from
+// a bright one of the same hue.
+export function colour(element, of) {
+  const [red, green, blue] = of.map((part) => (part / 255) ** 2.2);
+  const isDark = 0.21 * red + 0.72 * green + 0.07 * blue < 0.2;
+  const light = isDark ? of.map((part) => Math.round(0.55 * part + 0.45 * 255)) : of;
+  element.style.setProperty("--class", `rgb(${of.join(" ")})`);
+  element.style.setProperty("--light", `rgb(${light.join(" ")})`);
 }
 
 // As many children as there are items, each changed only where it has to be: what somebody reads,

@@ -28,6 +28,7 @@ from hearthlog.analyzer.bridge.page.sounds import (
     ShownBouts,
     bouts,
     events_between,
+    needs_look,
     uncounted_ids,
 )
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scenario_lines
@@ -47,7 +48,7 @@ from hearthlog.schemas.messages.topics import is_sound
 _EVERY_SECONDS = 1.0
 _MARKS = {"/mark": False, "/mark-one": True}  # whether a mark is of the event alone
 _SHOW = {"yes": True, "no": False}
-_MOST_LOOKED_AT, _MOST_OTHERS = 8, 20  # bouts of the current day
+_MOST_LOOKED_AT, _MOST_OTHERS = 24, 20  # bouts of the current day
 _MOST_OF_DAY = 200  # bouts of a past day
 _MOST_IDS = 50  # events in a request
 _DAY = 24 * 3600 * NANOSECONDS
@@ -242,8 +243,10 @@ class HomePage:
         left = {True: _MOST_LOOKED_AT, False: _MOST_OTHERS}
         found = []
         for bout in self._bouts.values():
-            if left[bout.is_important]:
-                left[bout.is_important] -= 1
+            uncounted = sum(event.id in self._uncounted for event in bout.events)
+            look = needs_look(bout, uncounted)
+            if left[look]:
+                left[look] -= 1
                 found.append(bout)
         return found
 

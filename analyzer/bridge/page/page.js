@@ -1,5 +1,5 @@
 // The page of the home: what sounds now, what works, days, and the stream of news.
-import { ask, draw, keep, make, place, say, set, write } from "./elements.js";
+import { ask, colour, draw, inside, keep, make, place, say, set, write } from "./elements.js";
 import { drawAgain, marks, showDay, spans } from "./picture.js";
 import { allowSound, showEvents, showRecurring, showSoundsOf } from "./sounds.js";
 
@@ -162,7 +162,10 @@ async function showWeek() {
     row.button.addEventListener("click", () => chooseDay(date));
     return row;
   });
-  week.replaceChildren(...rows.map((row) => make("li", {}, row.button)));
+  const important = (today?.rooms ?? []).flatMap(({ lanes }) => lanes).filter((lane) => lane.important);
+  const names = [...new Set(important.map(({ words: name }) => inside(name)))].join(", ");
+  week.replaceChildren(...rows.map((row) => make("li", {}, row.button)),
+    ...(names ? [make("li", { class: "note" }, say("week rows", { classes: names }))] : []));
   for (const row of rows) {
     const day = row.date === today?.date ? today : await readDay(row.date);
     if (week.hidden || !row.button.isConnected) return;
@@ -172,15 +175,20 @@ async function showWeek() {
 }
 
 function showDayOfWeek(row, day) {
-  const width = 480, height = 22;
+  const width = 480, height = 36, upper = 19; // what needs a look is in a row of its own
   const lanes = day.rooms.flatMap((room) => room.lanes).filter(({ bars, pale }) => bars || pale);
   const now = day.now ?? 1;
   set(row.svg, "viewBox", `0 0 ${width} ${height}`);
   row.svg.replaceChildren(draw("path", { class: "shade", d: spans(day.nights, width, height) }),
     ...day.rooms.map(({ gaps }) => draw("path", { fill: "url(#unheard)", d: spans(gaps, width, height) })),
     draw("rect", { class: "future", x: now * width, width: (1 - now) * width, height }),
-    ...lanes.toReversed().flatMap(({ bars, pale, colour }) => [[pale, "marks pale"], [bars, "marks"]].map(([own, kind]) =>
-      draw("path", { class: kind, fill: `rgb(${colour.join(" ")})`, d: marks(own, width, day.hours.length, 0, height) }))));
+    draw("path", { class: "line", d: `M0 ${upper}.5H${width}` }),
+    ...lanes.toReversed().flatMap((lane) => [[lane.pale, "marks pale"], [lane.bars, "marks"]].map(([own, kind]) => {
+      const [top, tall] = lane.important ? [1, upper - 1] : [upper + 1, height - upper - 1];
+      const path = draw("path", { class: kind, d: marks(own, width, day.hours.length, top, tall) });
+      colour(path, lane.colour);
+      return path;
+    })));
   write(row.about, day.sentence);
 }
 

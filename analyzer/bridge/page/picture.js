@@ -1,5 +1,5 @@
 // A day as one picture, its counts, and the times behind a lane or a count.
-import { breakable, draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
+import { breakable, colour, draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
 import { showEntries } from "./sounds.js";
 
 const LANE = 36, NAME = 15, GAP = 3, HOURS = 20; // pixels
@@ -106,6 +106,27 @@ function beginRow(room, label, columns) {
   return row;
 }
 
+// The last row of a table, in place of those of classes that did not sound.
+function beginZero(columns) {
+  const button = make("button", { type: "button", class: "quiet zero", "aria-expanded": "false" });
+  button.addEventListener("click", () => {
+    set(button, "aria-expanded", String(button.getAttribute("aria-expanded") !== "true"));
+    drawAgain();
+  });
+  return { button, element: make("tr", {}, make("td", { colspan: columns.length + 2 }, button)) };
+}
+
+function showZero({ zero, rows, lanes }) {
+  const none = lanes.map(({ counts, bars, pale }) => !bars && !pale && counts.every((value) => value === 0));
+  const isFolded = zero.button.getAttribute("aria-expanded") !== "true";
+  rows.forEach(({ element, counts }, index) => {
+    element.hidden = isFolded && none[index] && !counts.includes(open?.button);
+  });
+  const names = lanes.filter((_, index) => none[index]).map(({ words }) => inside(words));
+  write(zero.button, say("zero", { classes: names.join(", ") }));
+  zero.element.hidden = !names.length;
+}
+
 function showRow(row, it, where, columns) {
   if (!row.name.firstChild) row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour), make("span", {}, breakable(it.words))));
   it.counts.forEach((value, index) => {
@@ -169,7 +190,7 @@ function showRoom(room, { gaps, unheard, lanes }, day) {
     lane.label = it.label;
     for (const [path, bars] of [[lane.marks, it.bars], [lane.pale, it.pale]]) {
       set(path, "d", marks(bars, width, day.hours.length, top + NAME, LANE - NAME - GAP));
-      set(path, "fill", `rgb(${it.colour.join(" ")})`);
+      colour(path, it.colour);
     }
     write(lane.name, it.words);
     write(lane.figure, it.count ? `${it.count}×` : "");
@@ -192,9 +213,11 @@ function showTable(room, day) {
   if (room.key !== key) { // else what somebody reads there stays
     room.key = key;
     room.rows = room.lanes.map(({ label }) => beginRow(room, label, day.columns));
-    room.body.replaceChildren(...room.rows.map(({ element }) => element));
+    room.zero = beginZero(day.columns);
+    room.body.replaceChildren(...room.rows.map(({ element }) => element), room.zero.element);
   }
   room.rows.forEach((row, index) => showRow(row, room.lanes[index], room.where, day.columns));
+  showZero(room);
 }
 
 let rooms = [], roomsOf = "", shown = null;
@@ -204,6 +227,8 @@ export function showDay(day) {
   shown = day;
   if (isNew) close();
   place("legend").hidden = !day.rooms.length;
+  write(place("missing"), day.missing);
+  place("missing").hidden = !day.missing;
   place("key-unheard").hidden = !day.rooms.some(({ gaps }) => gaps.length);
   place("key-beside").hidden = !day.rooms.some(({ lanes }) => lanes.some(({ pale }) => pale));
   const key = JSON.stringify(day.rooms.map(({ room }) => room));

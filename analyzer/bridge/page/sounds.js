@@ -4,6 +4,7 @@ import { ask, breakable, count, inside, keep, make, place, say, send, swatch, wr
 const REST = 8000; // milliseconds without a touch, after which a list may change
 const SEPARATOR = "\u00a0· "; // ends a line, and begins none
 const BRIEF = 6; // sounds that are shown at first
+const SINGLE = 2; // newest sounds of a class that are entries of their own, if more than one more needs a look
 const AGAIN = 60000; // after which it is asked again whether sound was kept
 let classes = [], isSoundAllowed = false;
 const lists = { look: new Map(), events: new Map(), recurring: new Map() }; // items by ids
@@ -94,7 +95,7 @@ function form(item, { legend, choices, save }) {
   const problem = make("p", { class: "problem", role: "alert" });
   const button = make("button", {}, say("save"));
   const question = make("form", {}, make("fieldset", {}, make("legend", {}, legend),
-    ...choices.map(([label, words]) => choice("label", label, words)), something), problem, button);
+    ...choices.map(([label, words]) => choice("label", label, words)), something), problem, make("div", { class: "save" }, button));
   question.addEventListener("submit", async (submitted) => {
     submitted.preventDefault();
     const label = new FormData(question).get("label") || own.value.trim();
@@ -115,6 +116,46 @@ function form(item, { legend, choices, save }) {
 function showAnswer(item, said) {
   write(item.said, said);
   item.element.classList.toggle("reviewed", Boolean(said) && item.isReviewable);
+}
+
+// Sounds that need a look: of each class the newest, and the others behind one tap.
+const unfolded = new Set(); // classes
+
+function folded(look) {
+  const entries = [], seen = new Map();
+  for (const entry of look) {
+    const same = entry.doubtful ? [] : look.filter(({ label, doubtful, room }) => label === entry.label && room === entry.room && !doubtful);
+    const key = `${entry.label} ${entry.room}`, number = seen.get(key) ?? 0;
+    seen.set(key, number + 1);
+    if (same.length <= SINGLE + 1 || number < SINGLE) entries.push({ ...entry, isFolded: false });
+    else if (number === SINGLE) {
+      const earlier = same.slice(SINGLE);
+      entries.push({ id: `fold ${key}`, key, earlier, colour: entry.colour, words: entry.words },
+        ...earlier.map((each) => ({ ...each, isFolded: !unfolded.has(key) })));
+    }
+  }
+  return entries;
+}
+
+function beginFold({ key, colour, words }) {
+  const item = { details: { open: false }, often: make("span", { class: "often" }), about: make("p", { class: "about" }),
+    button: make("button", { type: "button", class: "quiet fold" }) };
+  item.element = make("li", { class: "fold" }, make("div", {},
+    make("p", { class: "what" }, swatch(colour), breakable(words), item.often), item.about), item.button);
+  item.button.addEventListener("click", () => {
+    if (!unfolded.delete(key)) unfolded.add(key);
+    showList(shownEvents);
+  });
+  return item;
+}
+
+function showFold(item, { key, earlier, words }) {
+  const number = earlier.reduce((sum, { ids }) => sum + ids.length, 0), isOpen = unfolded.has(key);
+  write(item.often, `${SEPARATOR}${count("earlier", number)}`);
+  write(item.about, earlier.map(({ time, room }) => [time, room].filter(Boolean).join(" ")).join(", "));
+  item.button.setAttribute("aria-expanded", String(isOpen));
+  item.button.setAttribute("aria-label", `${say(isOpen ? "fold" : "unfold")}: ${words}, ${count("earlier", number)}`);
+  write(item.button, say(isOpen ? "fold" : "unfold"));
 }
 
 // An item of a list of sounds, with a form that `question` describes when it is opened.
@@ -180,6 +221,7 @@ function beginBout(entry) {
 
 function showBout(item, entry) {
   item.entry = entry;
+  item.element.hidden = Boolean(entry.isFolded) && !item.details.open;
   write(item.often, entry.times ? `${SEPARATOR}${entry.times}` : "");
   write(item.about, entry.isSingle ? entry.about : [entry.time, entry.length, entry.sure, entry.beside, entry.room].filter(Boolean).join(SEPARATOR));
   if (entry.said || !item.isAnswered) showAnswer(item, entry.said); // the log has an answer later
@@ -192,12 +234,14 @@ export function showEntries(list, items, entries) {
   showPlayable(entries.map(({ id }) => id));
 }
 
-let latest = null, shownIds = null, isPast = false;
+let latest = null, shownIds = null, isPast = false, shownEvents = [];
 let touched = -Infinity;
 
 function showList(events) {
+  shownEvents = events;
   const look = events.filter((each) => each.look), others = events.filter((each) => !each.look);
-  arrange(place("look"), lists.look, look, beginBout, showBout);
+  arrange(place("look"), lists.look, folded(look),
+    (entry) => (entry.key ? beginFold : beginBout)(entry), (item, entry) => (entry.key ? showFold : showBout)(item, entry));
   arrange(place("events"), lists.events, others, beginBout, showBout);
   place("looked-at").hidden = !look.length;
   place("no-events").hidden = events.length > 0;
@@ -227,7 +271,7 @@ function showLatest(isWanted) {
   }
   for (const entry of latest) { // those that are shown may go on
     const item = lists.look.get(entry.id) ?? lists.events.get(entry.id);
-    if (item) showBout(item, entry);
+    if (item) showBout(item, { ...entry, isFolded: item.entry.isFolded });
   }
   write(button, count("new", fresh));
   button.hidden = false;
@@ -248,6 +292,7 @@ export function showEvents({ events, classes: known, hidden }) {
 // The sounds of a past day; without any argument those of today again.
 export function showSoundsOf(events) {
   isPast = events !== undefined;
+  unfolded.clear();
   write(place("events-heading"), say(isPast ? "sounds of" : "sounds"));
   write(place("no-events"), say(isPast ? "none of day" : "none"));
   place("new-sounds").hidden = true;

@@ -66,8 +66,13 @@ class Bout(NamedTuple):
 
     @property
     def is_important(self) -> bool:
-        """Whether the bout needs a look."""
+        """Whether the bout needs a look, if any of it counts."""
         return bool(self.doubts) or self.first.label in IMPORTANT
+
+
+def needs_look(bout: Bout, uncounted: int) -> bool:
+    """Whether a bout needs a look, of which so many events do not count."""
+    return bout.is_important and uncounted < len(bout.events)
 
 
 def bouts(events: Iterable[SoundEvent], doubts: Doubts = MappingProxyType({})) -> list[Bout]:
@@ -164,7 +169,7 @@ class ShownBouts(NamedTuple):
             "doubtful": bool(bout.doubts),
             "room": "" if self.is_alone else room(first.microphone),
             "said": corrections[-1] if corrections else "",
-            "look": bout.is_important,
+            "look": needs_look(bout, self._uncounted_of(bout)),
             "ids": [event.id for event in reversed(bout.events)],
         }
 
@@ -203,12 +208,15 @@ class ShownBouts(NamedTuple):
 
     def _beside(self, bout: Bout) -> str:
         """Return how many events of a bout do not count, because of a television beside."""
-        number = sum(e.id in self.uncounted and not self.correction(e) for e in bout.events)
+        number = self._uncounted_of(bout)
         if not number:
             return ""
         if number == len(bout.events):
             return self.words.text("beside")
         return self.words.text("beside.some", count=self.words.number(number))
+
+    def _uncounted_of(self, bout: Bout) -> int:
+        return sum(e.id in self.uncounted and not self.correction(e) for e in bout.events)
 
 
 _LONGEST_SOUND = 60 * NANOSECONDS
