@@ -273,7 +273,8 @@ class Phone:
         )
 
     def text(self, selector):
-        return self.of(f"document.querySelector({selector!r})?.innerText")
+        shown = self.of(f"document.querySelector({selector!r})?.innerText")
+        return shown and shown.replace("\N{NO-BREAK SPACE}", " ")
 
     def shows(self, selector, text):
         patiently(lambda: self.text(selector), lambda shown: text.lower() in (shown or "").lower())

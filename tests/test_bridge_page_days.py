@@ -174,18 +174,18 @@ def coughs_at(*hours, sure=True):
         ),
         (
             [*coughs_at(0), *coughs_at(1, 2, 3, 4, sure=False)],
-            "coughing once (00:00), perhaps 4 more times (01:00 to 04:00)",
-            "einmal Husten (00:00), vielleicht noch 4-mal (01:00 bis 04:00)",
+            "coughing once (00:00), perhaps 4 more times (01:00, 02:00, 03:00 and 04:00)",
+            "einmal Husten (00:00), vielleicht noch 4\N{NON-BREAKING HYPHEN}mal (01:00, 02:00, 03:00 und 04:00)",
         ),
         (
             coughs_at(0.67, 6.44, sure=False),
-            "perhaps coughing twice (00:40 and 06:26)",
-            "vielleicht zweimal Husten (00:40 und 06:26)",
+            "something like coughing twice (00:40 and 06:26)",
+            "zweimal etwas wie Husten (00:40 und 06:26)",
         ),
         (
             coughs_at(3, sure=False),
-            "perhaps coughing once (03:00)",
-            "vielleicht einmal Husten (03:00)",
+            "something like coughing once (03:00)",
+            "einmal etwas wie Husten (03:00)",
         ),
         (
             [*coughs_at(3), *coughs_at(4, sure=False), (5, 3, "crying", 0.9)],
@@ -195,12 +195,12 @@ def coughs_at(*hours, sure=True):
         (
             [*coughs_at(1, 2, 2.5, 3), (5, 3, "crying", 0.9)],
             "coughing 4 times and crying once",
-            "4-mal Husten und einmal Weinen",
+            "4\N{NON-BREAKING HYPHEN}mal Husten und einmal Weinen",
         ),
         (
             [*coughs_at(3), (5, 3, "crying", 0.6)],
-            "coughing once and perhaps crying once",
-            "einmal Husten und vielleicht einmal Weinen",
+            "coughing once and something like crying once",
+            "einmal Husten und einmal etwas wie Weinen",
         ),
     ],
 )
@@ -277,7 +277,7 @@ def test_the_sentence_the_times_and_the_list_call_the_same_sounds_not_sure(tmp_p
     assert entries == ["not sure", "", "1 of them not sure"]
     home = home._replace(sureness=Sureness(0.55))  # as the checked minutes of the home have it
     sentence, times, entries = shown()
-    assert "coughing 4 times (02:10 to 06:13), by" in sentence
+    assert "coughing 4 times (02:10, 02:12, 05:00 and 06:13), by" in sentence
     assert times == {"06:13": "sure", "05:00": "", "02:12": "sure", "02:10": "sure"}
     assert entries[0] == entries[2] == "sure"
 
@@ -295,6 +295,7 @@ def test_rings_and_coughs_beside_a_television_are_not_counted_and_the_lane_says_
     lanes = {lane["label"]: lane for lane in picture["rooms"][0]["lanes"]}
     ring = lanes["phone_ring"]
     assert (ring["count"], ring["counts"], len(ring["times"][2]["times"])) == (1, [0, 1], 1)
+    assert ring["last"] == "09:15", "of what counts"
     assert ring["told"].endswith("; twice beside something like a television, not counted")
     assert picture["sentence"] == "Since 07:00: telephone ringing once (09:15), by the sound of it."
     assert lanes["speech"]["counts"] == [0, 60], "talking of a television is talking"
@@ -378,11 +379,37 @@ def test_what_is_not_counted_is_drawn_pale_and_its_entry_says_so():
     shown = shown._replace(uncounted=uncounted)
     texts = {bout.first.label: [] for bout in bouts(events)}
     for bout in bouts(events):
-        texts[bout.first.label].append(shown.describe(bout)["beside"])
-    assert texts["coughing"] == ["beside a television, not counted", ""]
-    assert {*texts["speech"]} == {""}
+        about = shown.describe(bout)
+        texts[bout.first.label].append((about["beside"], about["look"]))
+    assert texts["coughing"] == [("beside a television, not counted", False), ("", True)]
+    assert {*texts["speech"]} == {("", False)}
     corrected = shown._replace(correction=lambda _: "You said: Coughing")
     assert {corrected.describe(bout)["beside"] for bout in bouts(events)} == {""}
+
+
+def test_the_page_says_which_sounds_that_people_ask_about_it_does_not_know():
+    home = home_at(9, tiled((-3, 9)))
+    (microphone,) = home.microphones
+    microphone.never_tell = frozenset({"yelling"})
+    note = picture_of(home)["missing"]
+    assert ": telephone ringing, toilet flush, shower and water tap. To teach" in note
+    microphone.names = ["silence", "coughing", "crying", "speech", "phone_ring", "running_water"]
+    assert picture_of(home)["missing"] == (
+        "It does not tell toilet flush, shower and water tap apart: all of them are running water "
+        "here."
+    )
+    microphone.names = []
+    assert picture_of(home)["missing"] == "", "not known yet"
+
+
+def test_times_of_the_first_class_are_there_though_a_telephone_rang():
+    rings = [(hour, 4, "phone_ring", 0.6) for hour in (-1.7, -1.6)]
+    coughs = coughs_at(-0.53, 1.86, 2.27, 6.02, sure=False)
+    home = home_at(9, tiled((-3, 9), *rings, *coughs, (1, 400, "speech", 0.9)))
+    assert picture_of(home)["sentence"] == (
+        "Last night: something like coughing 4 times (23:28, 01:51, 02:16 and 06:01), by the "
+        "sound of it."
+    )
 
 
 def test_hours_that_no_log_has_are_hatched_and_no_0_is_said_of_them():
@@ -967,6 +994,62 @@ def test_a_long_list_begins_short_and_counts_lie_over_the_line_of_now(phone, tmp
         pictures = [name for role, name in phone.tree() if name.startswith("Sounds, ")]
         assert len(pictures) == 1
         assert "from 22:00 of the evening before. Not listening: 22:00 to" in pictures[0]
+
+
+def test_of_each_class_the_newest_need_a_look_and_the_rest_is_behind_one_tap(phone, tmp_path):
+    with serving(tmp_path) as home:
+        for number in range(7):
+            home.log.write_segment("coughing", 100 - 10 * number, 2)
+        home.log.hears("silence")
+        phone.open(home)
+        phone.shows("#look .fold", "Coughing · 5 earlier")
+        phone.shows("#look .fold .about", ", ")
+        drawn = "[...document.querySelectorAll('#look > li')].filter((e) => e.offsetHeight).length"
+        assert phone.of(drawn) == 3
+        phone.of("document.querySelector('.fold button').click()")
+        assert phone.of(drawn) == 8
+        button = "document.querySelector('.fold button')"
+        assert phone.of(f"{button}.getAttribute('aria-expanded')") == "true"
+        assert phone.of(f"{button}.getAttribute('aria-label')") == "Hide: Coughing, 5 earlier"
+        assert phone.of(PALE_TEXTS) == []
+        phone.of("document.querySelector('#look summary').click()")
+        phone.until("document.querySelector('#look form')")
+        phone.of("document.querySelector('#look form').scrollIntoView()")
+        save = phone.of("document.querySelector('.save button').getBoundingClientRect().bottom")
+        assert save <= 844, "in sight while one chooses"
+        assert phone.of(drawn) == 8
+        phone.of("document.querySelector('.fold button').click()")
+        assert phone.of(drawn) == 3
+
+
+def test_classes_that_did_not_sound_are_one_row_that_opens(phone, lived):
+    lived.log.hears("silence")
+    phone.open(lived)
+    phone.shows("button.zero", "Not once: ")
+    rows = "[...document.querySelectorAll('tbody tr')].filter((e) => e.offsetHeight).length"
+    few = phone.of(rows)
+    assert phone.of("document.querySelector('button.zero').textContent").count("coughing") == 0
+    phone.of("document.querySelector('button.zero').click()")
+    names = phone.of("document.querySelector('button.zero').textContent").count(",") + 1
+    assert phone.of(rows) == few + names
+    assert phone.of(PALE_TEXTS) == []
+    phone.of("document.querySelector('button.zero').click()")
+    assert phone.of(rows) == few
+
+
+def test_a_dark_class_is_lighter_on_a_dark_ground_and_what_does_not_count_is_hollow(phone, lived):
+    drawn = "getComputedStyle({}.querySelector('{}'))['{}']"
+    for scheme in ("light", "dark"):
+        phone.open(lived, 390, 844, scheme)
+        phone.until(lane("Coughing"))
+        element = lane("Coughing")
+        assert phone.of(drawn.format(element, ".marks:not(.pale)", "fill")) == "rgb(210, 94, 1)"
+        assert float(phone.of(drawn.format(element, ".pale", "fill-opacity"))) < 0.3
+        brown = phone.of(
+            "import('./elements.js').then(({ swatch }) => { const it = swatch([139, 69, 19]);"
+            "document.body.append(it); return getComputedStyle(it).backgroundColor; })"
+        )
+        assert brown == {"light": "rgb(139, 69, 19)", "dark": "rgb(191, 153, 125)"}[scheme]
 
 
 _SHIFTS = """

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from threading import Event
 
@@ -20,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from homelife import write_day
 from logs import features, read
 from mcap.opcode import Opcode
 from spliced import record_logs, run
@@ -744,6 +746,22 @@ def test_the_command_writes_the_catalogue_and_shows_the_homes(fleet, capfd):
     gaps = sum(home.gaps for home in homes(read_catalog(fleet)))
     assert ("no log has a gap" in done.stdout) == (not gaps)
     assert {row.home for row in read_catalog(fleet).rows()} == {"north/anna"}
+
+
+def test_the_table_has_the_times_of_each_home_in_its_zone(tmp_path, capfd):
+    day = date(2026, 3, 1)
+    write_day(tmp_path / "anna", day, hours=[20], timezone="Asia/Kolkata")
+    shown = run(capfd, "catalog", tmp_path).stdout.splitlines()
+    assert "from (Asia/Kolkata)" in shown[0]
+    assert re.search("2026-03-02 01:30 +2026-03-02 02:30$", shown[1])
+    write_day(tmp_path / "bert", day, hours=[20])
+    shown = run(capfd, "catalog", tmp_path).stdout.splitlines()
+    assert "from (Asia/Kolkata, UTC)" in shown[0]
+    assert [re.search(r"\d\d:\d\d\+\d{4}$", line)[0] for line in shown[1:4]] == [
+        "02:30+0530",
+        "21:00+0000",
+        "21:00+0000",
+    ]
 
 
 def test_the_command_says_in_json_what_the_table_says(fleet, capfd):

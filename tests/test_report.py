@@ -431,7 +431,8 @@ def test_the_last_whole_day_is_that_which_the_logs_reach_to_the_end_of(tmp_path)
 
 
 def headline(root, tmp_path, **period) -> str:
-    return re.search('<p class="headline">([^<]*)</p>', page_of(root, tmp_path, **period))[1]
+    found = re.search('<p class="headline">(.*?)</p>', page_of(root, tmp_path, **period))[1]
+    return re.sub("<[^>]*>", "", found)
 
 
 def test_the_headline_of_a_quiet_day_names_its_coughs(tmp_path):
@@ -560,9 +561,55 @@ def test_a_week_has_a_headline_of_its_days(tmp_path):
         write_day(tmp_path / "logs", DAY - timedelta(days=ago), coughs, hours=hours)
     first = DAY - timedelta(days=6)
     assert headline(tmp_path / "logs", tmp_path, first=first, days=7) == (
-        "Five of seven days could be judged, all of them quiet. By the sound of it, 18 bouts "
-        "of coughing on four days, most on Mon 23 Feb (6)."
+        "All of the five recorded days were quiet; too little was recorded of the other two. By the "
+        "sound of it, 18 bouts of coughing on four days, most on Mon 23 Feb (6)."
     )
+
+
+def test_a_week_of_which_one_day_was_recorded_is_headed_by_that_day(tmp_path):
+    write_day(tmp_path / "logs", DAY)
+    assert headline(tmp_path / "logs", tmp_path, first=DAY - timedelta(days=6), days=7) == (
+        "Sunday was quiet; too little was recorded of the other six days."
+    )
+
+
+def test_what_the_night_has_of_the_evening_before_is_named_so_that_counts_add_up(tmp_path):
+    before = [(at("23:28"), 2, "coughing", 0.9)]
+    write_day(tmp_path / "logs", DAY - timedelta(days=1), before)
+    times = ["01:51", "02:16", "06:01", "14:00"]
+    coughs = [(at(time), 2, "coughing", 0.9) for time in times]
+    write_day(tmp_path / "logs", DAY, coughs)
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert "four bouts of coughing in the night (one of them on Saturday) and one by day" in page
+    assert rows_of(page)["Coughing"][0] == "4", "of which three are in the night"
+    assert "as labelled, at Saturday 23:28, 01:51, 02:16, 06:01." in page
+    other = tmp_path / "other"
+    other.mkdir()
+    write_day(other / "logs", DAY - timedelta(days=1), before)
+    write_day(other / "logs", DAY, coughs[:1])
+    assert "in the night (Saturday 23:28 and 01:51)." in headline(other / "logs", other)
+
+
+def test_how_long_a_sound_lasted_is_apart_from_a_television(tmp_path):
+    talking = [(at("13:00") + 60 * number, 30, "speech", 0.9) for number in range(60)]
+    write_day(tmp_path / "logs", DAY, [*talking, (at("18:00"), 5, "coughing", 0.9)])
+    page = page_of(tmp_path / "logs", tmp_path)
+    apart = "+\N{NO-BREAK SPACE}30\N{NO-BREAK SPACE}min beside a television"
+    assert f'<span class="unit">none</span><small>{apart}</small>' in page
+    assert f'<td data-head="Count, as labelled">0 min<small>{apart}</small>' in page
+    other = tmp_path / "other"
+    other.mkdir()
+    week = page_of(tmp_path / "logs", other, first=DAY - timedelta(days=6), days=7)
+    assert "television:\N{NO-BREAK SPACE}30\N{NO-BREAK SPACE}min" in week
+
+
+def test_a_name_that_nobody_gave_is_not_shown(tmp_path):
+    write_day(tmp_path / "logs", DAY)
+    assert "icrophone: mic" not in page_of(tmp_path / "logs", tmp_path)
+    other = tmp_path / "other"
+    other.mkdir()
+    write_day(other / "logs", DAY, node="anna", microphone="kitchen")
+    assert "Home: anna. Microphone: kitchen. Times" in page_of(other / "logs", other)
 
 
 # The page

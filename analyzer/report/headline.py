@@ -1,6 +1,7 @@
 """Headline of a report: what a day or a week was like, in two or three short sentences."""
 
 from collections.abc import Callable, Iterator, Sequence
+from datetime import timedelta
 
 import numpy as np
 
@@ -12,13 +13,14 @@ from hearthlog.analyzer.logs.spans import common, joined, one, without
 from hearthlog.analyzer.report.report_data import counted_events, television_spans
 from hearthlog.analyzer.report.wording import (
     clock_text,
+    clock_with_day,
     number_in_words,
     several_in_words,
     short_day,
     weekday,
 )
 from hearthlog.models.classes import COUGHING, CRYING, SILENCE, UNKNOWN, YELLING, in_words
-from hearthlog.schemas.arrays import Bool
+from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import listed
 
 LIVELY_MINUTES = 5  # minutes with sound of a lively hour
@@ -51,13 +53,15 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
     quiet = sum(is_quiet(day) for day in complete_days)
     number, of = number_in_words(len(complete_days)), number_in_words(len(days))
     which = {0: "none", len(complete_days): "all" if len(complete_days) > _ONE_MORE else "both"}
-    was = which.get(quiet, number_in_words(quiet))
+    was = _capital(which.get(quiet, number_in_words(quiet)))
+    rest = f"too little was recorded of the other {number_in_words(len(days) - len(complete_days))}"
     if len(complete_days) == len(days):
-        parts = [f"{_capital(was)} of the {of} days {_were(quiet)} quiet."]
+        parts = [f"{was} of the {of} days {_were(quiet)} quiet."]
     elif len(complete_days) > 1:
-        parts = [f"{_capital(number)} of {of} days could be judged, {was} of them quiet."]
+        parts = [f"{was} of the {number} recorded days {_were(quiet)} quiet; {rest}."]
     elif complete_days:
-        parts = [f"One of {of} days could be judged, and was {'' if quiet else 'not '}quiet."]
+        (day,) = complete_days
+        parts = [f"{weekday(day.day)} was {'' if quiet else 'not '}quiet; {rest} days."]
     else:
         parts = [f"Too little was recorded to judge any of the {of} days."]
     sounds: list[tuple[str, bool]] = []
@@ -231,12 +235,21 @@ def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
             starts = counted_events(day, name, span)
             if len(starts):
                 count = day.home.minutes.between(span).count(name, day.home.rates.get(name))
-                clocks = [clock_text(start, day.zone) for start in np.sort(starts).tolist()]
-                times = f" ({listed(clocks, 'and')})" if len(clocks) <= _TIMES else ""
+                times = f" ({_when(day, starts)})" if _when(day, starts) else ""
                 parts.append(f"{amount(name, count, named=not parts)} {when}{times}")
                 is_known &= count.certain == count.labelled
         if parts:
             yield listed(parts, "and"), is_known
+
+
+def _when(day: DayMetrics, starts: Int64) -> str:
+    """Return the times of a few events; of more, how many were on the day before, if any."""
+    if len(starts) <= _TIMES:
+        clocks = [clock_with_day(start, day.zone, day.day) for start in np.sort(starts).tolist()]
+        return listed(clocks, "and")
+    number, before = int((starts < day.span.starts[0]).sum()), day.day - timedelta(days=1)
+    which = f"{number_in_words(number)} of them" if number < len(starts) else "all"
+    return f"{which} on {weekday(before)}" if number else ""
 
 
 def _were(number: int) -> str:

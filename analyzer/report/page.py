@@ -9,9 +9,8 @@ import jinja2
 import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
-from hearthlog.analyzer.activity.event_counts import MINUTE, SET_APART
+from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
-from hearthlog.analyzer.logs.spans import common
 from hearthlog.analyzer.report.headline import day_headline, week_headline
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
@@ -19,11 +18,12 @@ from hearthlog.analyzer.report.report_data import (
     Account,
     FigureSection,
     ReportFigure,
+    apart_figure,
     counted_events,
     event_figure,
     minutes_figure,
     sections,
-    television_spans,
+    television_minutes_of,
 )
 from hearthlog.analyzer.report.summary_text import (
     gist_of_day,
@@ -106,8 +106,10 @@ def fill_page(**parts: Any) -> str:
 
 _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
+_HOME, _MICROPHONE = "home", "mic"  # names that nobody gave
 _FEW = 5  # events of which every time is written
 _NOT_COUNTED = "not counted"
+_SPACE = "\N{NO-BREAK SPACE}"
 
 
 class PageSection(NamedTuple):
@@ -128,7 +130,7 @@ def day_page(account: Account) -> str:
         account,
         PagePicture(f"The sounds of {title}", _description(timeline), [("", timeline)], bars),
         title=title,
-        headline=day_headline(day),
+        headline=_first_sentence(day_headline(day)),
         gist=list(gist_of_day(account, day)),
         overview=[(f"What was heard{_labelled(account)}", _sounds(account, day))],
         parts=[_part(account, section, day) for section in sections(account.classes)],
@@ -147,7 +149,7 @@ def week_page(account: Account) -> str:
         account,
         PagePicture(f"The sounds of {spoken}", described, days),
         title=f"Week {first.isocalendar().week}, {spoken}",
-        headline=week_headline(account.days),
+        headline=_first_sentence(week_headline(account.days)),
         gist=list(gist_of_week(account)),
         overview=[
             (
@@ -156,7 +158,7 @@ def week_page(account: Account) -> str:
             ),
             (
                 "How long it was heard, as labelled",
-                _week(account, list(map(minutes_figure, names))),
+                _week(account, list(map(apart_figure, names)), has_share=False),
             ),
         ],
         parts=[
@@ -164,6 +166,12 @@ def week_page(account: Account) -> str:
             for section in sections(account.classes)
         ],
     )
+
+
+def _first_sentence(headline: str) -> tuple[str, str]:
+    """Return the first sentence of a headline, and the rest of it."""
+    first, point, rest = headline.partition(". ")
+    return f"{first}{point.strip()}", rest
 
 
 def _labelled(account: Account) -> str:
@@ -200,6 +208,8 @@ def _page(account: Account, picture: PagePicture, **parts: Any) -> str:
         account=account,
         picture=picture,
         week=len(account.days) > 1,
+        default_home=_HOME,
+        default_microphone=_MICROPHONE,
         microphones=listed([plain(name) for name in account.microphones], "and"),
         alerts=[*needing_look(account), *not_recorded(account), *not_well(account)],
         absent=_listed(absent),
@@ -266,7 +276,8 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
     heads = ["Sound", "How often", f"When{labelled}", f"How long{labelled}"]
     rows = []
     for name in account.classes:
-        figure, lasting = event_figure(name), minutes_figure(name)
+        figure = event_figure(name)
+        lasting = (minutes_figure if name == SILENCE else apart_figure)(name)
         value, uncounted = figure.value(day), day.beside_television(name)
         if name == SILENCE:
             cells = [Cell(""), Cell(""), _cell(account, lasting, day)]
@@ -291,11 +302,16 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
 
 def _with_television(cell: Cell, name: str, day: DayMetrics) -> Cell:
     """Add how long a class sounded beside a television, from a minute on."""
-    minutes = common(day.home.spans[name], television_spans(day)).length / MINUTE
+    minutes = television_minutes_of(day, name)
     if minutes < 1:
         return cell
-    notes = [f"{Duration(minutes).text} beside a television", *[cell.note] * bool(cell.note)]
-    return cell._replace(note=", ".join(notes))
+    notes = [*[cell.note] * bool(cell.note), _beside(minutes)]
+    text = "none" if cell.text == Duration().text else cell.text
+    return cell._replace(text=text, note=", ".join(notes))
+
+
+def _beside(minutes: float) -> str:
+    return f"+{_SPACE}{Duration(minutes).text.replace(' ', _SPACE)} beside a television"
 
 
 def _times(day: DayMetrics, starts: Int64) -> str:
@@ -381,23 +397,33 @@ def _coughing(day: DayMetrics) -> str:
     if not len(starts):
         return ""
     if len(starts) <= _FEW:
-        return f"Coughing in the night, as labelled, at {times_in_words(starts, day.zone)}."
+        times = times_in_words(starts, day.zone, first=day.day)
+        return f"Coughing in the night, as labelled, at {times}."
     hours = [clock_text(time, day.zone)[:2] for time in np.sort(starts).tolist()]
     each = [f"{hours.count(hour)} after {hour}:00" for hour in dict.fromkeys(hours)]
     return f"Bouts of coughing in the night, as labelled, hour by hour: {', '.join(each)}."
 
 
-def _week(account: Account, figures: Sequence[ReportFigure]) -> PageTable:
-    """Return the figures of seven days, a column for each, and their total."""
+def _week(
+    account: Account, figures: Sequence[ReportFigure], *, has_share: bool = True
+) -> PageTable:
+    """Return the figures of seven days, a column for each, and their total.
+
+    The first row is the share of each day that was recorded, unless another table has it.
+    """
     shares = [_share(figures, day) for day in account.days]
     recorded = [Cell(percent(share) if share else _NOTHING) for share in shares]
-    rows = [[Cell("Recorded"), *recorded, Cell("")]]
+    rows = [[Cell("Recorded"), *recorded, Cell("")]] if has_share else []
     for figure in figures:
         values = [figure.value(day) if day.coverage.length else None for day in account.days]
         uncounted = [day.beside_television(figure.name) * figure.counts for day in account.days]
         usual = _dense(account.usually(figure)) if account.comparable else ""
         notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{sum(uncounted)}"] * any(uncounted)
         notes += [f"usually {usual} a day"] * bool(usual)
+        if figure.is_apart:
+            beside = sum(television_minutes_of(day, figure.name) for day in account.days)
+            length = Duration(beside).text.replace(" ", _SPACE)
+            notes += [f"television:{_SPACE}{length}"] * (beside >= 1)
         colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(
             [
@@ -411,10 +437,6 @@ def _week(account: Account, figures: Sequence[ReportFigure]) -> PageTable:
 
 def _day_heads(account: Account) -> list[str]:
     return [short_day(day.day).rpartition(" ")[0] for day in account.days]
-
-
-def _row(*texts: str) -> list[Cell]:
-    return [Cell(text) for text in texts]
 
 
 def _share(figures: Sequence[ReportFigure], day: DayMetrics) -> float:
@@ -461,7 +483,11 @@ def _interrai(account: Account, days: Sequence[DayMetrics]) -> PageTable:
         text = _text(number)
         if account.checked and not _is_checked(number):
             text += ", as labelled"
-        rows.append(_row(item.topic, item.sounds, text, item.limits))
+        beside = 0.0
+        if isinstance(number, Duration) and item.needs:
+            beside = sum(television_minutes_of(day, item.needs) for day in days)
+        cell = Cell(text, note=_beside(beside) if beside >= 1 else "")
+        rows.append([Cell(item.topic), Cell(item.sounds), cell, Cell(item.limits)])
     count = "Count" if account.checked else "Count, as labelled"
     heads = ["The form asks about", "Heard here", count, "What sound cannot tell"]
     return PageTable(heads, rows, "stack")

@@ -78,9 +78,23 @@ def clock_text(nanoseconds: int, zone: tzinfo) -> str:
     return f"{local_time(nanoseconds, zone):%H:%M}"
 
 
-def times_in_words(starts: Int64, zone: tzinfo, most: int = 16) -> str:
-    """List times of day (nanoseconds of UTC, any order), `most` of them, and how many more."""
-    shown = Counter(clock_text(start, zone) for start in np.sort(starts)[:most].tolist())
+def clock_with_day(nanoseconds: int, zone: tzinfo, first: date | None) -> str:
+    """Format a local time of day, with its weekday if that is before the first day."""
+    moment = local_time(nanoseconds, zone)
+    is_before = first is not None and moment.date() < first
+    return f"{weekday(moment.date())} {moment:%H:%M}" if is_before else f"{moment:%H:%M}"
+
+
+def times_in_words(
+    starts: Int64, zone: tzinfo, most: int = 16, first: date | None = None
+) -> str:
+    """List times of day (nanoseconds of UTC, any order), `most` of them, and how many more.
+
+    Those of days before the `first` have their weekday: `Sunday 23:28`.
+    """
+    shown = Counter(
+        clock_with_day(start, zone, first) for start in np.sort(starts)[:most].tolist()
+    )
     more = len(starts) - shown.total()
     texts = [text if n == 1 else f"{text} ({_often(n)})" for text, n in shown.items()]
     return ", ".join(texts) + (f" and {more} more" if more else "")

@@ -1,9 +1,10 @@
 """`hearthlog info` and `hearthlog catalog`: contents of logs, and of a folder of homes."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, date, tzinfo
+from itertools import islice
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -365,9 +366,10 @@ def _duration(seconds: float) -> str:
 
 
 _HOMES_SHOWN = 40  # one page
-_TO_THE_MINUTE = len("2026-03-01T08:00")
+_MINUTE, _MINUTE_AND_OFFSET = "%Y-%m-%d %H:%M", "%Y-%m-%d %H:%M%z"
+_ZONES = 2  # in the head of a table
 _COUNTS = "logs", "layers", "unfinished", "damaged"
-_FIGURES = "MB", "hours", "gaps", "gap minutes", "from (UTC)", "to (UTC)"
+_FIGURES = "MB", "hours", "gaps", "gap minutes"
 _IF_ANY = frozenset({"layers", "unfinished", "damaged", "gaps", "gap minutes"})
 
 
@@ -437,7 +439,7 @@ def catalog(
         }
         print(json.dumps(result, indent=2))
     else:
-        _print_homes(homes(files), amounts, unfinished)
+        _print_homes(folder, homes(files), amounts, unfinished)
     if damaged or unfinished:
         raise typer.Exit(3)
 
@@ -461,16 +463,25 @@ def _write(folder: Path, workers: int, scheduler: str | None) -> "Catalog":
 
 
 def _print_homes(
-    homes: Sequence["HomeTotals"], labels: Sequence["LabelAmount"], unfinished: Sequence[str]
+    folder: Path,
+    homes: Sequence["HomeTotals"],
+    labels: Sequence["LabelAmount"],
+    unfinished: Sequence[str],
 ) -> None:
-    rows = list(_home_rows(homes))
+    from hearthlog.tools.cli.info_summary import zone_name
+
+    zones = {home.home: _zone_of(folder / home.home) for home in homes[:_HOMES_SHOWN]}
+    names = sorted(map(zone_name, {*zones.values()}))
+    shown = ", ".join(names[:_ZONES]) + " …" * (len(names) > _ZONES)
+    rows = list(_home_rows(homes, zones))
+    heads = "home", *_COUNTS, *_FIGURES, f"from ({shown})", "to"
     columns = [
         column
-        for column in zip(("home", *_COUNTS, *_FIGURES), *rows, strict=True)
+        for column in zip(heads, *rows, strict=True)
         if column[0] not in _IF_ANY or any(map(float, column[1:]))
     ]
-    head, *shown = zip(*columns, strict=True)
-    print_table(head, shown)
+    head, *cells = zip(*columns, strict=True)
+    print_table(head, cells)
     if len(homes) > _HOMES_SHOWN:
         print(f"and {len(homes) - _HOMES_SHOWN} more homes (--json lists all)")
     if homes and not {"unfinished", "damaged", "gaps"} & {*head}:
@@ -480,14 +491,34 @@ def _print_homes(
     print_lines(first_of("unfinished", unfinished))
 
 
-def _home_rows(homes: Sequence["HomeTotals"]) -> Iterator[Sequence[str]]:
+def _zone_of(folder: Path) -> tzinfo:
+    """Return the time zone that the latest log of a home has; UTC if that cannot be read."""
+    from hearthlog.analyzer.logs.home_logs import find_home_logs
+    from hearthlog.analyzer.logs.local_time import home_zone
+
+    try:
+        return home_zone(None, islice(find_home_logs([folder]).records(), 1))
+    except HearthlogError:
+        return UTC
+
+
+def _home_rows(
+    homes: Sequence["HomeTotals"], zones: Mapping[str, tzinfo]
+) -> Iterator[Sequence[str]]:
+    is_one = len({*map(str, zones.values())}) == 1
     for home in homes[:_HOMES_SHOWN]:
-        yield _home_row(home.home or "this folder", [home])
+        form = _MINUTE if is_one else _MINUTE_AND_OFFSET
+        yield _home_row(home.home or "this folder", [home], zones[home.home], form)
     if len(homes) > 1:
-        yield _home_row(number(len(homes), "home"), homes)
+        zone, form = (next(iter(zones.values())), _MINUTE) if is_one else (UTC, _MINUTE_AND_OFFSET)
+        yield _home_row(number(len(homes), "home"), homes, zone, form)
 
 
-def _home_row(name: str, homes: Sequence["HomeTotals"]) -> Sequence[str]:
+def _home_row(
+    name: str, homes: Sequence["HomeTotals"], zone: tzinfo, form: str
+) -> Sequence[str]:
+    from hearthlog.analyzer.logs.local_time import local_time
+
     starts = [home.start for home in homes if home.start is not None]
     ends = [home.end for home in homes if home.end is not None]
     return [
@@ -497,8 +528,8 @@ def _home_row(name: str, homes: Sequence["HomeTotals"]) -> Sequence[str]:
         f"{sum(home.hours for home in homes):.2f}",
         str(sum(home.gaps for home in homes)),
         f"{sum(home.gap_seconds for home in homes) / 60:.2f}",
-        (moment(min(starts, default=None)) or "")[:_TO_THE_MINUTE].replace("T", " "),
-        (moment(max(ends, default=None)) or "")[:_TO_THE_MINUTE].replace("T", " "),
+        f"{local_time(min(starts), zone):{form}}" if starts else "",
+        f"{local_time(max(ends), zone):{form}}" if ends else "",
     ]
 
 

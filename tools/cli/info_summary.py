@@ -120,7 +120,7 @@ class Overview:
         first, last = self._summary.span
         length = _hours(self._summary.seconds)
         begin, end = (f"{local_time(time, self._zone):%Y-%m-%d %H:%M}" for time in (first, last))
-        span = f"{begin} to {end} ({_zone_name(self._zone)})"
+        span = f"{begin} to {end} ({zone_name(self._zone)})"
         return f"{whose}: {length}, {span}"
 
     def _activity(self) -> str:
@@ -189,7 +189,8 @@ def _scenario(labelling: str) -> str:
     return f"{microphone}, {rest.replace('/', ' ')}" if is_scenario(rest) else ""
 
 
-def _zone_name(zone: tzinfo) -> str:
+def zone_name(zone: tzinfo) -> str:
+    """Return the name of a time zone."""
     return "UTC" if str(zone) == "Etc/UTC" else str(zone)
 
 

@@ -37,6 +37,7 @@ from hearthlog.analyzer.report.report import Period, read_account
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_ITEMS,
     Account,
+    apart_figure,
     minutes_figure,
     sections,
 )
@@ -451,7 +452,8 @@ def _heard(
             REPORT, where + when, name, clocks, truth, modest=is_modest(heads[2] + when)
         )
     if (minutes := read_minutes(lasting.partition(" | ")[0])) is not None:
-        value = minutes_figure(name).value(truth.metrics)
+        figure = minutes_figure if name == SILENCE else apart_figure
+        value = figure(name).value(truth.metrics)
         true = 0 if value is None else value.middle
         yield _lasted(REPORT, where + lasting, minutes, true, modest=is_modest(heads[3] + lasting))
 

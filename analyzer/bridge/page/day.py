@@ -394,8 +394,9 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     is_brief = len(names) > 1
     while True:
         shown = {name: found[name] for name in names}
-        is_dispensable = names[-1] not in IMPORTANT - {PHONE_RING}
-        for times in (_MOST_CLOCKS,) if is_dispensable and names[1:] else (_MOST_CLOCKS, 1, 0):
+        # Times of the first class matter more than a last one that worries nobody.
+        is_dispensable = bool(names[1:]) and names[-1] not in IMPORTANT - {PHONE_RING}
+        for times in (_MOST_CLOCKS,) if is_dispensable else (_MOST_CLOCKS, 1, 0):
             sentence = _sentence_of(when, shown, home, times if is_brief else None)
             if not names[1:] or len(sentence) <= _LONGEST:
                 return sentence
