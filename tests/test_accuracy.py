@@ -343,6 +343,16 @@ def report_day(root, checks=None):
     return day_of(metrics_of_home(data, checks), DAY, UTC)
 
 
+def test_a_sound_that_somebody_marked_is_sure_whatever_the_model_thinks(tmp_path):
+    coughs = [(at(t), 2, "coughing", 0.6) for t in ("10:00:05", "12:00:05")]
+    logs = write_day(tmp_path, DAY, coughs)
+    count = report_day(tmp_path).count("coughing")
+    assert (count.labelled, count.unsure) == (2, 2)
+    check(logs, at("10:00"), [(5, 7, "coughing")])
+    count = report_day(tmp_path).count("coughing")
+    assert (count.labelled, count.unsure, count.certain) == (2, 1, 1)
+
+
 def test_coughs_beside_a_television_are_counted_apart(tmp_path):
     talking = [(at("10:00") + 20 * i, 15, "speech", 0.9) for i in range(60)]
     coughs = [(at(t), 2, "coughing", 0.9) for t in ("10:05:16", "10:15:16", "15:00:00")]

@@ -14,7 +14,12 @@ from livehome import rule
 from spliced import run
 
 from hearthlog.analyzer.activity.checked_minutes import read_checked_minutes
-from hearthlog.analyzer.activity.daily_metrics import day_of, home_sound, metrics_of_home
+from hearthlog.analyzer.activity.daily_metrics import (
+    EventTotal,
+    day_of,
+    home_sound,
+    metrics_of_home,
+)
 from hearthlog.analyzer.activity.day_profile import COUNT, LENGTH, Profiles
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import read_home
@@ -185,7 +190,7 @@ def test_two_microphones_are_counted_apart_by_the_bridge_and_joined_by_the_repor
         if lane["label"] == "coughing"
     }
     assert shown == {"Bath": 17, "Kitchen": 10}
-    together = {"coughing": {"counted": 21, "television": 0}}  # six were heard by both
+    together = {"coughing": {"counted": 21, "television": 0, "unsure": 0}}  # six were heard by both
     _, day = day_metrics(tmp_path)
     assert day.count("coughing").labelled == 21
     listed = json.loads(run(capfd, "events", tmp_path, "--day", DAY, "--json").stdout)
@@ -198,7 +203,11 @@ def test_the_contents_of_logs_name_the_counts_of_the_report(logs, capfd):
     _, day = day_metrics(logs)
     assert found["date"] == DAY.isoformat()
     assert found["counts"] == {
-        name: {"counted": count.labelled, "television": day.beside_television(name)}
+        name: {
+            "counted": count.labelled,
+            "television": day.beside_television(name),
+            "unsure": count.unsure,
+        }
         for name in day.home.classes
         if (count := day.count(name)) is not None and count.labelled + day.beside_television(name)
     }
@@ -340,8 +349,8 @@ def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(
 
     def listed(*words):
         result = hearthlog("events", logs, "--day", DAY, "--json", *words)
-        counts = json.loads(result.stdout)["counts"]
-        return {name: counts.get(name, {"counted": 0, "television": 0}) for name in SOUNDS}
+        counts, none = json.loads(result.stdout)["counts"], dict.fromkeys(EventTotal._fields, 0)
+        return {name: counts.get(name, none) for name in SOUNDS}
 
     def expected():
         _, day = day_metrics(logs)
@@ -349,6 +358,7 @@ def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(
             name: {
                 "counted": day.count(name).labelled,
                 "television": day.beside_television(name),
+                "unsure": day.count(name).unsure,
             }
             for name in SOUNDS
         }
@@ -399,7 +409,10 @@ def test_a_sound_that_a_person_marked_counts_beside_a_television_too(logs, capfd
         after = json.loads(run(capfd, *words).stdout)["counts"]["crying"]
         assert after["counted"] == before["counted"] + 1
         _, day = day_metrics(logs)
-        neighbour = day.beside_television("crying")
-        assert after == {"counted": day.count("crying").labelled, "television": neighbour}
+        count = day.count("crying")
+        assert (
+            after
+            == EventTotal(count.labelled, day.beside_television("crying"), count.unsure)._asdict()
+        )
     finally:
         layer.unlink()

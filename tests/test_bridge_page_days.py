@@ -28,9 +28,11 @@ from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.doubts import need_look
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import (
+    Bout,
     ShownBouts,
     bouts,
     events_between,
+    needs_look,
     uncounted_ids,
 )
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
@@ -789,6 +791,21 @@ def test_the_page_works_behind_the_ingress_of_home_assistant(phone, lived):
     assert "alert(1)" not in str(lived.request("GET", "/", **hostile))
     assert lived.request("GET", "/", cookie=None, **{"X-Ingress-Path": path})[0] == 403
     assert lived.request("GET", "/", Host="evil.example", **{"X-Ingress-Path": path})[0] == 403
+
+
+def test_a_telephone_that_may_be_something_else_is_counted_apart_and_needs_no_look():
+    rings = [(8, 5, "phone_ring", 0.95), (8.2, 5, "phone_ring", 0.4)]
+    home = home_at(9, tiled((-3, 9), *rings))
+    (lane,) = (each for each in picture_of(home)["rooms"][0]["lanes"] if each["count"])
+    assert (lane["label"], lane["counts"], lane["unsure"]) == ("phone_ring", [0, 2], [1, 0, 1])
+    sure, unsure = (
+        Bout([SoundEvent("mic", "phone_ring", start, start + NANOSECONDS, confidence, 1.0)])
+        for start, confidence in ((MIDNIGHT, 0.95), (MIDNIGHT + NANOSECONDS, 0.4))
+    )
+    assert [needs_look(bout, 0, Sureness()) for bout in (sure, unsure)] == [True, False]
+    both = Bout([*sure.events, *unsure.events])
+    cough = Bout([sure.first._replace(label="coughing", confidence=0.4)])
+    assert needs_look(both, 0, Sureness()) and needs_look(cough, 0, Sureness())
 
 
 SCREAM = 4.0, "music", 0.33, {"coughing": 0.05, "yelling": 0.12}, 48.0

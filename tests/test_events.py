@@ -94,8 +94,9 @@ def test_each_sound_that_the_report_counts_is_a_line(home, hearthlog):
     assert lines["yelling", True] > 50
     for name in day.home.classes:
         if name != SILENCE:
-            counts = listed["counts"].get(name, {"counted": 0, "television": 0})
-            assert counts == {"counted": lines[name, False], "television": lines[name, True]}
+            counts = listed["counts"].get(name, {"counted": 0, "television": 0, "unsure": 0})
+            of_lines = {"counted": lines[name, False], "television": lines[name, True]}
+            assert counts == {**of_lines, "unsure": day.count(name).unsure}
             assert counts["counted"] == day.count(name).labelled, name
             assert counts["television"] == day.beside_television(name), name
             seconds = sum(e["seconds"] for e in listed["events"] if e["label"] == name)
@@ -197,6 +198,20 @@ def test_sound_that_was_not_kept_cannot_be_played_and_is_said_so(home, hearthlog
     result = hearthlog("events", home, "--day", DAY, "--label", "phone_ring", "--play")
     assert result.returncode == 0
     assert "no sound was kept of 1 of these: keep_audio" in result.stderr
+
+
+def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path, hearthlog):
+    rings = [(at("08:00"), 5, "phone_ring", 0.95), (at("09:00"), 5, "phone_ring", 0.4)]
+    write_day(tmp_path, DAY, rings)
+    found = hearthlog("events", tmp_path, "--day", DAY, "--label", "phone_ring")
+    assert found.stdout.splitlines()[-1] == (
+        "Telephone ringing on Monday, 2026-03-02: 1, and perhaps 1 more"
+    )
+    found = hearthlog("events", tmp_path, "--day", DAY, "--json")
+    assert json.loads(found.stdout)["counts"]["phone_ring"] == {
+        "counted": 2, "television": 0, "unsure": 1,
+    }  # fmt: skip
+    assert "telephone ringing 1 (+1 not sure)" in hearthlog("info", tmp_path).stdout
 
 
 def test_time_that_nobody_listened_to_is_said(tmp_path, hearthlog):

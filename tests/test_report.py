@@ -150,9 +150,23 @@ def test_what_two_microphones_hear_at_one_time_counts_once(tmp_path):
     assert day.share == 1
 
 
+def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path):
+    coughs = [(at(f"{hour:02}:30"), 3, "coughing", 0.9) for hour in (9, 10)]
+    coughs += [(at(f"{hour:02}:30"), 3, "coughing", 0.6) for hour in (1, 11, 12)]
+    rings = [(at("15:00"), 5, "phone_ring", 0.95), (at("16:00"), 5, "phone_ring", 0.4)]
+    write_day(tmp_path / "logs", DAY, [*coughs, *rings])
+    page = page_of(tmp_path / "logs", tmp_path)
+    text = re.sub(r"\s+", " ", re.sub("<[^>]*>", " ", page))
+    assert "perhaps one bout of coughing in the night (01:30) and two (perhaps four) by day" in text
+    assert re.search(r"Coughing 2 \(\+3\?\) .*Telephone ringing 1 \(\+1\?\) 15:00, 16:00", text)
+    assert "In brackets, as in 4 (+3?), is how many more the model is not sure of" in text
+
+
 def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give():
     assert exactly(3).text == "3"
     assert Count(7, 0, Strata(100, 20, 7)).text == "7"
+    doubtful = Count(7, 0, Strata(100, 20, 7), unsure=3)
+    assert (doubtful.text, (doubtful + doubtful).text) == ("4 (+3?)", "8 (+6?)")
     printed = np.array([1, 1, 1, 1, 0, 0, 2, 1])
     rates = checked_rates(printed, np.minimum(printed, 1), printed > 0, 0.5)
     count = Count(27, 2, Strata(100, 20, 25), rates)

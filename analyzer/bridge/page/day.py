@@ -263,6 +263,7 @@ def _lane(
         "told": description,
         "count": count,
         "counts": counts,
+        "unsure": [sum(map(home.is_unsure, own)) for own in (of_day, *of_parts)],
         "last": at,
         "times": [_times(each, name, sounds.given, home) for each in (of_day, *of_parts)],
     }

@@ -244,7 +244,7 @@ class HomePage:
         found = []
         for bout in self._bouts.values():
             uncounted = sum(event.id in self._uncounted for event in bout.events)
-            look = needs_look(bout, uncounted)
+            look = needs_look(bout, uncounted, self._sureness)
             if left[look]:
                 left[look] -= 1
                 found.append(bout)

@@ -68,6 +68,8 @@ function showTimes() {
   write(open.hide, say("hide", { class: inside(it.words) }));
 }
 
+// A count, those apart that are not sure: 2 (+3?).
+const counted = (value, unsure) => unsure ? `${value - unsure} (+${unsure}?)` : String(value);
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 const dayName = () => shown.now === null ? shown.title : say("since evening");
 
@@ -131,7 +133,7 @@ function showRow(row, it, where, columns) {
   if (!row.name.firstChild) row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour), make("span", {}, breakable(it.words))));
   it.counts.forEach((value, index) => {
     row.cells[index].className = value ? "" : "none";
-    write(row.counts[index], value === null ? say("not known") : String(value));
+    write(row.counts[index], value === null ? say("not known") : counted(value, it.unsure[index + 1]));
     const name = [it.words, where, columns[index]].filter(Boolean).join(", ");
     set(row.counts[index], "aria-label", `${name}: ${row.counts[index].textContent}`);
   });
@@ -193,7 +195,7 @@ function showRoom(room, { gaps, unheard, lanes }, day) {
       colour(path, it.colour);
     }
     write(lane.name, it.words);
-    write(lane.figure, it.count ? `${it.count}×` : "");
+    write(lane.figure, it.count ? (it.unsure[0] ? counted(it.count, it.unsure[0]) : `${it.count}×`) : "");
     for (const [text, x] of [[lane.name, 6], [lane.figure, width - 6]]) { set(text, "x", x); set(text, "y", top + 12.5); }
   });
   const every = width < 520 ? 4 : 2;

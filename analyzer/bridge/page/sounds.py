@@ -19,7 +19,7 @@ from hearthlog.analyzer.bridge.page.doubts import Doubts
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import Words, clock, room
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, colour_on_paper
+from hearthlog.models.classes import PHONE_RING, SILENCE, UNKNOWN, class_name, colour_on_paper
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, find_logs, log_name
@@ -70,9 +70,14 @@ class Bout(NamedTuple):
         return bool(self.doubts) or self.first.label in IMPORTANT
 
 
-def needs_look(bout: Bout, uncounted: int) -> bool:
-    """Whether a bout needs a look, of which so many events do not count."""
-    return bout.is_important and uncounted < len(bout.events)
+def needs_look(bout: Bout, uncounted: int, sureness: Sureness) -> bool:
+    """Whether a bout needs a look, of which so many events do not count.
+
+    Nobody has to look at a telephone that may be something else.
+    """
+    unsure = [sureness.is_unsure(event.confidence) for event in bout.events]
+    is_doubtful_ring = bout.first.label == PHONE_RING and not bout.doubts and all(unsure)
+    return bout.is_important and uncounted < len(bout.events) and not is_doubtful_ring
 
 
 def bouts(events: Iterable[SoundEvent], doubts: Doubts = MappingProxyType({})) -> list[Bout]:
@@ -169,7 +174,7 @@ class ShownBouts(NamedTuple):
             "doubtful": bool(bout.doubts),
             "room": "" if self.is_alone else room(first.microphone),
             "said": corrections[-1] if corrections else "",
-            "look": needs_look(bout, self._uncounted_of(bout)),
+            "look": needs_look(bout, self._uncounted_of(bout), self.sureness),
             "ids": [event.id for event in reversed(bout.events)],
         }
 
