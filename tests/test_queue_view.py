@@ -2,7 +2,6 @@
 
 import subprocess
 from contextlib import suppress
-from dataclasses import replace
 from operator import ge
 
 import numpy as np
@@ -12,7 +11,7 @@ from conftest import HEARTHLOG
 from viewers import patiently, pixels
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.lanes import FEATURES, SHARES, features_image
+from hearthlog.analyzer.review.lanes import SHARES
 from hearthlog.analyzer.review.timeline import Key, LabelledSpans, Question, SoundClip
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.drawing import placed_lanes
@@ -242,22 +241,6 @@ def test_a_window_keeps_its_layout_when_its_cursor_goes_elsewhere(view, timeline
     assert layout() == before
 
 
-def test_where_no_sound_was_kept_there_are_features_one_below_the_other(timeline):
-    microphone, grid = timeline.microphones["mic"], timeline.grid
-    image, text = features_image(microphone, grid, (66, 1000))
-    plot = microphone.plots[FEATURES, ""]
-    assert text == "Features, as no sound was kept here"
-    energy = plot.values[np.arange(1000) * grid.count // 1000, plot.names.index("energy")]
-    order = np.argsort(energy)
-    assert (np.diff(image[-1, order]) >= 0).all()
-    assert image[-1].min() == 0.0
-    assert image[-1].max() == 1.0
-    bare = replace(microphone, plots={})
-    image, text = features_image(bare, grid, (66, 1000))
-    assert not image.any()
-    assert text == "No sound was kept here, and no features"
-
-
 def test_the_viewer_hardly_grows_with_the_spans_that_it_showed(view, logs, timeline):
     ours = psutil.Process().children(recursive=True)
     (viewer,) = [each for each in ours if each.name() == "rerun"]
@@ -283,7 +266,6 @@ def test_the_spectrogram_of_a_span_shows_its_sound_where_it_was_kept(view, logs,
         start = timeline.grid.start + second * SECOND
         close = read_timeline([logs], start - MARGIN, start + SECOND + MARGIN)
         close.microphones["mic"].clips.extend(timeline.microphones["mic"].clips)
-        del close.microphones["mic"].plots[FEATURES, ""]  # else they are shown where no sound is
         view.draw_close_up(close)
         view.show(start, start + SECOND, MARGIN)
         patiently(view.cursor, lambda cursor, start=start: cursor == start)

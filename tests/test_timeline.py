@@ -55,7 +55,7 @@ from hearthlog.analyzer.review.timeline import (
 )
 from hearthlog.analyzer.review.timeline_reader import MOST_SHARES, read_timeline
 from hearthlog.analyzer.review.viewer.canvas import ROWS_HEIGHT, Canvas
-from hearthlog.analyzer.review.viewer.drawing import LANE_HEIGHT, DrawnLane
+from hearthlog.analyzer.review.viewer.drawing import LANES_HEIGHT, DrawnLane
 from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classes import colour, in_words, ordered
@@ -766,10 +766,11 @@ def test_every_sound_is_a_strip_in_the_lane_of_its_class_and_in_its_colour(recor
         (text,) = set(fixed(recording, entity, "SeriesLines:names"))
         (shade,) = set(fixed(recording, entity, "SeriesLines:colors"))
         red, green, blue = shade >> 24, shade >> 16 & 255, shade >> 8 & 255
-        place = (len(names) - int(number) - 0.5) * LANE_HEIGHT
+        height = LANES_HEIGHT / len(names)
+        place = (len(names) - int(number) - 0.5) * height
         for lines in heights[2:4]:
             assert np.mean(lines) == pytest.approx(place)
-            assert 0.45 * LANE_HEIGHT < np.ptp(lines) < 0.55 * LANE_HEIGHT
+            assert 0.45 * height < np.ptp(lines) < 0.55 * height
         for start, end in zip(times[2::6].tolist(), times[3::6].tolist(), strict=True):
             drawn.add((labelling, names[int(number)], start, end, text, (red, green, blue)))
     expected = {
@@ -811,7 +812,7 @@ def test_what_is_not_in_a_lane_any_more_is_hidden_and_what_is_new_is_drawn(tmp_p
     stream = rr.RecordingStream("test")
     sink = rr.binary_stream(stream)
     canvas = Canvas(stream, home_clock(UTC, 0, HOUR))
-    drawn = DrawnLane("mic/lanes/all/00", 0.5)
+    drawn = DrawnLane("mic/lanes/all/00", 0.5, 0.05)
     first, second = (0, 20, "yelling"), (30, 31, "yelling")
     for marks in ((first,), (first, second), (second,)):
         drawn.show(reviewed_lane("mic", "", spans_at(*marks), no_spans()), canvas)
@@ -834,7 +835,7 @@ def test_texts_of_one_length_are_drawn_in_the_same_order_in_every_process(tmp_pa
     canvas = Canvas(stream, home_clock(UTC, 0, HOUR))
     names = ["yelling", "speech", "music", "coughing", "crying", "laughing"]
     marks = [(10 * n, 10 * n + 5, name) for n, name in enumerate(names)]
-    drawn = DrawnLane("mic/lanes/all/00", 0.5)
+    drawn = DrawnLane("mic/lanes/all/00", 0.5, 0.05)
     drawn.show(reviewed_lane("mic", "", spans_at(*marks), no_spans()), canvas)
     path = tmp_path / "a.rrd"
     path.write_bytes(sink.read())

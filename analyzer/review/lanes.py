@@ -145,7 +145,7 @@ _TROUBLE = "Trouble"
 _RECURRING = "Recurs"
 _VOICES = "Voices"
 _LOOKED_AT: Colour = (58, 70, 92)
-SELECTED_COLOUR: Colour = (245, 240, 225)
+SELECTED_COLOUR: Colour = (206, 196, 170)
 _MOST_LANES = 12  # of classes, if some were not heard at all
 
 
@@ -468,26 +468,6 @@ def timeline_plots(timeline: Timeline) -> Iterator[Plot]:
     for microphone in timeline.microphones.values():
         for plot in microphone.plots.values():
             yield _shaded(plot) if plot.kind.style is Style.HEAT_MAP else plot
-
-
-def features_image(
-    microphone: MicrophoneTimeline, grid: TimelineGrid, shape: tuple[int, int]
-) -> tuple[Float64, str]:
-    """Draw the features of a span without sound, one below the other, the energy last; add a text.
-
-    `shape` has the rows, and the columns from the start of the grid to its end; shades are 0 (low,
-    or nothing recorded) to 1.
-    """
-    rows, columns = shape
-    plot = microphone.plots.get((FEATURES, ""))
-    if plot is None or np.isnan(plot.values).all():
-        return np.zeros(shape), "No sound was kept here, and no features"
-    order = sorted(range(len(plot.names)), key=lambda i: plot.names[i] == _ENERGY)
-    shades = _shades(plot.values)[:, order]
-    of_column = np.arange(columns) * grid.count // columns
-    of_row = np.arange(rows) * len(order) // rows
-    text = "Features, as no sound was kept here"  # two lines beside a flat picture
-    return np.nan_to_num(shades)[of_column][:, of_row].T, text
 
 
 def _shades(values: NDArray[np.floating]) -> Float64:

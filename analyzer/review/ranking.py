@@ -9,12 +9,15 @@ import numpy as np
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation import DAY, indexed_events
 from hearthlog.analyzer.logs.labelling import LABEL_FIELDS, Labellings, NamedLabelling
-from hearthlog.analyzer.logs.spans import Spans, pieces
+from hearthlog.analyzer.logs.spans import NONE, Spans
 from hearthlog.analyzer.review.spans import (
+    LEAST_AUDIBLE,
     JudgeableSpans,
     ModelUncertainty,
     SpanSounds,
+    audible_time,
     border_pieces,
+    cut_to_audible,
     judgeable_spans,
     labelling_model,
     other_labels,
@@ -156,7 +159,7 @@ def make_queue(  # noqa: PLR0913
         since there is nothing to judge. The most `useful` spans sound like most of the sounds that
         the model is uncertain of, with rare classes preferred.
     audible : Spans, optional
-        Time with kept sound: `useful` spans within it go first.
+        Time with kept sound: `useful` spans with some of it go first, and are cut to it.
     progress : callable, optional
         Called with the share of the logs that is read, 0 to 1.
 
@@ -176,6 +179,8 @@ def make_queue(  # noqa: PLR0913
     segments = indexed_events(side.labelling, classes)
     segments = without(segments, reviewed)
     spans = judgeable_spans(segments)
+    if audible is not None and ranking == USEFUL:
+        spans = cut_to_audible(spans, audible, _LONG_ENOUGH)
     if not len(spans):
         raise DataError(f"{side.name}: nothing is left to review")
     means = ModelUncertainty(spans, classes)
@@ -231,21 +236,30 @@ def _useful(
     sounds: Callable[[JudgeableSpans], SpanSounds],
     audible: Spans | None,
 ) -> Int64:
-    """Choose spans similar to most of a model's uncertain sounds, with rare classes preferred."""
-    rows, shares = sample(worth(spans, uncertain))
+    """Choose spans similar to most of a model's uncertain sounds, with rare classes preferred.
+
+    Those that are mostly audible go first, then those that are partly, and silent ones last.
+    """
+    kept = audible_time(spans, NONE if audible is None else audible)
+    # Sampled apart, or of many spans few that can be heard would be left.
+    weights, is_audible = worth(spans, uncertain), kept >= LEAST_AUDIBLE
+    first, of_first = sample(np.where(is_audible, weights, 0.0), MOST_CANDIDATES // 2)
+    other, of_other = sample(np.where(is_audible, 0.0, weights), MOST_CANDIDATES - len(first))
+    order = np.argsort(np.concatenate([first, other]))
+    rows = np.concatenate([first, other])[order]
+    shares = np.concatenate([of_first, of_other])[order]
     some = spans.take(rows)
     points, gamma = sounds(some)
-    eligible = some.ends - some.starts >= _LONG_ENOUGH
+    length = some.ends - some.starts
+    eligible = length >= _LONG_ENOUGH
     if not eligible.any():
         eligible[:] = True
-    if audible is None:
-        return rows[cover(points, gamma, shares, eligible, count)]
-    kept, row, _ = pieces(some, audible)
-    length = np.bincount(row, kept.ends - kept.starts, len(some))
-    sounding = length > _MOSTLY * (some.ends - some.starts)
-    first = cover(points, gamma, shares, eligible & sounding, count)
-    rest = cover(points, gamma, shares, eligible & ~sounding, count - len(first))
-    return rows[np.concatenate([first, rest])]
+    rank = is_audible[rows] * (1 + (kept[rows] > _MOSTLY * length))
+    chosen = np.empty(0, np.intp)
+    for best in (2, 1, 0):
+        more = cover(points, gamma, shares, eligible & (rank == best), count - len(chosen))
+        chosen = np.concatenate([chosen, more])
+    return rows[chosen]
 
 
 def worth(spans: JudgeableSpans, uncertain: Float64) -> Float64:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
-from hearthlog.analyzer.logs.spans import NONE, Spans, union
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, union
 from hearthlog.analyzer.marks import QUEUE, RANDOM
 from hearthlog.analyzer.promotion.paired_labels import A_DAY, class_words, time_words
 from hearthlog.analyzer.review.candidates import (
@@ -30,6 +30,7 @@ from hearthlog.analyzer.review.review_list import (
     random_minutes,
     read_list,
 )
+from hearthlog.analyzer.review.spans import LEAST_AUDIBLE
 from hearthlog.models.classes import in_words
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.registry import DEFAULT_FOLDER, load
@@ -45,6 +46,7 @@ class ReviewItem(NamedTuple):
     label: str
     text: str
     chosen: str = QUEUE
+    is_audible: bool = True  # unless less than a quarter of a second of its sound was kept
 
 
 QUEUES = (*RANKINGS, RANDOM, HINT)
@@ -60,10 +62,17 @@ _MINUTES_LEFT = 10  # labelled minutes per drawn one, or a short log would have 
 Limits = tuple[int | None, int | None]
 
 
-def review_items(spans: Iterable[ReviewSpan]) -> list[ReviewItem]:
-    """Return the items of a review, in span order."""
+def review_items(spans: Iterable[ReviewSpan], audible: Spans | None = None) -> list[ReviewItem]:
+    """Return the items of a review, in span order; `audible` is the time with kept sound."""
     return [
-        ReviewItem(span.start, span.end, span.proposed_label, _text(span), chosen_as(span))
+        ReviewItem(
+            span.start,
+            span.end,
+            span.proposed_label,
+            _text(span),
+            chosen_as(span),
+            audible is None or cut(audible, span.start, span.end).length >= LEAST_AUDIBLE,
+        )
         for span in spans
     ]
 

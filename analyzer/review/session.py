@@ -26,6 +26,8 @@ _AROUND = 600 * NANOSECONDS
 _RIGHT = "."
 _CAPS = {_RIGHT: "Enter", "p": "Space"}
 _NO_SOUND = "no sound of this span was kept"
+_SILENT = "nothing to hear: its sound was not kept"
+_LONG = 60 * NANOSECONDS  # a longer span is marked by a second press
 _ANSWERS = {"a", "c", _RIGHT, "n", "b", "q"}
 _CLASS_KEYS = "1234567890eghijklorsvwxy"
 _SELECT = "drag a span on the time ruler, or press [ at its start and ] at its end"
@@ -95,7 +97,7 @@ class ReviewSession:
 
     `look_closely` draws a span at the resolution of its frames; `listen` plays the kept sound of a
     span, and returns its length in seconds, 0 without sound, and a line for the reviewer; `stop`
-    stops it. Spans have start and end in nanoseconds of UTC.
+    stops it; `show_keys` shows the keys. Spans have start and end in nanoseconds of UTC.
     """
 
     screen: Screen
@@ -107,11 +109,13 @@ class ReviewSession:
     listen: Callable[[int, int], tuple[float, str]]
     stop: Callable[[], None]
     items: Sequence[ReviewItem] = ()
+    show_keys: Callable[[], None] | None = None  # by default the lines of keys are announced
     _at: int = -1
     _judged: list[int] = field(default_factory=list)  # the item of each change
     _began: float = 0.0
     _begin: int | None = None  # start of a span without an end yet
     _plays_until: float = 0.0  # by CLOCK_MONOTONIC
+    _long: tuple[str, int, int] | None = None  # label and span of the last press, if too long
 
     @property
     def keys(self) -> list[Key]:
@@ -202,8 +206,11 @@ class ReviewSession:
             if same in actions:
                 actions[same][1]()
             elif key.strip():
-                for line in self.key_lines:
-                    self.announce(line)
+                if self.show_keys is not None:
+                    self.show_keys()
+                else:
+                    for line in self.key_lines:
+                        self.announce(line)
                 self.announce(f"{key!r} does nothing: press one of these keys")
         except HearthlogError as error:
             self.announce(str(error))
@@ -212,6 +219,13 @@ class ReviewSession:
 
     def _mark_as(self, label: str) -> None:
         chosen = "" if self._in_minute or not self.items else self.items[self._at].chosen
+        start, end = self._chosen()
+        is_item = bool(self.items) and (start, end) == self.items[self._at][:2]
+        if end - start > _LONG and not is_item and (label, start, end) != self._long:
+            self._long = label, start, end
+            length = length_text(end - start)
+            raise DataError(f"{length} is long: press the key again to mark it as {_words(label)}")
+        self._long = None
         self._mark(lambda start, end: self.marking.mark(start, end, label, chosen))
 
     @property
@@ -361,18 +375,19 @@ class ReviewSession:
             return
         item = self.items[self._at]
         place = f"{self._at + 1} of {len(self.items)}"
-        self.announce(f"{place}: {_question(item)} {self._text(item.start, item.end)}; {item.text}")
+        silent = "" if item.is_audible else f"; {_SILENT}"
+        span = self._text(item.start, item.end)
+        self.announce(f"{place}: {_question(item)} {span}; {item.text}{silent}")
         margin = _margin(item.start, item.end)
         with self._unless_silent():
             self.look_closely(item.start - margin, item.end + margin)
-            text = f"{place}, {self._text(item.start, item.end)}"
+            text = f"{place}, {span}{silent}"
             self.screen.ask(item.start, item.end, Question(_question(item), text, self._answers()))
             # A minute has several sounds: what is named in it is selected by hand.
             self.screen.show(item.start, item.end, margin, select=item.chosen != RANDOM)
 
     def _text(self, start: int, end: int) -> str:
-        length = (end - start) / NANOSECONDS
-        return f"{local_time(start, self.zone):%a %d %b %H:%M:%S}, {length:.1f} s"
+        return f"{local_time(start, self.zone):%a %d %b %H:%M:%S}, {length_text(end - start)}"
 
     def _conclude(self) -> None:
         minutes = (time.monotonic() - self._began) / 60
@@ -388,7 +403,8 @@ class ReviewSession:
             yes = Key(_RIGHT, "yes, or the rest is right", shown=_CAPS[_RIGHT])
         others = [key for key, label in labels.items() if self._in_minute or label != item.label]
         named = {one.key: one for one in self.keys}
-        more = Key("n", "skip"), Key("p", "play", shown=_CAPS["p"]), Key("z", "undo")
+        play = [Key("p", "play", shown=_CAPS["p"])] if item.is_audible else []
+        more = Key("n", "skip"), *play, Key("z", "undo")
         return [yes, *(named[key] for key in others), *more]
 
 
@@ -396,6 +412,16 @@ def _question(item: ReviewItem) -> str:
     if item.chosen == RANDOM:
         return "Is all of this minute labelled right?"
     return f"{in_words(item.label)}?"
+
+
+def length_text(length: int) -> str:
+    """Return a length in nanoseconds in words, as `53 min 20 s`; up to a minute with tenths."""
+    if length <= _LONG:
+        return f"{length / NANOSECONDS:.1f} s"
+    minutes, seconds = divmod(round(length / NANOSECONDS), 60)
+    hours, minutes = divmod(minutes, 60)
+    parts = (hours, "h"), (minutes, "min"), (seconds, "s")
+    return " ".join(f"{number} {unit}" for number, unit in parts if number)
 
 
 def _words(label: str) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from hearthlog.analyzer.logs.labelling import LabelledFile, Labellings
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
-from hearthlog.analyzer.logs.spans import Spans, overlay, ranges, remains
+from hearthlog.analyzer.logs.spans import Spans, overlay, pieces, ranges, remains
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features import FeatureSet, Inputs, WindowStatistics
@@ -31,6 +31,7 @@ from hearthlog.schemas.messages.topics import EmbeddingSpace, topic
 
 SHORTEST = NANOSECONDS // 2
 LONGEST = 10 * NANOSECONDS
+LEAST_AUDIBLE = NANOSECONDS // 4  # of kept sound, for a person to judge
 _FLICKER = NANOSECONDS
 _MOST = 5_000_000
 
@@ -87,6 +88,35 @@ def border_pieces(spans: JudgeableSpans, silent: Bool) -> Bool:
     is_next[1:] |= touching & sounds[:-1]
     is_next[:-1] |= touching & sounds[1:]
     return is_next & (spans.ends - spans.starts < _FLICKER)
+
+
+def audible_time(spans: JudgeableSpans, audible: Spans) -> Int64:
+    """Return the kept sound in each span, in nanoseconds; shape (n,)."""
+    kept, row, _ = pieces(spans, audible)
+    return np.bincount(row, kept.ends - kept.starts, len(spans)).astype(np.int64)
+
+
+def cut_to_audible(spans: JudgeableSpans, audible: Spans, least: int) -> JudgeableSpans:
+    """Cut spans that are partly audible to the part from their first to their last kept sound.
+
+    The part is at least `least` nanoseconds long, if its span is. Spans with less than a quarter of
+    a second of kept sound stay as they are.
+    """
+    kept, row, _ = pieces(spans, audible)
+    enough = audible_time(spans, audible) >= LEAST_AUDIBLE
+    first, last = spans.ends.copy(), spans.starts.copy()
+    np.minimum.at(first, row, kept.starts)
+    np.maximum.at(last, row, kept.ends)
+    missing = np.maximum(least - (last - first), 0)
+    starts = np.clip(
+        first - missing // 2, spans.starts, np.maximum(spans.ends - least, spans.starts)
+    )
+    ends = np.minimum(np.maximum(last, starts + least), spans.ends)
+    return replace(
+        spans,
+        starts=np.where(enough, starts, spans.starts),
+        ends=np.where(enough, ends, spans.ends),
+    )
 
 
 def without(segments: Events, reviewed: Spans) -> Events:

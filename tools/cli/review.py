@@ -268,6 +268,7 @@ def _show(
         lambda start, end: listen(shown.clips, start, end),
         stop_sound,
         items,
+        lambda: _print_keys(session),
     )
     keys: SimpleQueue[str] = SimpleQueue()
     audio = partial(_playable, session, shown.clips)
@@ -349,7 +350,7 @@ def _work(
             edges = np.array([(one.start, one.end) for one in clips], np.int64).reshape(-1, 2)
             audible = Spans(edges[:, 0], edges[:, 1])
             of = microphone, labelling
-            items = review_items(_queue_spans(sources, of, choice, audible if clips else None))
+            items = review_items(_queue_spans(sources, of, choice, audible), audible)
             _report_fewer(len(items), choice)
     marking = Marking(
         microphone,

@@ -20,9 +20,7 @@ _STROKE_WIDTH = 2.0  # pixels
 _STRIP_LINES, _STRIP_WIDTH = 12, 5.0  # screen points
 # As many lines as fill a row of 37 points, as of nine classes in a window of 1440.
 _ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 6, 6.0, 0.8
-# Of all rows. The space of an axis is as wide as its widest number, and digits differ in width:
-# with 0.4 here as on the axis of the lanes, both begin at one place, and have one scale of time.
-ROWS_HEIGHT = 0.44
+ROWS_HEIGHT = 3.9  # of all rows, as of all lanes: so their axes are equally wide
 _SHADES = 10  # of a row; each change of its colour is a line of its own for the viewer
 _GROUND = np.array((13, 13, 13))  # behind the plots of the viewer
 _FILLING = 400  # texts that leave no pause in the data
@@ -169,7 +167,8 @@ class Canvas:
         last = np.append(first[1:], True)
         kept = first | np.append(True, (levels[1:] != levels[:-1]).any(axis=1))
         ends = starts[last] + length
-        stamps = np.concatenate([starts[first], starts[kept], ends, ends])
+        # Of rows at one time the viewer may take a value without its hole: none share a time.
+        stamps = np.concatenate([starts[first], starts[kept] + first[kept], ends - 1, ends])
         shades = np.concatenate([levels[first], levels[kept], levels[last], levels[last]])
         order = np.argsort(stamps, kind="stable")
         count = levels.shape[1]

@@ -18,7 +18,6 @@ from hearthlog.analyzer.review.lanes import (
     SHARES,
     Checked,
     Lane,
-    features_image,
     labelling_in_words,
     labellings_of,
     timeline_lanes,
@@ -56,9 +55,9 @@ _Strip = tuple[int, int, str]
 class DrawnLane:
     """A lane in the viewer; drawn states can be hidden, but not changed."""
 
-    def __init__(self, root: str, height: float, thickness: float | None = None) -> None:
+    def __init__(self, root: str, height: float, thickness: float) -> None:
         self._root = root
-        self._places = height, thickness or _THICKNESS * LANE_HEIGHT
+        self._places = height, thickness
         self._parts: dict[str, set[_Strip]] = {}
         self._count = 0
 
@@ -84,11 +83,12 @@ class DrawnLane:
 
 
 class LanePlace(NamedTuple):
-    """Place of a lane: its entity, the entity of its name, and its height in units of the view."""
+    """Place of a lane: its entity, the entity of its name, and its middle and thickness there."""
 
     entity: str
     name: str
     height: float
+    thickness: float
 
 
 def placed_lanes(timeline: Timeline, *, marking: bool = False) -> list[tuple[Lane, LanePlace]]:
@@ -103,9 +103,10 @@ def placed_lanes(timeline: Timeline, *, marking: bool = False) -> list[tuple[Lan
         number = own.index(lane.name)
         root = lanes_entity(lane.microphone, lane.labelling)
         name = f"{lane.microphone}/{WORDS}/names/{_word(lane.labelling) or 'all'}/{number:02}"
-        placed.append(
-            (lane, LanePlace(f"{root}/{number:02}", name, (len(own) - number - 0.5) * LANE_HEIGHT))
-        )
+        lane_height = LANES_HEIGHT / len(own)
+        middle = (len(own) - number - 0.5) * lane_height
+        place = LanePlace(f"{root}/{number:02}", name, middle, _THICKNESS * lane_height)
+        placed.append((lane, place))
     return placed
 
 
@@ -128,15 +129,16 @@ def draw(
         _draw_hours(timeline, canvas)
     for lane, place in placed_lanes(timeline, marking=marking):
         canvas.write(place.name, lane.title)
-        drawn = DrawnLane(place.entity, place.height)
+        drawn = DrawnLane(place.entity, place.height, place.thickness)
         drawn.show(lane, canvas)
         if {REVIEWED, SELECTED} & lane.colours.keys():
             changing[lane.microphone, lane.name] = drawn
     for plot in timeline_plots(timeline):
         if len(plot.times):
-            _draw_plot(plot, plot_entity(plot), canvas)
+            draw_plot(plot, plot_entity(plot), canvas)
         canvas.write(text_entity(plot), plot.text)
     for microphone in timeline.microphones.values():
+        _clear_sound(microphone.name, timeline.grid.start, " ", canvas)  # until a span is requested
         if microphone.clips:
             canvas.show_clips(f"{microphone.name}/{CLIP}", microphone.clips, timeline.grid.start)
     canvas.write_lines(LINES, timeline.lines)
@@ -176,14 +178,19 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
         if plot.kind.frame_step:
             new = rows_at(before, plot.times) < 0
             part = plot._replace(times=plot.times[new], values=plot.values[new])
-            _draw_plot(part, plot_entity(plot, CLOSE_UP), canvas, is_new=not len(before.starts))
+            draw_plot(part, plot_entity(plot, CLOSE_UP), canvas, is_new=not len(before.starts))
     grid = timeline.grid
     for microphone in timeline.microphones.values():
-        text = "Kept sound, 0 to 8 kHz"
         shade = spectrogram(microphone.clips, grid.start, grid.end, _SPECTRUM_SHAPE)
         if shade is None:
-            shade, text = features_image(microphone, grid, _SPECTRUM_SHAPE)
-        canvas.show_image(f"{microphone.name}/{SPECTRUM}", grid.start, shade, text)
+            _clear_sound(microphone.name, grid.start, "No sound was kept here", canvas)
+        else:
+            entity = f"{microphone.name}/{SPECTRUM}"
+            canvas.show_image(entity, grid.start, shade, "Kept sound, 0 to 8 kHz")
+
+
+def _clear_sound(microphone: str, time: int, text: str, canvas: Canvas) -> None:
+    canvas.show_image(f"{microphone}/{SPECTRUM}", time, np.zeros((2, 2)), text)
 
 
 class RequestedSpan(DrawnLane):
@@ -249,12 +256,12 @@ def draw_frames(
             canvas.draw_frames(entity, plot.names, parts, plot.kind.frame_step)
 
 
-def _draw_plot(plot: Plot, entity: str, canvas: Canvas, *, is_new: bool = True) -> None:
-    """Draw a plot of a review: bands fall apart where one zooms in, so shares are rows."""
+def draw_plot(plot: Plot, entity: str, canvas: Canvas, *, is_new: bool = True) -> None:
+    """Draw a plot, or add to it: bands fall apart where one zooms in, so shares are rows."""
     if plot.kind is not SHARES:
         if is_new:
             configure_plot(plot, entity, canvas)
-        add_to_plot(plot, entity, canvas)
+        _add_to_plot(plot, entity, canvas)
         return
     names = ordered(plot.names)
     shades = [*map(colour, names)]
@@ -273,11 +280,9 @@ def configure_plot(plot: Plot, entity: str, canvas: Canvas, style: Style | None 
     canvas.configure(entity, style or plot.kind.style, names, colours)
 
 
-def add_to_plot(plot: Plot, entity: str, canvas: Canvas, strokes: int = 1) -> None:
-    """Draw values into a configured plot."""
-    if plot.kind.style is Style.BANDS:
-        canvas.add_bands(entity, plot.times, plot.values, plot.length, strokes)
-    elif plot.kind.style is Style.HEAT_MAP:
+def _add_to_plot(plot: Plot, entity: str, canvas: Canvas) -> None:
+    """Draw values into a configured plot, but not shares."""
+    if plot.kind.style is Style.HEAT_MAP:
         canvas.add_shades(entity, plot.times, plot.values)
     else:
         canvas.draw_lines(entity, plot.times, plot.values)
@@ -314,17 +319,18 @@ APPLICATION = "hearthlog"
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
 _LANE, _CLOSE_LANE, _AROUND_LANES = 29, 27, 50
-_LEVEL_HEIGHT, _PLOT_HEIGHT, _REQUESTED_HEIGHT = 90, 140, 28
+_LEVEL_HEIGHT, _PLOT_HEIGHT, _CLOSE_PLOT, _REQUESTED_HEIGHT = 90, 140, 122, 27
 _QUESTION_HEIGHT = 62  # of a heading, with the space that the viewer leaves above it
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
-# Numbers of the lanes' axis are as wide as those of the plots below: the plots begin at one place.
-LANE_HEIGHT = 0.1
-_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 42
+# Of all lanes. Rerun 0.41 cannot hide the numbers of an axis, and writes one every 20 points or
+# more: so these are few, 0 to 3, and as wide as the 0 of the other plots, which begin at one place.
+LANES_HEIGHT = 3.9
+_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 90
 _SPECTRUM_SHAPE = (64, 2240)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 # Widths of a text and a plot, until that of the window is known; the hours have no axis.
-COLUMNS, REQUESTED_COLUMNS, HOUR_COLUMNS, _QUESTION_COLUMNS = (2, 10), (2, 12), (2, 11), (3, 7)
+COLUMNS, HOUR_COLUMNS, _QUESTION_COLUMNS = (2, 10), (2, 11), (3, 7)
 Boundary = rr.encodings.TimeRangeBoundary
 Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
 
@@ -367,7 +373,7 @@ def tabs(views: Iterable[rrb.View | rrb.Container]) -> rrb.View | rrb.Container:
 
 def states_view(root: str, name: str) -> rrb.View:
     """Make a view of all state lanes below an entity."""
-    return rrb.StateTimelineView(origin=root, name=name, time_view=_axis())
+    return rrb.StateTimelineView(origin=root, name=name, titlebar=False, time_view=_axis())
 
 
 def lines_view() -> rrb.View:
@@ -385,10 +391,9 @@ def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = Fa
     scale = kind.live_scale or kind.scale if live else kind.scale
     if kind.style is Style.HEAT_MAP:
         scale = (-0.5, len(plot.names) - 0.5)
-    elif kind is SHARES and not live:
+    elif kind is SHARES:
         scale = (0.0, ROWS_HEIGHT)
-    legend = live and (kind.style is Style.BANDS or len(entities) > 1)
-    return _time_series(plot.title, entities, scale, titlebar=live, legend=legend)
+    return _time_series(plot.title, entities, scale, legend=live and len(entities) > 1)
 
 
 def _time_series(
@@ -396,7 +401,6 @@ def _time_series(
     entities: Sequence[str],
     scale: tuple[float, float] | None,
     *,
-    titlebar: bool = False,
     legend: bool = False,
 ) -> rrb.View:
     is_one = len(entities) == 1
@@ -404,7 +408,7 @@ def _time_series(
         origin=entities[0] if is_one else "/",
         contents="$origin/**" if is_one else [f"{entity}/**" for entity in entities],
         name=name,
-        titlebar=titlebar,
+        titlebar=False,
         axis_x=_axis(),
         # The wheel zooms in time alone: names of lanes do not move with their lanes.
         axis_y=rrb.ScalarAxis(range=scale, zoom_lock=True),
@@ -444,7 +448,8 @@ def review_layout(
             more[1:1] = level
         else:
             rows += [(_LEVEL_HEIGHT, view) for view in level]
-        stacks[name] = [*rows, (_PLOT_HEIGHT, tabs(more))] if more else rows
+        below = _CLOSE_PLOT if close_up else _PLOT_HEIGHT
+        stacks[name] = [*rows, (below, tabs(more))] if more else rows
     panel = rrb.TimePanel(
         state="expanded" if marking else "collapsed", timeline=clock.name, play_state="paused"
     )
@@ -453,7 +458,7 @@ def review_layout(
         for time in (timeline.grid.start, timeline.grid.end)
     )
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
-    words = rrb.Horizontal(_text(QUESTION), _text(ANSWERS), column_shares=_QUESTION_COLUMNS)
+    words = rrb.Horizontal(text_view(QUESTION), text_view(ANSWERS), column_shares=_QUESTION_COLUMNS)
     question: list[Row] = [(_QUESTION_HEIGHT, words), (_REQUESTED_HEIGHT, _requested_view())]
     homes = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []
@@ -471,17 +476,22 @@ def _lane_views(
     for labelling, words in labellings or [("", "")]:
         entities = [lanes_entity(microphone.name, each) for each in dict.fromkeys((labelling, ""))]
         names = [place.name for own, place in places if own in {labelling, ""}]
-        lanes = _time_series(words, entities, (0.0, count * LANE_HEIGHT))
-        texts = rrb.Vertical(
-            *(_text(name) for name in names), _text(NOTHING), row_shares=[*[1.0] * count, BELOW]
-        )
+        lanes = _time_series(words, entities, (0.0, LANES_HEIGHT))
+        texts = names_view(names, count)
         by = f" by {words}" if words else ""
         title = f"What was heard{by}: {note}"
         views.append(rrb.Horizontal(texts, lanes, column_shares=COLUMNS, name=title))
     return views
 
 
-def _text(entity: str) -> rrb.View:
+def names_view(names: Sequence[str], count: int) -> rrb.Vertical:
+    """Show the names of rows, each next to its own."""
+    views = (text_view(name) for name in names)
+    return rrb.Vertical(*views, text_view(NOTHING), row_shares=[*[1.0] * count, BELOW])
+
+
+def text_view(entity: str) -> rrb.View:
+    """Make a view of a text."""
     return rrb.TextDocumentView(origin=entity, titlebar=False)
 
 
@@ -506,8 +516,8 @@ def _by_title(plots: Sequence[Plot]) -> list[list[Plot]]:
 
 
 def _hours_view() -> rrb.Container:
-    view = rrb.StateTimelineView(origin=HOURS, name="Hours", titlebar=False, time_view=_axis())
-    return rrb.Horizontal(_text(HOURS_NAME), view, column_shares=HOUR_COLUMNS)
+    view = states_view(HOURS, "Hours")
+    return rrb.Horizontal(text_view(HOURS_NAME), view, column_shares=HOUR_COLUMNS)
 
 
 def _spectrum_view(microphone: str) -> rrb.Container:
@@ -521,12 +531,12 @@ def _spectrum_view(microphone: str) -> rrb.Container:
         visual_bounds=rrb.VisualBounds2D(x_range=[0, columns], y_range=[0, rows]),
         background=_BLACK,
     )
-    return rrb.Horizontal(_text(f"{entity}/text"), view, column_shares=HOUR_COLUMNS)
+    return rrb.Horizontal(text_view(f"{entity}/text"), view, column_shares=HOUR_COLUMNS)
 
 
 def _requested_view() -> rrb.Container:
     lane = _time_series("Which span is asked", [REQUESTED], (0.0, 1.0))
-    return rrb.Horizontal(_text(REQUESTED_NAME), lane, column_shares=REQUESTED_COLUMNS)
+    return rrb.Horizontal(text_view(REQUESTED_NAME), lane, column_shares=COLUMNS)
 
 
 def _close_up(plot: Plot, clock: str) -> rrb.Container:
@@ -546,7 +556,7 @@ def _with_text(plots: Sequence[Plot], view: rrb.View, note: str = "") -> rrb.Con
     """Put a view of plots with one title next to a text that explains them."""
     labelling = f": {labelling_in_words(plots[0].labelling)}" if plots[0].kind is SHARES else ""
     return rrb.Horizontal(
-        _text(text_entity(plots[0])),
+        text_view(text_entity(plots[0])),
         view,
         column_shares=COLUMNS,
         name=f"{plots[0].kind.view}{labelling}{note}",

@@ -25,9 +25,11 @@ from hearthlog.analyzer.review.current_sounds import (
 from hearthlog.analyzer.review.lanes import (
     DIRECTION,
     FEATURES,
+    FLOOR,
     NOVELTY,
     PLOTS,
     RECORDER,
+    SHARES,
     Checked,
     StateLane,
 )
@@ -38,23 +40,26 @@ from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import (
     APPLICATION,
     LINES,
+    NOTHING,
+    WORDS,
     Boundary,
     Row,
     TimelineBlueprint,
-    add_to_plot,
-    configure_plot,
     draw,
     draw_frames,
+    draw_plot,
     lines_view,
+    names_view,
     plot_entity,
     plot_view,
     review_layout,
     stack,
     states_view,
     tabs,
+    text_view,
     write_checked,
 )
-from hearthlog.models.classes import Colour, ordered
+from hearthlog.models.classes import Colour, in_words, ordered
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS, time_text
 from hearthlog.schemas.new_files import check_new, new_file
@@ -135,12 +140,16 @@ PORT = 9876  # default server port of Rerun's viewer
 _APPLICATION = "hearthlog_watch"  # separate: viewers keep the layout of each application
 _MEMORY = "20MB"
 _TOGETHER = 4 * NANOSECONDS  # minimum per plot message: each costs a viewer kilobytes for ever
-_MOST_STROKES = 1_200  # maximum of a band on the screen
 _STATES = "lanes"  # entity of all lanes
-_HEAD_HEIGHT, _LANE_HEIGHT = 90, 48
+_LANES_NAME = f"{WORDS}/lanes"
 _CURRENT = "current"  # root of the texts of the current sounds
-_TEXT_HEIGHT, _COLUMNS = 64, 2  # of the texts of microphones
-_DETAILS, _DETAILS_HEIGHT = {DIRECTION, NOVELTY, FEATURES}, 160  # plots in tabs
+# Heights in points of a window of 768: large letters, lanes, a row of a class, and so on.
+_TEXT_HEIGHT, _COLUMNS = 76, 2  # of the texts of microphones
+_HEAD_HEIGHT, _LANE_HEIGHT, _ROW_HEIGHT, _AXIS_HEIGHT = 44, 42, 27, 24
+_PLOTS_HEIGHT = 540
+_DETAILS, _DETAILS_HEIGHT = {DIRECTION, NOVELTY, FEATURES}, 150  # plots in tabs
+# Widths of a text and of a view in a window of 1366: all plots begin at 200, after their numbers.
+_LANE_COLUMNS, _ROW_COLUMNS, _LEVEL_COLUMNS = (200, 1166), (183, 1183), (160, 1206)
 _STEP_SECONDS = 1, 10, 60  # between updates of a sound: in the first 10 s, the first minute, later
 _LEAST_CHANGE = 0.1  # of a confidence, for an update
 _MOST_NAMED = 8  # microphones in the text
@@ -167,7 +176,6 @@ class LiveServer:
         self._recording.send_recording_name("live")
         self._canvas: Canvas | None = None  # None until the clock of the home is known
         self._minutes = minutes
-        self._strokes = max(1, round(_MOST_STROKES / (60 * minutes)))
         self._plots: Plots = {}
         self._waiting: dict[str, list[Plot]] = {}  # by entity: plots too short to be sent yet
         self._lanes: dict[str, dict[str, Colour]] = {}
@@ -189,6 +197,7 @@ class LiveServer:
             if len(update.times):
                 self._show(update, self._canvas_at(int(update.times[-1]), zone))
         if self._canvas is not None and self._plots and not self._is_laid_out:
+            self._canvas.write(_LANES_NAME, "What is heard")
             layout = _layout(self._plots, self._minutes, self._canvas.clock.name)
             self._recording.send_blueprint(layout, make_active=True, make_default=True)
             self._is_laid_out = True
@@ -252,11 +261,11 @@ class LiveServer:
         entity = f"{root}/{len(names) if is_new else names.index(plot.names)}"
         if is_new:
             same.append(plot._replace(times=plot.times[:0], values=plot.values[:0]))
-            configure_plot(plot, entity, canvas)
+            _write_names(plot, canvas)
             self._is_laid_out = False
         waiting = [*self._waiting.pop(entity, []), plot]
         if is_new or abs(int(plot.times[-1] - waiting[0].times[0])) >= _TOGETHER:
-            add_to_plot(_joined(waiting), entity, canvas, self._strokes)
+            draw_plot(_joined(waiting), entity, canvas, is_new=is_new)
         else:
             self._waiting[entity] = waiting
 
@@ -293,11 +302,13 @@ def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
     views = (rrb.TextDocumentView(origin=f"{_CURRENT}/{name}", titlebar=False) for name in named)
     lines = -(-len(named) // _COLUMNS)
     current = rrb.Grid(*views, grid_columns=min(len(named), _COLUMNS))
+    lanes = rrb.Horizontal(
+        text_view(_LANES_NAME), states_view(_STATES, "Heard"), column_shares=_LANE_COLUMNS
+    )
     rows: list[Row] = [
         (_TEXT_HEIGHT * lines, current),
-        (_HEAD_HEIGHT + _LANE_HEIGHT * len(microphones), states_view(_STATES, "What is heard")),
-        (580, tabs(_stack_plots(name, plots) for name in microphones)),
-        (140, lines_view()),
+        (_HEAD_HEIGHT + _LANE_HEIGHT * len(microphones), lanes),
+        (_PLOTS_HEIGHT, tabs(_stack_plots(name, plots) for name in microphones)),
     ]
     panel = rrb.TimePanel(state="collapsed", timeline=clock, play_state="following")
     ends = (Boundary.cursor_relative(seconds=seconds) for seconds in (-60 * minutes, 0.0))
@@ -305,7 +316,7 @@ def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
 
 
 def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
-    """Show the plots of a microphone; kinds with the same title share a view, some share tabs."""
+    """Show the plots of a microphone next to their names; some share tabs with the events."""
     rows: list[Row] = []
     details = []
     for title in dict.fromkeys(kind.title for kind in PLOTS):
@@ -320,8 +331,30 @@ def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
         view = plot_view(first, list(shown), live=True)
         if first[0].kind in _DETAILS:
             details.append(view)
-        else:
-            rows.append((first[0].kind.height, view))
-    if details:
-        rows.append((_DETAILS_HEIGHT, tabs(details)))
+            continue
+        names = [_name_entity(first[0], row) for row in range(max(map(_row_count, first)))]
+        height, columns = first[0].kind.height, _LEVEL_COLUMNS
+        texts: rrb.View | rrb.Container = text_view(names[0])
+        if first[0].kind is SHARES:
+            height, columns = _ROW_HEIGHT * len(names) + _AXIS_HEIGHT, _ROW_COLUMNS
+            texts = names_view(names, len(names))
+        rows.append((height, rrb.Horizontal(texts, view, column_shares=columns)))
+    rows.append((_DETAILS_HEIGHT, tabs([lines_view(), *details])))
     return stack(rows, microphone)
+
+
+def _write_names(plot: Plot, canvas: Canvas) -> None:
+    """Write what is next to a plot: the names of its rows, or its title."""
+    canvas.write(NOTHING, "")
+    names = [*map(in_words, ordered(plot.names))] if plot.kind is SHARES else [plot.title]
+    for row, name in enumerate(names):
+        canvas.write(_name_entity(plot, row), name)
+
+
+def _row_count(plot: Plot) -> int:
+    return len(plot.names) if plot.kind is SHARES else 1
+
+
+def _name_entity(plot: Plot, row: int) -> str:
+    kind = "level" if plot.kind is FLOOR else plot.kind.name
+    return f"{WORDS}/{plot.microphone}/{kind}/{row:02}"

@@ -36,7 +36,6 @@ from hearthlog.analyzer.review.viewer.drawing import (
     BELOW,
     COLUMNS,
     HOUR_COLUMNS,
-    REQUESTED_COLUMNS,
     SHARED_AXIS,
     DrawnLane,
     RequestedSpan,
@@ -53,6 +52,7 @@ _PANEL, _AXIS, _CONTAINER = "/time_panel", "ScalarAxis", "ContainerBlueprint"
 _WAIT_SECONDS = 60
 _FLUSH_SECONDS = 30.0
 _SIZE_SECONDS = 3.0
+_ROUNDING = 1_000_000  # nanoseconds
 
 Blueprint = dict[str, Any]
 
@@ -75,7 +75,7 @@ class ViewerSize(NamedTuple):
 
 # Points of the viewer's own parts.
 _RULER_LEFT, _RULER_RIGHT = 200.0, 30.0  # from the edges of the viewer to the ends of its ruler
-_SCALE_WIDTH, _DIGIT_WIDTH, _AXIS_HEIGHT = 28.0, 17.0, 17.0  # between a view and its plot
+_SCALE_WIDTH, _AXIS_HEIGHT = 17.0, 17.0  # between a view and its plot
 TOP_BAR, _TAB_BAR = 36.0, 30.0
 _PANEL_HEIGHTS = 150.0, 250.0  # a quarter of the viewer, within these
 
@@ -97,6 +97,7 @@ class Viewer(ABC):
         self._aligned: ViewerSize | None = None
         self._size_due = 0.0  # of the next look at the size, by CLOCK_MONOTONIC
         self._opening: Any = None  # range of the time axes
+        self._latest: Any = None  # that of the last span that was shown
         self._axes: dict[str, list[float]] = {}  # vertical ranges, by component of the blueprint
         self._selected: tuple[int, int] | None = None  # as drawn
         self._requested = RequestedSpan()
@@ -233,13 +234,24 @@ class Viewer(ABC):
         moved = [path for path, span in self._axes.items() if ranges[path] != span]
         for path in moved:
             blueprint.setdefault(path, {}).setdefault(_AXIS, {})["range"] = self._axes[path]
-        is_changed = bool(moved)
+        is_changed = bool(moved) or self._undo_reset(blueprint)
         if time.monotonic() >= self._size_due:
             self._size_due = time.monotonic() + _SIZE_SECONDS
             is_changed |= self._align(blueprint)
         if is_changed:
             self._set_blueprint(blueprint)
         self._draw_selection(self._selection_in(blueprint))
+
+    def _undo_reset(self, blueprint: Blueprint) -> bool:
+        """Show the last span again after a double click, which shows all data; return whether."""
+        grid = self._grid
+        if grid is None or self._latest is None:
+            return False
+        data = self._clock.shown(grid.start), self._clock.shown(grid.end)
+        if not _is_near(_view(blueprint), data) or _is_near(self._latest, data):
+            return False
+        _set_view(blueprint, self._latest)
+        return True
 
     def _draw_selection(self, selection: tuple[int, int] | None) -> None:
         if selection == self._selected:
@@ -301,11 +313,10 @@ class Viewer(ABC):
             blueprint = self._blueprint()
             found = {path: _component(blueprint, path, _AXIS).get("range") for path in blueprint}
             self._axes = {path: span for path, span in found.items() if span is not None}
-            self._opening = _view(blueprint)
+            self._opening = self._latest = _view(blueprint)
             shares = {path: _component(blueprint, path, _CONTAINER) for path in blueprint}
             for columns, left in (
                 (COLUMNS, _RULER_LEFT - _SCALE_WIDTH),
-                (REQUESTED_COLUMNS, _RULER_LEFT - _DIGIT_WIDTH),
                 (HOUR_COLUMNS, _RULER_LEFT),
             ):
                 own = [*map(float, columns)]
@@ -336,8 +347,10 @@ class Viewer(ABC):
         if _view(blueprint) == self._opening:  # else the user looks at another span
             start, end = self._clock.shown(grid.start), self._clock.shown(grid.end)
             beyond = _RULER_RIGHT / max(size.width - _RULER_RIGHT - _RULER_LEFT, 1.0)
-            _set_view(blueprint, start, end + round((end - start) * beyond))
-            self._opening = _view(blueprint)
+            # A tick at the very start would be labelled with half of its date.
+            first, last = start + (end - start) // 5000, end + round((end - start) * beyond)
+            self._opening = self._latest = _range(first, last)
+            _set_view(blueprint, self._opening)
         return True
 
     def _set_shares(self, blueprint: Blueprint, size: ViewerSize) -> None:
@@ -366,7 +379,8 @@ class Viewer(ABC):
             panel.pop("time_selection", None)
             panel["loop_mode"] = "Off"  # else the viewer selects something itself
         panel["play_state"] = "Paused"
-        _set_view(blueprint, start - margin, end + margin)
+        self._latest = _range(start - margin, end + margin)
+        _set_view(blueprint, self._latest)
         self._set_blueprint(blueprint)
         self._set_time(start, play=False)
 
@@ -395,8 +409,20 @@ def check_version(version: str) -> None:
         )
 
 
-def _set_view(blueprint: Blueprint, start: int, end: int) -> None:
-    bounds = {"start": {"Absolute": start}, "end": {"Absolute": end}}
+def _range(start: int, end: int) -> Any:
+    return {"start": {"Absolute": start}, "end": {"Absolute": end}}
+
+
+def _is_near(bounds: Any, span: tuple[int, int]) -> bool:
+    """Return whether a range of the axes is a span; the viewer rounds some nanoseconds."""
+    edges = [bounds[edge].get("Absolute") for edge in ("start", "end")] if bounds else []
+    pairs = zip(edges, span, strict=False)
+    return bool(edges) and all(
+        isinstance(edge, int) and abs(edge - time) < _ROUNDING for edge, time in pairs
+    )
+
+
+def _set_view(blueprint: Blueprint, bounds: Any) -> None:
     blueprint[f"/{SHARED_AXIS}"] = {"TimeAxis": {"view_range": bounds}}
 
 

@@ -14,7 +14,7 @@ from itertools import count
 from typing import Any, cast
 
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, free_port
-from hearthlog.analyzer.review.timeline import Key
+from hearthlog.analyzer.review.timeline import Key, Question
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.viewer import (
     TOP_BAR,
@@ -121,7 +121,7 @@ class Relay:
     keys: Sequence[Key] = ()
     press: Callable[[str], None] = lambda _: None
     sound: Callable[[], bytes] | None = None
-    texts: queue.SimpleQueue[str] = field(default_factory=queue.SimpleQueue)
+    texts: queue.SimpleQueue[str | Question] = field(default_factory=queue.SimpleQueue)
     requests: queue.SimpleQueue[tuple[int, bytes]] = field(default_factory=queue.SimpleQueue)
     answers: dict[int, "Future[bytes]"] = field(default_factory=dict)
     size: ViewerSize | None = None  # of the viewer in the page
@@ -266,10 +266,15 @@ class _Handler(HttpHandler):
             self.send_text(HTTPStatus.SERVICE_UNAVAILABLE, "the viewer did not answer")
 
     def _send_text(self) -> None:
-        text = ""
+        """Send the next line, or the next question and the keys that answer it."""
+        text: str | Question = ""
         with suppress(queue.Empty):
             text = self._page.relay.texts.get(timeout=_POLL_SECONDS)
-        self.send(HTTPStatus.OK, text.encode(), "text/plain; charset=utf-8")
+        if isinstance(text, Question):
+            question = {"text": text.text, "keys": [one.key for one in text.keys]}
+            self.send(HTTPStatus.OK, json.dumps(question).encode(), "application/json")
+        else:
+            self.send(HTTPStatus.OK, text.encode(), "text/plain; charset=utf-8")
 
 
 class _PageViewer(Viewer):
@@ -297,6 +302,10 @@ class _PageViewer(Viewer):
         sound: Callable[[], bytes] | None = None,
     ) -> None:
         self._relay.keys, self._relay.press, self._relay.sound = keys, press, sound
+
+    def ask(self, start: int, end: int, question: Question) -> None:
+        super().ask(start, end, question)
+        self._relay.texts.put(question)
 
     def announce(self, text: str) -> None:
         self._relay.texts.put(text)

@@ -79,7 +79,7 @@ def queue_of(logs: Path, microphone: str, audible: Spans) -> Sequence[ReviewItem
     sources, limits = find_labellings(logs), (None, None)
     labelled = microphone, LIVE
     spans = queue_spans(USEFUL, sources, labelled, limits, None, DEFAULT_FOLDER, audible=audible)
-    return review_items(spans)
+    return review_items(spans, audible)
 
 
 def _still_picture(viewer: WindowViewer) -> bytes:
