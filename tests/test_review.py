@@ -269,6 +269,9 @@ class Screen:
     def refresh(self):
         self.refreshed += 1
 
+    def clear_question(self):
+        self.requested.append(None)
+
     def ask(self, start, end, question):
         self.requested.append((start, end, question))
 

@@ -59,6 +59,9 @@ class Screen(Protocol):
     def refresh(self) -> None:
         """Draw the selected span, and put the lanes beside their names again."""
 
+    def clear_question(self) -> None:
+        """Remove the question of the previous span."""
+
     def ask(self, start: int, end: int, question: Question) -> None:
         """Draw the requested span and its question, in place of the previous ones.
 
@@ -377,14 +380,16 @@ class ReviewSession:
         place = f"{self._at + 1} of {len(self.items)}"
         silent = "" if item.is_audible else f"; {_SILENT}"
         span = self._text(item.start, item.end)
-        self.announce(f"{place}: {_question(item)} {span}; {item.text}{silent}")
         margin = _margin(item.start, item.end)
         with self._unless_silent():
+            self.screen.clear_question()
             self.look_closely(item.start - margin, item.end + margin)
-            text = f"{place}, {span}{silent}"
-            self.screen.ask(item.start, item.end, Question(_question(item), text, self._answers()))
             # A minute has several sounds: what is named in it is selected by hand.
             self.screen.show(item.start, item.end, margin, select=item.chosen != RANDOM)
+            text = f"{place}, {span}{silent}"
+            self.screen.ask(item.start, item.end, Question(_question(item), text, self._answers()))
+        # Not before: nobody is to answer from the picture of the item before.
+        self.announce(f"{place}: {_question(item)} {span}; {item.text}{silent}")
 
     def _text(self, start: int, end: int) -> str:
         return f"{local_time(start, self.zone):%a %d %b %H:%M:%S}, {length_text(end - start)}"

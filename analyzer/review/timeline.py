@@ -191,10 +191,10 @@ class Plot(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Text next to the plot: its title, or the names of rows."""
+        """Text next to the plot: its title, or the names of rows from above."""
         if self.kind.style is not Style.BANDS:
             return self.title
-        return f"From above: {', '.join(map(in_words, ordered(self.names)))}"
+        return ", ".join(map(in_words, ordered(self.names)))
 
     def between(self, start: int | None, end: int | None) -> "Plot":
         """Return the frames that begin in a span (ns of UTC; None for no limit)."""

@@ -215,6 +215,12 @@ class RequestedSpan(DrawnLane):
         canvas.write(ANSWERS, f"{_plain(question.place)}\\\n{where}{keys}", rr.MediaType.MARKDOWN)
         canvas.write(REQUESTED_NAME, "Asked about")
 
+    @staticmethod
+    def clear(canvas: Canvas) -> None:
+        """Remove the question, so that nobody answers it while the next span is drawn."""
+        canvas.write(QUESTION, "# …", rr.MediaType.MARKDOWN)
+        canvas.write(ANSWERS, " ")
+
     def show(self, lane: Lane, canvas: Canvas) -> None:
         """Draw a selected span, unless it is the requested one."""
         starts, ends, _ = spans = lane.spans
@@ -319,15 +325,15 @@ APPLICATION = "hearthlog"
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
 _LANE, _CLOSE_LANE, _AROUND_LANES = 29, 27, 50
-_LEVEL_HEIGHT, _PLOT_HEIGHT, _CLOSE_PLOT, _REQUESTED_HEIGHT = 90, 140, 122, 27
+_LEVEL_HEIGHT, _PLOT_HEIGHT, _CLOSE_PLOT, _REQUESTED_HEIGHT = 90, 140, 108, 27
 _QUESTION_HEIGHT = 62  # of a heading, with the space that the viewer leaves above it
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
 # Of all lanes. Rerun 0.41 cannot hide the numbers of an axis, and writes one every 20 points or
 # more: so these are few, 0 to 3, and as wide as the 0 of the other plots, which begin at one place.
 LANES_HEIGHT = 3.9
-_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 90
-_SPECTRUM_SHAPE = (64, 2240)  # flatter than any view of it
+_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 78
+_SPECTRUM_SHAPE = (96, 1920)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 # Widths of a text and a plot, until that of the window is known; the hours have no axis.
 COLUMNS, HOUR_COLUMNS, _QUESTION_COLUMNS = (2, 10), (2, 11), (3, 7)
@@ -421,9 +427,9 @@ def _axis() -> rrb.TimeAxis:
 
 
 def review_layout(
-    timeline: Timeline, *, marking: bool = False, close_up: bool = False
+    timeline: Timeline, *, marking: bool = False, close_up: bool = False, asks: bool = False
 ) -> TimelineBlueprint:
-    """Lay out the views of a review.
+    """Lay out the views of a review; with `asks`, the question of a span is above all.
 
     Raise `DataError` if the timeline's time zone is unknown.
     """
@@ -459,7 +465,8 @@ def review_layout(
     )
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
     words = rrb.Horizontal(text_view(QUESTION), text_view(ANSWERS), column_shares=_QUESTION_COLUMNS)
-    question: list[Row] = [(_QUESTION_HEIGHT, words), (_REQUESTED_HEIGHT, _requested_view())]
+    question: list[Row] = [(_QUESTION_HEIGHT, words)] if asks else []
+    question.append((_REQUESTED_HEIGHT, _requested_view()))
     homes = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []
     everything = [*(question if close_up else hours), homes]

@@ -167,7 +167,8 @@ class Viewer(ABC):
         self._process.wait_until_it_listens()
         rr.set_strict_mode(True)
         self._sent = True
-        layout = review_layout(timeline, marking=True, close_up=close_up)
+        asks = close_up and not self.address  # a page has the question next to its buttons
+        layout = review_layout(timeline, marking=True, close_up=close_up, asks=asks)
         self._lanes_share = layout.lanes_share
         self._recording.connect_grpc(self._process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
@@ -207,6 +208,11 @@ class Viewer(ABC):
         if not self.address:
             question = question._replace(keys_in="Press in the terminal")
         self._requested.ask(start, end, question, self._canvas)
+        self._flush()
+
+    def clear_question(self) -> None:
+        """Remove the question of the previous span."""
+        self._requested.clear(self._canvas)
         self._flush()
 
     def redraw_marks(
