@@ -119,6 +119,22 @@ def test_the_queue_of_a_window_begins_with_what_can_be_heard(captured, display):
     assert min(shares[:5]) > 0.5
 
 
+def test_what_is_partly_heard_goes_before_what_is_not_and_is_cut_to_its_sound(recorded):
+    spans = queue_spans("useful", find_labellings(recorded), LIVE, EVER, 8)
+    loud = max((one for one in spans if one.reason != RANDOM), key=lambda one: one.end - one.start)
+    middle = (loud.start + loud.end) // 2
+    kept = joined(
+        np.array([middle, middle + 3 * MINUTE]),
+        np.array([middle + NANOSECONDS, middle + 3 * MINUTE + FRAME_NANOSECONDS]),
+    )
+    found = queue_spans("useful", find_labellings(recorded), LIVE, EVER, 8, audible=kept)
+    first = found[0]
+    assert first.start <= middle
+    assert first.end >= middle + NANOSECONDS
+    assert first.end - first.start == 3 * NANOSECONDS // 2
+    assert [item.is_audible for item in review_items(found, kept)] == [True] + [False] * 7
+
+
 # Minutes
 
 

@@ -34,7 +34,7 @@ from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.review_list import write_list
 from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
-from hearthlog.analyzer.review.session import ReviewSession, sound_file
+from hearthlog.analyzer.review.session import ReviewSession, length_text, sound_file
 from hearthlog.analyzer.review.timeline import SoundClip, sound_of
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.classes import colour
@@ -395,6 +395,52 @@ def test_a_key_that_does_not_fit_is_explained_and_changes_nothing(home, key, out
     sitting.session.press(key)
     assert output in sitting.output[-1]
     assert layers(home) == []
+
+
+def test_a_long_span_is_marked_by_a_second_press_of_the_same_key(home):
+    sitting = Sitting(home)
+    sitting.screen.marked = span = (START + 10 * SECOND, START + 110 * SECOND)
+    for key, wanted in (("2", "talking"), ("3", "coughing")):
+        sitting.session.press(key)
+        line = f"1 min 40 s is long: press the key again to mark it as {wanted}"
+        assert sitting.output[-1] == line
+        assert layers(home) == []
+    sitting.session.press("3")
+    assert {mark.label for mark in layers(home)} == {"coughing"}
+    assert sitting.output[-1].endswith(", 1 min 40 s")
+    sitting.screen.marked = (span[0], span[0] + 59 * SECOND)
+    sitting.session.press("2")
+    assert sitting.output[-1].endswith(", 59.0 s")
+
+
+def test_lengths_are_in_words():
+    lengths = {3.25: "3.2 s", 60: "60.0 s", 3200: "53 min 20 s", 7320: "2 h 2 min", 86400: "24 h"}
+    assert {each: length_text(round(each * SECOND)) for each in lengths} == lengths
+
+
+def test_what_cannot_be_heard_is_said_and_not_offered_to_play(home):
+    kept, lost = items_of(2)
+    sitting = Sitting(home, [kept, lost._replace(is_audible=False)])
+    sitting.run("n")
+    (*_, first), (*_, second) = (one for one in sitting.screen.requested if one is not None)
+    assert "p" in [key.key for key in first.keys]
+    assert "p" not in [key.key for key in second.keys]
+    assert second.place.endswith("; nothing to hear: its sound was not kept")
+    assert "hear" not in first.place
+
+
+def test_the_question_before_is_gone_until_the_next_span_is_drawn(home):
+    sitting = Sitting(home, items_of(2))
+    shown = []
+    draw, show = sitting.session.look_closely, sitting.screen.show
+    sitting.session.look_closely = lambda *span: (shown.append("draw"), draw(*span))
+    sitting.screen.show = lambda *span, **more: (shown.append("show"), show(*span, **more))
+    sitting.screen.clear_question = lambda: shown.append("clear")
+    sitting.screen.ask = lambda *_: shown.append("ask")
+    sitting.session.announce = shown.append
+    sitting.run("n")
+    assert shown[1:5] == ["clear", "draw", "show", "ask"]
+    assert shown[5].startswith("1 of 2: ")
 
 
 def test_the_keys_are_three_lines_by_what_they_are_for(home):
@@ -1058,6 +1104,35 @@ def test_the_page_shows_the_line_before_and_the_last_one_whole_above_the_buttons
             assert done.startswith("marked as not sure: ")
             assert (last, is_complete, also) == (requested, True, True)
             assert min(page.evaluate(tops)) >= 0
+
+
+def test_on_a_phone_the_page_has_the_question_and_large_buttons_of_its_answers(home, tmp_path):
+    buttons = """[...document.querySelectorAll("button")].filter((b) => b.offsetHeight)
+        .map((b) => [b.dataset.key, b.offsetHeight, b.getBoundingClientRect().right])"""
+    options = ("--web", "--port", free_port(), "--queue", "uncertain")
+    with reviewing(home, *options, BROWSER="true") as review:
+        line = review.wait_for("http://127.0.0.1:")
+        address = line[line.index("http:") :].split()[0]
+        with browsing(address, tmp_path / "browser", "1366,768") as page:
+            review.wait_for("1 of ")
+            patiently(page.text, lambda text: text.startswith("1 of "))
+            every = page.evaluate(buttons)
+            assert min(height for _, height, _ in every) >= 44
+            page.call(
+                "Emulation.setDeviceMetricsOverride",
+                width=390, height=844, deviceScaleFactor=1, mobile=False,
+            )  # fmt: skip
+            found = patiently(
+                lambda: page.evaluate(buttons), lambda each: max(right for *_, right in each) <= 390
+            )
+            keys = {key for key, *_ in found}
+            assert {"a", "n", "z", "u"} <= keys
+            assert not keys & set("md[]bq")
+            assert min(height for _, height, _ in found) >= 56
+            question = page.evaluate("document.getElementById('question').textContent")
+            assert question == page.text().split(": ", 1)[1].split("?")[0] + "?"
+            play = "document.querySelector('button[data-key=p]').disabled"
+            assert page.evaluate(play) is True  # no sound of this home was kept
 
 
 def request(port, path, **headers):
