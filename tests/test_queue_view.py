@@ -199,7 +199,7 @@ def test_the_question_is_large_and_all_is_shown_on_a_small_screen(timeline):
                 and len(small) == 3
                 and heights[0] > 1.4 * max(last - first for first, last in small)
                 and max(large[-1][1], small[-1][1]) < top - 2
-                and [*map(ge, views, (8 * 27, 90))] == [True, True]
+                and [*map(ge, views, (8 * 27, 70))] == [True, True]
             )
 
         patiently(viewer.picture, is_right)

@@ -386,6 +386,7 @@ class ReviewSession:
             self.look_closely(item.start - margin, item.end + margin)
             # A minute has several sounds: what is named in it is selected by hand.
             self.screen.show(item.start, item.end, margin, select=item.chosen != RANDOM)
+        with self._unless_silent():
             text = f"{place}, {span}{silent}"
             self.screen.ask(item.start, item.end, Question(_question(item), text, self._answers()))
         # Not before: nobody is to answer from the picture of the item before.

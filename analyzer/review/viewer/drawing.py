@@ -138,7 +138,6 @@ def draw(
             draw_plot(plot, plot_entity(plot), canvas)
         canvas.write(text_entity(plot), plot.text)
     for microphone in timeline.microphones.values():
-        _clear_sound(microphone.name, timeline.grid.start, " ", canvas)  # until a span is requested
         if microphone.clips:
             canvas.show_clips(f"{microphone.name}/{CLIP}", microphone.clips, timeline.grid.start)
     canvas.write_lines(LINES, timeline.lines)
@@ -183,13 +182,14 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
     for microphone in timeline.microphones.values():
         shade = spectrogram(microphone.clips, grid.start, grid.end, _SPECTRUM_SHAPE)
         if shade is None:
-            _clear_sound(microphone.name, grid.start, "No sound was kept here", canvas)
+            clear_sound(microphone.name, grid.start, "No sound was kept here", canvas)
         else:
             entity = f"{microphone.name}/{SPECTRUM}"
             canvas.show_image(entity, grid.start, shade, "Kept sound, 0 to 8 kHz")
 
 
-def _clear_sound(microphone: str, time: int, text: str, canvas: Canvas) -> None:
+def clear_sound(microphone: str, time: int, text: str, canvas: Canvas) -> None:
+    """Show no spectrogram from a time (ns of UTC) on, next to a text."""
     canvas.show_image(f"{microphone}/{SPECTRUM}", time, np.zeros((2, 2)), text)
 
 
@@ -325,14 +325,14 @@ APPLICATION = "hearthlog"
 SHARED_AXIS = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"
 # In points of a screen of 1366 x 768; on other screens they are relative heights.
 _LANE, _CLOSE_LANE, _AROUND_LANES = 29, 27, 50
-_LEVEL_HEIGHT, _PLOT_HEIGHT, _CLOSE_PLOT, _REQUESTED_HEIGHT = 90, 140, 108, 27
+_LEVEL_HEIGHT, _PLOT_HEIGHT, _CLOSE_PLOT, _REQUESTED_HEIGHT = 90, 140, 117, 27
 _QUESTION_HEIGHT = 62  # of a heading, with the space that the viewer leaves above it
 _NEAR = -60.0, 300.0  # seconds from the cursor, which is at the start of the requested span
 BELOW = 0.5  # height of the time axis, in lanes, until the height of the window is known
 # Of all lanes. Rerun 0.41 cannot hide the numbers of an axis, and writes one every 20 points or
 # more: so these are few, 0 to 3, and as wide as the 0 of the other plots, which begin at one place.
 LANES_HEIGHT = 3.9
-_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 78
+_HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 66
 _SPECTRUM_SHAPE = (96, 1920)  # flatter than any view of it
 _BLACK: Colour = (0, 0, 4)
 # Widths of a text and a plot, until that of the window is known; the hours have no axis.

@@ -39,6 +39,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
     SHARED_AXIS,
     DrawnLane,
     RequestedSpan,
+    clear_sound,
     draw,
     draw_close_up,
     draw_frames,
@@ -177,6 +178,8 @@ class Viewer(ABC):
         self._lanes = draw(timeline, self._canvas, marking=not close_up)
         if close_up:
             self._lanes["", SELECTED] = self._requested
+            for name in timeline.microphones:  # until a span is requested
+                clear_sound(name, timeline.grid.start, " ", self._canvas)
         self._flush()
 
     def write_checked(self, timeline: Timeline, checked: Checked) -> None:
@@ -353,9 +356,7 @@ class Viewer(ABC):
         if _view(blueprint) == self._opening:  # else the user looks at another span
             start, end = self._clock.shown(grid.start), self._clock.shown(grid.end)
             beyond = _RULER_RIGHT / max(size.width - _RULER_RIGHT - _RULER_LEFT, 1.0)
-            # A tick at the very start would be labelled with half of its date.
-            first, last = start + (end - start) // 5000, end + round((end - start) * beyond)
-            self._opening = self._latest = _range(first, last)
+            self._opening = self._latest = _range(start, end + round((end - start) * beyond))
             _set_view(blueprint, self._opening)
         return True
 
