@@ -382,7 +382,9 @@ def test_the_page_says_of_a_night_what_its_table_counts(tmp_path):
     make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), tmp_path / "day.html")
     text = (tmp_path / "day.html").read_text()
     assert "Coughing in the night, as labelled, at 02:05, 05:00." in text
-    assert "sounded: coughing 1, as labelled. How long leaves out the same, and has it apart." in text
+    assert (
+        "sounded: coughing 1, as labelled. How long leaves out the same, and has it apart." in text
+    )
     assert (
         "Coughing, crying, shouting, telephone ringing, laughing and household sounds are left "
         "out of 5 of these minutes"

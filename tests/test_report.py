@@ -575,8 +575,8 @@ def test_a_week_has_a_headline_of_its_days(tmp_path):
         write_day(tmp_path / "logs", DAY - timedelta(days=ago), coughs, hours=hours)
     first = DAY - timedelta(days=6)
     assert headline(tmp_path / "logs", tmp_path, first=first, days=7) == (
-        "All of the five recorded days were quiet; too little was recorded of the other two. By the "
-        "sound of it, 18 bouts of coughing on four days, most on Mon 23 Feb (6)."
+        "All of the five recorded days were quiet; too little was recorded of the other two. By "
+        "the sound of it, 18 bouts of coughing on four days, most on Mon 23 Feb (6)."
     )
 
 

@@ -85,16 +85,12 @@ def clock_with_day(nanoseconds: int, zone: tzinfo, first: date | None) -> str:
     return f"{weekday(moment.date())} {moment:%H:%M}" if is_before else f"{moment:%H:%M}"
 
 
-def times_in_words(
-    starts: Int64, zone: tzinfo, most: int = 16, first: date | None = None
-) -> str:
+def times_in_words(starts: Int64, zone: tzinfo, most: int = 16, first: date | None = None) -> str:
     """List times of day (nanoseconds of UTC, any order), `most` of them, and how many more.
 
     Those of days before the `first` have their weekday: `Sunday 23:28`.
     """
-    shown = Counter(
-        clock_with_day(start, zone, first) for start in np.sort(starts)[:most].tolist()
-    )
+    shown = Counter(clock_with_day(start, zone, first) for start in np.sort(starts)[:most].tolist())
     more = len(starts) - shown.total()
     texts = [text if n == 1 else f"{text} ({_often(n)})" for text, n in shown.items()]
     return ", ".join(texts) + (f" and {more} more" if more else "")

@@ -514,9 +514,7 @@ def _home_rows(
         yield _home_row(number(len(homes), "home"), homes, zone, form)
 
 
-def _home_row(
-    name: str, homes: Sequence["HomeTotals"], zone: tzinfo, form: str
-) -> Sequence[str]:
+def _home_row(name: str, homes: Sequence["HomeTotals"], zone: tzinfo, form: str) -> Sequence[str]:
     from hearthlog.analyzer.logs.local_time import local_time
 
     starts = [home.start for home in homes if home.start is not None]

@@ -167,9 +167,7 @@ def _missing_classes(home: HomeDay) -> str:
     if not home.microphones or not all(each.names for each in home.microphones):
         return ""
     words = home.words
-    known = {
-        each.common_names.get(name, name) for each in home.microphones for name in each.names
-    }
+    known = {each.common_names.get(name, name) for each in home.microphones for name in each.names}
     hidden = frozenset[str]().union(*(each.never_tell for each in home.microphones))
     missing = _EXPECTED - known - hidden
     notes = []
