@@ -36,6 +36,7 @@ class Frames:
     # for a single microphone
     channels: Float32 | None = None
     reports: tuple[SourceHealth, ...] = ()
+    filtered: Float32 | None = None  # `samples` after the infrasound filter, if the source has one
 
     def part(self, start: int, stop: int) -> "Frames":
         """Return the frames in a range of at least one row, with their reports."""
@@ -43,7 +44,8 @@ class Frames:
         stamps = self.stamps[rows]
         channels = None if self.channels is None else self.channels[rows]
         reports = tuple(each for each in self.reports if stamps[0] <= each.stamp <= stamps[-1])
-        return Frames(self.first + start, self.samples[rows], stamps, channels, reports)
+        filtered = None if self.filtered is None else self.filtered[rows]
+        return Frames(self.first + start, self.samples[rows], stamps, channels, reports, filtered)
 
 
 @dataclass(frozen=True)

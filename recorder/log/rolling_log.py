@@ -74,19 +74,17 @@ class HeldMessages:
     def size(self) -> int:  # noqa: D102
         return self._end - self._begin
 
-    @property
-    def begins_log(self) -> bool:
-        """Whether the first item is a description."""
-        return not _ENTRY.unpack_from(self._memory, self._begin)[1]
-
     def extend(self, items: Iterable[Held]) -> None:
         """Append messages and descriptions."""
+        parts = []
         for item in items:
             if isinstance(item, LogDescription):
                 self._descriptions.append(item)
-                self._append(0, b"", b"")
+                parts.append(_ENTRY.pack(0, 0, 0))
             else:
-                self._append(item.log_time, item.topic.encode(), item.data)
+                topic = item.topic.encode()
+                parts += [_ENTRY.pack(item.log_time, len(topic), len(item.data)), topic, item.data]
+        self._append(b"".join(parts))
 
     def batches(self) -> Iterator[list[Held]]:
         """Split the items at a change of the log time: files may begin there."""
@@ -101,27 +99,31 @@ class HeldMessages:
             last = now
         yield batch
 
-    def drop_first(self) -> None:
-        """Drop the first item."""
-        _, topic_size, size = _ENTRY.unpack_from(self._memory, self._begin)
-        if not topic_size:
-            self._descriptions.popleft()
-        self._begin += _ENTRY.size + topic_size + size
-        if self._begin == self._end:
+    def drop(self, messages: int, *, trailing: bool) -> None:
+        """Drop so many messages, the descriptions before them, and with `trailing` those behind."""
+        while self._begin < self._end:
+            _, topic_size, size = _ENTRY.unpack_from(self._memory, self._begin)
+            if not (messages or (trailing and not topic_size)):
+                return
+            if topic_size:
+                messages -= 1
+            else:
+                self._descriptions.popleft()
+            self._begin += _ENTRY.size + topic_size + size
+        if self._end:
             self._begin = self._end = 0
             if len(self._memory) > _FIRST_BYTES:
                 self._memory.close()
                 self._memory = mmap.mmap(-1, _FIRST_BYTES)
 
-    def _append(self, log_time: int, topic: bytes, data: bytes) -> None:
-        entry = _ENTRY.pack(log_time, len(topic), len(data)) + topic + data
-        if self._end + len(entry) > len(self._memory):
-            wider = mmap.mmap(-1, 2 * len(self._memory) + len(entry))
+    def _append(self, entries: bytes) -> None:
+        if self._end + len(entries) > len(self._memory):
+            wider = mmap.mmap(-1, 2 * len(self._memory) + len(entries))
             wider[: self._end] = self._memory[: self._end]
             self._memory.close()
             self._memory = wider
-        self._memory[self._end : self._end + len(entry)] = entry
-        self._end += len(entry)
+        self._memory[self._end : self._end + len(entries)] = entries
+        self._end += len(entries)
 
 
 class RollingLog:
@@ -306,7 +308,8 @@ class RollingLog:
                     self.sync()
         except (LogError, OSError) as error:
             self._fail(error)
-        self._drop_synced()
+        self._held.drop(self._safe - self._dropped, trailing=not self._failing)
+        self._dropped = self._safe
         if was_failing and not self._failing:
             give_back()
 
@@ -359,14 +362,6 @@ class RollingLog:
             self._notices.append(
                 Notice(WARNING, f"{what}: messages are held in memory until it can")
             )
-
-    def _drop_synced(self) -> None:
-        while self._held:
-            begins_log = self._held.begins_log
-            if self._dropped == self._safe and (self._failing or not begins_log):
-                return
-            self._held.drop_first()
-            self._dropped += not begins_log
 
     @contextmanager
     def _preserving_written(self) -> Iterator[None]:

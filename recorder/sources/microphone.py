@@ -222,8 +222,7 @@ class MicrophoneSource:
         first = block.samples if block.samples.ndim == 1 else block.samples[:, 0]
         is_flat = int(first.max()) - int(first.min()) <= DEAD_STEPS
         for event in self._framer.add(block):
-            self._watch(event, is_flat=is_flat)
-            yield event
+            yield self._watched(event, is_flat=is_flat)
 
     def _report_channel(self) -> None:
         """Report a change of the selected channels once; the sound itself is fine."""
@@ -311,11 +310,12 @@ class MicrophoneSource:
         self._return = ReturnWatch(lambda stop: self._open(self._own, stop))
         return True
 
-    def _watch(self, event: Frames | Gap, *, is_flat: bool) -> None:
+    def _watched(self, event: Frames | Gap, *, is_flat: bool) -> Frames | Gap:
+        """Update the health; return the event, filtered."""
         if isinstance(event, Gap):
             self._frames_lost += event.frames_lost
             self._infrasound.restart()
-            return
+            return event
         filtered = self._infrasound(event.samples)
         self._level.add(filtered)
         is_dead = ~event.samples.any(axis=1)
@@ -334,6 +334,7 @@ class MicrophoneSource:
             self._health = (WARNING, f"{lost}; {self.device} is heard in its place")
         else:
             self._health = (OK, LISTENING)
+        return replace(event, filtered=filtered)
 
     def _steps_clock(self) -> bool:
         """Check the time of day; return whether it was set."""

@@ -133,7 +133,9 @@ class Pipeline:
     def push(self, event: Event) -> list[EncodedMessage]:
         """Convert an event of a source to messages."""
         if isinstance(event, Frames):
-            samples = self._infrasound(event.samples)
+            samples = event.filtered
+            if samples is None:
+                samples = self._infrasound(event.samples)
             self.last_frames = replace(event, samples=samples)
             features = self._features(samples)
             floors = self._track_floor(features, event.first)
