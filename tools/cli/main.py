@@ -18,6 +18,8 @@ from hearthlog.schemas.blas import kernel_environment
 # Before the import of numpy: products here are small, and idle BLAS threads burn a core.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.update(kernel_environment())
+# A search through all installed distributions, whose plugins no recorder should load.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
 @contextmanager
