@@ -180,8 +180,10 @@ class _Choice:
         powers = finite.var(axis=-1)
         self._piece += 1
         self._powers = np.concatenate([self._powers[-_PIECES + 1 :], powers[np.newaxis]])
+        is_sound = powers > _AUDIBLE
         rises = powers > _STANDS_OUT * _low_powers(self._powers)
-        is_sound = (powers > _AUDIBLE) & (rises | (_level_spread(finite) > _MODULATED_DB))
+        if (is_sound & ~rises).any():
+            is_sound &= rises | (_level_spread(finite) > _MODULATED_DB)
         self._sounded[is_sound & (powers * _FAINTER > powers.max())] = self._piece
         candidates = is_sound & self._usable & ~is_lost
         best = int(np.where(candidates, powers, -1.0).argmax())

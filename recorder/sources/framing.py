@@ -125,16 +125,16 @@ class SampleClock:
 
     def _fit(self, nominal: float) -> tuple[float, float]:
         """Return the slope of the lateness, and the lateness at a nominal time."""
-        at, late = np.array(self._windows).T
+        at, late = rows = np.array([*zip(*self._windows, strict=True)])
         if not self._is_exact:
             return 0.0, float(late.min())
         weight = np.ones(len(at))
         for _ in range(_ROUNDS):
-            center, mean = np.average([at, late], axis=1, weights=weight)
-            spread = (weight * (at - center) ** 2).sum()
-            spread += (_PRIOR_NOISE / (_PRIOR_PPM * 1e-6)) ** 2
-            slope = float((weight * (at - center) * (late - mean)).sum() / spread)
-            above = late - mean - slope * (at - center)
+            center, mean = (weight * rows).sum(axis=1) / weight.sum()
+            apart, over = at - center, late - mean
+            spread = (weight * apart**2).sum() + (_PRIOR_NOISE / (_PRIOR_PPM * 1e-6)) ** 2
+            slope = float((weight * apart * over).sum() / spread)
+            above = over - slope * apart
             weight = _LATE / np.maximum(above, _LATE)
         return slope, float(mean + slope * (nominal - center))
 
