@@ -808,7 +808,8 @@ def test_a_telephone_that_may_be_something_else_is_counted_apart_and_needs_no_lo
     assert [needs_look(bout, 0, Sureness()) for bout in (sure, unsure)] == [True, False]
     both = Bout([*sure.events, *unsure.events])
     cough = Bout([sure.first._replace(label="coughing", confidence=0.4)])
-    assert needs_look(both, 0, Sureness()) and needs_look(cough, 0, Sureness())
+    assert needs_look(both, 0, Sureness())
+    assert needs_look(cough, 0, Sureness())
 
 
 SCREAM = 4.0, "music", 0.33, {"coughing": 0.05, "yelling": 0.12}, 48.0

@@ -242,9 +242,8 @@ class LiveMicrophone:
             if own is not None:
                 own.events.append(event)
                 own.counted.append(event)
-        for own in found.values():
-            own.events.sort(key=_START)
-            own.counted.sort(key=_START)
+        for events in (part for own in found.values() for part in (own.events, own.counted)):
+            events.sort(key=_START)
         return found
 
     def counts(
@@ -257,14 +256,13 @@ class LiveMicrophone:
         key = self._changes, corrections.number, today[1:], self.never_tell, *self.classes
         if key != self._counts[0]:
             found = self.sounds(min(today.midnight, today.night), corrections, {})
-            counts = {
+            self._counts = key, {
                 name: (
                     sum(event.start >= today.midnight for event in own.counted),
                     sum(today.night <= event.start < today.morning for event in own.counted),
                 )
                 for name, own in found.items()
             }
-            self._counts = key, counts
         enough = self.known_of(today)
         return {
             name: (day if day or enough.day else None, night if night or enough.night else None)
@@ -581,8 +579,8 @@ def _labelling_sources(log: Path) -> set[str] | None:
     """Return the labelling sources of a log; None if the log cannot be read at this moment."""
     with suppress(LogError), LogFile(log) as file:
         read_definitions(file)
-        names = {source_of_topic(channel.topic) for channel in file.channels.values()}
-        return {name for name in names if name is not None}
+        topics = [channel.topic for channel in file.channels.values()]
+        return {name for topic in topics if (name := source_of_topic(topic)) is not None}
     return None
 
 
