@@ -348,10 +348,6 @@ def _play(found: Sequence["HomeEvent"], logs: "HomeLogs", zone: tzinfo) -> None:
         )
 
 
-if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.home_logs import HomeLogs
-
-
 def report(
     logs: Logs,
     *,

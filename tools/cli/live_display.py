@@ -28,8 +28,11 @@ from hearthlog.schemas.frames import FRAME_SECONDS
 from hearthlog.tools.cli.terminal import long_bar
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from hearthlog.recorder.config import Settings
     from hearthlog.recorder.recording_session import RecorderState
+    from hearthlog.recorder.sources.capture import Device
 
 
 _SECONDS = 0.5  # between two updates
@@ -136,11 +139,6 @@ def _put(text: str) -> None:
     while data:
         data = data[os.write(sys.stderr.fileno(), data) :]
 
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from hearthlog.recorder.sources.capture import Device
 
 _CARDS = Path("/proc/asound")
 _LATENCY = 0.1  # seconds: the bar follows a clap at once

@@ -49,8 +49,12 @@ from hearthlog.tools.cli.terminal import (
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
+    from hearthlog.analyzer.logs.recorder_info import RecorderInfo
+    from hearthlog.analyzer.relabel.player import Replay, ReplayOptions
     from hearthlog.analyzer.relabel.relabel import Relabelled
+    from hearthlog.analyzer.relabel.replay import LogSet
     from hearthlog.analyzer.review.review_list import ReviewSpan
+    from hearthlog.models.classifiers.model import Model
 
 
 _TASKS = "hearthlog.analyzer.relabel.layer"
@@ -253,12 +257,6 @@ def _queue(
     spans = partial(queued, ranked, microphone, *names)
     return _Result(figures, spans, partial(print_queue, ranked))
 
-
-if TYPE_CHECKING:
-    from hearthlog.analyzer.logs.recorder_info import RecorderInfo
-    from hearthlog.analyzer.relabel.player import Replay, ReplayOptions
-    from hearthlog.analyzer.relabel.replay import LogSet
-    from hearthlog.models.classifiers.model import Model
 
 _MAX_RATE = "max"
 
