@@ -255,14 +255,12 @@ class LiveMicrophone:
         """
         key = self._changes, corrections.number, today[1:], self.never_tell, *self.classes
         if key != self._counts[0]:
-            found = self.sounds(min(today.midnight, today.night), corrections, {})
-            self._counts = key, {
-                name: (
-                    sum(event.start >= today.midnight for event in own.counted),
-                    sum(today.night <= event.start < today.morning for event in own.counted),
-                )
-                for name, own in found.items()
-            }
+            counts = {}
+            for name, own in self.sounds(min(today.midnight, today.night), corrections, {}).items():
+                of_night = (today.night <= event.start < today.morning for event in own.counted)
+                of_day = (event.start >= today.midnight for event in own.counted)
+                counts[name] = sum(of_day), sum(of_night)
+            self._counts = key, counts
         enough = self.known_of(today)
         return {
             name: (day if day or enough.day else None, night if night or enough.night else None)
