@@ -37,7 +37,7 @@ from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
 from hearthlog.analyzer.bridge.wording import ENGLISH
 from hearthlog.analyzer.http import HttpServer
 from hearthlog.analyzer.logs.local_time import today
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns

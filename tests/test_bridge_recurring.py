@@ -36,7 +36,7 @@ from hearthlog.analyzer.discover.summary import (
     save_summary,
     summary_path,
 )
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 

@@ -34,7 +34,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
 from hearthlog.analyzer.logs.shown_classes import write_list
 from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.timeline_plot import save_timelines

@@ -29,7 +29,7 @@ from viewers import Window, browsing, display, find_ruler, free_port, patiently,
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.layers import Coverage
-from hearthlog.analyzer.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.review_list import write_list

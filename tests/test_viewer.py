@@ -31,7 +31,7 @@ from viewers import (
 )
 
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.lanes import SELECTED_COLOUR, SHARES
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.drawing import SHARED_AXIS

@@ -29,7 +29,7 @@ from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overla
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.logs.shown_classes import common_names_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, lengths, overlay, rows_at, without
-from hearthlog.analyzer.marks import (
+from hearthlog.analyzer.marks.marks import (
     CHOICES,
     RANDOM,
     Mark,

@@ -14,7 +14,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labellings, find_labellings
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, remains, without
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import SILENCE, UNDECIDED, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.errors import LogError

@@ -12,7 +12,7 @@ from hearthlog.analyzer.evaluation import Events, indexed_events
 from hearthlog.analyzer.logs.labelling import LabelledFile, Labelling, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, overlay
-from hearthlog.analyzer.marks import RANDOM, read_review
+from hearthlog.analyzer.marks.marks import RANDOM, read_review
 from hearthlog.analyzer.promotion.paired_labels import ChangedTime, find_changed_time
 from hearthlog.analyzer.promotion.promotion_check import find_champion, other_features
 from hearthlog.analyzer.promotion.recent_time import recent_logs

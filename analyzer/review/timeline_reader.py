@@ -24,7 +24,7 @@ from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, lasting
 from hearthlog.analyzer.logs.selection import decode_types
 from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.logs.spans import one as one_span
-from hearthlog.analyzer.marks import Reviewed, read_review
+from hearthlog.analyzer.marks.marks import Reviewed, read_review
 from hearthlog.analyzer.review.lanes import (
     FEATURES,
     FIELDS,

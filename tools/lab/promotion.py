@@ -20,7 +20,7 @@ import typer
 
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.spans import NONE, Spans, one, overlay, pieces, rows_at
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion.paired_labels import TwoModels, joined_frames
 from hearthlog.analyzer.promotion.promotion_check import Verdict, judge
 from hearthlog.analyzer.promotion.recent_time import (
