@@ -753,7 +753,7 @@ def test_the_table_has_the_times_of_each_home_in_its_zone(tmp_path, capfd):
     write_day(tmp_path / "anna", day, hours=[20], timezone="Asia/Kolkata")
     shown = run(capfd, "catalog", tmp_path).stdout.splitlines()
     assert "from (Asia/Kolkata)" in shown[0]
-    assert re.search("2026-03-02 01:30 +2026-03-02 02:30$", shown[1])
+    assert re.search("2026-03-02 02:30 +2026-03-02 02:30$", shown[1])
     write_day(tmp_path / "bert", day, hours=[20])
     shown = run(capfd, "catalog", tmp_path).stdout.splitlines()
     assert "from (Asia/Kolkata, UTC)" in shown[0]
