@@ -590,10 +590,10 @@ def info_statements(
     true = truth.everywhere
     totals = event_totals(day.home, int(day.span.starts[0]), int(day.span.ends[0]))
     line = day_line(day.day, totals)
-    for name, (counted, _) in totals.items():
+    for name, total in totals.items():
         if name in _sounds_of(day):
-            stated = (counted, counted)
-            text = f"{in_words(name)} {counted}"
+            stated = (total.counted, total.counted)
+            text = f"{in_words(name)} {total.counted}"
             yield _counted(INFO, text, stated, _count(truth, name), modest=is_modest(line))
     for line in Overview(summary, day.zone).lines(None):
         for name in (n for n in _sounds_of(day) if _mentions(line, n)):
