@@ -380,13 +380,6 @@ class Page:
             self._mouse("mouseMoved", x, y, button="left", buttons=1)
         self._mouse("mouseReleased", end, y, button="left", clickCount=1)
 
-    def double_click(self, x, y):
-        """Click twice with the mouse."""
-        self._mouse("mouseMoved", x, y)
-        for count in (1, 2):
-            for kind in ("mousePressed", "mouseReleased"):
-                self._mouse(kind, x, y, button="left", clickCount=count)
-
     def wheel(self, x, y, steps, *, zoom=False):
         """Turn the wheel over a place; with `zoom`, hold Ctrl."""
         self._mouse("mouseMoved", x, y)
