@@ -157,7 +157,10 @@ def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path):
     write_day(tmp_path / "logs", DAY, [*coughs, *rings])
     page = page_of(tmp_path / "logs", tmp_path)
     text = re.sub(r"\s+", " ", re.sub("<[^>]*>", " ", page))
-    assert "perhaps one bout of coughing in the night (01:30) and two (perhaps four) by day" in text
+    assert (
+        "one bout of something like coughing in the night (01:30) and two (perhaps four) by day"
+        in text
+    )
     assert re.search(r"Coughing 2 \(\+3\?\) .*Telephone ringing 1 \(\+1\?\) 15:00, 16:00", text)
     assert "In brackets, as in 4 (+3?), is how many more the model is not sure of" in text
 

@@ -97,17 +97,20 @@ def amount(name: str, count: Count, *, named: bool = True) -> str:
     """Return a number of events in words, as labelled: `two bouts of coughing`, `crying once`.
 
     Without the name of the class, just `two`, `once`. With events that are not sure, `two (perhaps
-    four) bouts of coughing`.
+    four) bouts of coughing`, or `four bouts of something like coughing`.
     """
-    several = several_in_words(name).lower()
     sure = count.labelled - (count.unsure if count.range is None else 0)
+    several, sound = several_in_words(name).lower(), in_words(name).lower()
+    if named and not sure and count.labelled:
+        several = several.replace(sound, f"something like {sound}")
+        sound, sure = f"something like {sound}", count.labelled
     if several.startswith("times of "):
         often = _with_unsure(sure, count.labelled, _often)
-        return f"{in_words(name).lower()} {often}" if named else often
+        return f"{sound} {often}" if named else often
     number = _with_unsure(sure, count.labelled, number_in_words)
     if count.labelled == 1:
         bouts = several.startswith("bouts ")
-        several = several.replace("bouts", "bout", 1) if bouts else in_words(name).lower()
+        several = several.replace("bouts", "bout", 1) if bouts else sound
     return f"{number} {several}" if named else number
 
 

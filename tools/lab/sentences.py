@@ -322,7 +322,7 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
         for name in (name for name in _sounds_of(day) if _mentions(stated, name)):
             known = {in_words(name).lower(), several_in_words(name).lower()}
             words = f"(?:{'|'.join(map(re.escape, sorted(known)))})"
-            after_number = rf"(?:bouts? of |times of )?{words}|by day|after"
+            after_number = rf"(?:bouts? of |times of )?(?:something like )?{words}|by day|after"
             for part in re.split(r"(?:,| and) (?=\w+ (?:by day|after 22:00))", stated):
                 bare = re.sub(r"\([^)]*\)", "", part).lower()
                 match = re.search(rf"{words} ({_NUMBER})", bare) or re.search(
@@ -334,10 +334,12 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
                 high = _number(match[2]) if match.lastindex == 2 else low
                 span = next((own for when, own in parts.items() if when in part), day.span)
                 true = day.home.minutes.between(span).count(name, None).labelled
-                if doubtful := re.search(rf"\(?perhaps ({_NUMBER})", part):
-                    high = _number(doubtful[1])
-                    low = low if doubtful[0].startswith("(") else 0
-                yield _counted(surface, part, (low, high), true, modest=modest)
+                if doubtful := re.search(rf"\(perhaps ({_NUMBER})", part):
+                    most = _number(doubtful[1])
+                    right = low <= true <= most or is_close(low, true) or is_close(most, true)
+                    yield _judged(surface, part, f"{true:g}", right=right, modest=modest)
+                else:
+                    yield _counted(surface, part, (low, high), true, modest=modest)
                 if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
                     yield _at_times(surface, part, name, clocks, truth, modest=modest)
 
