@@ -476,7 +476,7 @@ def test_info_and_the_report_say_what_was_checked_and_what_was_not(tmp_path, cap
     assert "3 of 6" in text
     assert "<h2>What was heard</h2>" in text
     assert "How long, as labelled" in text
-    assert re.search(r"talking, in all</td><td[^>]*>[^<]+, as labelled<", text)
+    assert re.search(r"talking, not beside a television</td><td[^>]*>[^<]+, as labelled<", text)
     assert re.search(r"\d+ to \d+ \(8 labelled\)", text)
     assert "not checked here" not in text
     assert "“Right here”: how many" in text
