@@ -162,7 +162,7 @@ def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path):
         in text
     )
     assert re.search(r"Coughing 2 \(\+3\?\) .*Telephone ringing 1 \(\+1\?\) 15:00, 16:00", text)
-    assert "In brackets, as in 4 (+3?), is how many more the model is not sure of" in text
+    assert "A question mark, as in 3? or in 4 (+3?), is at those that the model is not" in text
 
 
 def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give():
@@ -170,6 +170,7 @@ def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give
     assert Count(7, 0, Strata(100, 20, 7)).text == "7"
     doubtful = Count(7, 0, Strata(100, 20, 7), unsure=3)
     assert (doubtful.text, (doubtful + doubtful).text) == ("4 (+3?)", "8 (+6?)")
+    assert Count(3, 0, Strata(100, 20, 3), unsure=3).text == "3?"
     printed = np.array([1, 1, 1, 1, 0, 0, 2, 1])
     rates = checked_rates(printed, np.minimum(printed, 1), printed > 0, 0.5)
     count = Count(27, 2, Strata(100, 20, 25), rates)

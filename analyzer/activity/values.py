@@ -75,9 +75,10 @@ class Count(_Quantity):
 
     @property
     def text(self) -> str:
-        """In words: `4 to 6 (7 labelled)`; without checks `4`, or `4 (+3?)` if 3 are not sure."""
+        """In words: `4 to 6 (7 labelled)`; unchecked `4`, `4 (+3?)` or `3?` with 3 unsure."""
         if self.range is None and self.unsure:
-            return f"{self.labelled - self.unsure} (+{self.unsure}?)"
+            sure = self.labelled - self.unsure
+            return f"{sure} (+{self.unsure}?)" if sure else f"{self.unsure}?"
         if self.range is None or self.range == (self.labelled, self.labelled):
             return f"{self.labelled}"
         low, high = self.range

@@ -68,8 +68,11 @@ function showTimes() {
   write(open.hide, say("hide", { class: inside(it.words) }));
 }
 
-// A count, those apart that are not sure: 2 (+3?).
-const counted = (value, unsure) => unsure ? `${value - unsure} (+${unsure}?)` : String(value);
+// A count, those apart that are not sure: 2 (+3?), or 3? if none is sure.
+function counted(value, unsure) {
+  if (!unsure) return String(value);
+  return unsure === value ? `${value}?` : `${value - unsure}\u202F(+${unsure}?)`;
+}
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 const dayName = () => shown.now === null ? shown.title : say("since evening");
 

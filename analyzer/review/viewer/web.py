@@ -108,7 +108,7 @@ def _text(content: bytes, field: int) -> str:
 
 _POLL_SECONDS = 20.0
 _SECONDS = 120.0  # for a request, with the time in which a browser takes the viewer
-_ANSWER_SECONDS = 15.0
+_ANSWER_SECONDS = 30.0  # a page without a graphics card takes some
 _LARGEST = 20_000.0  # points of a viewer
 _LIMIT = 16 << 20  # maximum bytes of an answer
 _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
