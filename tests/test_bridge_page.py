@@ -1014,8 +1014,9 @@ def test_the_page_works_below_a_path_of_a_proxy_and_leaves_its_cookie_there(phon
         phone.of('document.querySelector("#look input[value=silence]").click()')
         phone.of('document.querySelector("#look form").requestSubmit()')
         phone.shows("#look", "You said: Nothing")
-        cookies = {cookie["name"]: cookie["path"] for cookie in phone.cookies(address)}
-        assert cookies[f"hearthlog-{named.port}"] == "/sounds/hearth"
+        name = f"hearthlog-{named.port}"  # another test may have left one for the whole host
+        paths = {each["path"] for each in phone.cookies(address) if each["name"] == name}
+        assert "/sounds/hearth" in paths
         assert phone.of("seen") == []
 
 
