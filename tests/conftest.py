@@ -35,7 +35,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
-from hearthlog.tools.home import write_day, write_training_set
+from hearthlog.tools.home.simulate import write_day, write_training_set
 
 # Its workers have 80 columns, whatever the terminal: tables there are as in a pipe elsewhere.
 os.environ.pop("COLUMNS", None)

@@ -28,7 +28,6 @@ from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import HearthlogError, ModelError
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
-from hearthlog.tools.home import truth_of, write_sound
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary, frame_powers
 from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, Rooms
 from hearthlog.tools.home.routine import (
@@ -38,6 +37,7 @@ from hearthlog.tools.home.routine import (
     PlannedSound,
     plan_short_day,
 )
+from hearthlog.tools.home.simulate import truth_of, write_sound
 from hearthlog.tools.lab.home.days import Habits, plan_days
 from hearthlog.tools.lab.home.recording import FeatureStream, busy_frames, record_composition
 

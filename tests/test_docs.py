@@ -22,7 +22,7 @@ pytest.importorskip("hearthlog.tools.lab.month", reason="the wheel leaves what d
 from hearthlog.analyzer.review.viewer import drawing
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.main import make_app
-from hearthlog.tools.home import write_day, write_training_set
+from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.lab.classifiers import classifiers as compare_classifiers
 from hearthlog.tools.lab.home.__main__ import home as simulate_home
 from hearthlog.tools.lab.month.__main__ import month as simulate_month

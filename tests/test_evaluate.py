@@ -40,7 +40,7 @@ from hearthlog.models.classifiers.model import Smoothing
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli.tables import print_scores
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 
 
 @pytest.fixture

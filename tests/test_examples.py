@@ -13,7 +13,7 @@ import pytest
 from conftest import HEARTHLOG
 from homelife import write_day
 
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

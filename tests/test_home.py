@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.tools.home import write_day, write_training_set
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.routine import plan_short_day
+from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS, SimulationError, synthesize
 
 GENERAL = {

@@ -72,7 +72,7 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.cli.promotion import print_verdict
-from hearthlog.tools.home import write_day
+from hearthlog.tools.home.simulate import write_day
 
 OLD_MODEL = Path(__file__).parent / "golden/0.1.0/models/merged.safetensors"
 SECOND = 1_000_000_000

@@ -26,7 +26,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.labels.labeller import Labeller
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 
 pytestmark = pytest.mark.fast
 

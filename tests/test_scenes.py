@@ -25,7 +25,7 @@ from hearthlog.analyzer.training.manifest import read_manifest, scenario_of
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import SAMPLE_RATE
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 
 SECONDS = 60
 OPTIONS = SceneOptions(scenes=2, seconds=120.0)

@@ -26,7 +26,7 @@ from hearthlog.analyzer.workers import fits_on, in_parallel, single_thread
 from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.tools.cli import terminal
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 
 
 @pytest.fixture

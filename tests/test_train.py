@@ -29,7 +29,7 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, model_card
 from hearthlog.schemas.errors import ModelError, ignore_progress
 from hearthlog.tools.cli.train import print_figures, train
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 
 pytestmark = pytest.mark.fast
 

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from hearthlog.analyzer.http import free_port
 from hearthlog.tools.cli.main import make_app
-from hearthlog.tools.home import write_day, write_training_set
+from hearthlog.tools.home.simulate import write_day, write_training_set
 
 pytestmark = pytest.mark.fast
 

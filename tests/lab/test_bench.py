@@ -21,8 +21,8 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.frames import FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.tools.home import write_training_set
 from hearthlog.tools.home.clips import SHIPPED
+from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import queue
 from hearthlog.tools.lab.bench import (
     check,

@@ -8,10 +8,10 @@ from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.tools.home import truth_of
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import plan_short_day
+from hearthlog.tools.home.simulate import truth_of
 from hearthlog.tools.lab.adaptation import Outcome, adaptation, line_of, wrong_sounds
 from hearthlog.tools.lab.home.person import true_labelling
 from hearthlog.tools.lab.home.recording import record_composition

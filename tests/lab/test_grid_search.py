@@ -15,7 +15,7 @@ from hearthlog.analyzer.training.train import evaluate_method
 from hearthlog.analyzer.training.window_methods import PAPER, ROOM
 from hearthlog.analyzer.workers import fits_on
 from hearthlog.schemas.errors import ignore_progress
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import adaptation_curve, command, grid_search
 from hearthlog.tools.lab.grid_search import search
 

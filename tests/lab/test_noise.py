@@ -14,7 +14,7 @@ from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, read_manifest
 from hearthlog.analyzer.training.scores import F1Difference
 from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.schemas.frames import SAMPLE_RATE
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import noise as bench
 from hearthlog.tools.lab.noise import Outcome, compare, outcomes_of, won_back
 from hearthlog.tools.lab.noise_removers import WINDOW, Remover, SpectralSubtraction, Wiener

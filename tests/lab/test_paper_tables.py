@@ -13,7 +13,7 @@ from hearthlog.analyzer.training.manifest import BUILTIN, LABELS, read_manifest
 from hearthlog.analyzer.training.train import evaluate_method
 from hearthlog.analyzer.training.window_methods import PAPER
 from hearthlog.schemas.errors import ignore_progress
-from hearthlog.tools.home import write_training_set
+from hearthlog.tools.home.simulate import write_training_set
 from hearthlog.tools.lab import paper
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.paper import print_reproduction, reproduce, share_right

@@ -12,10 +12,10 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.home import truth_of
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import plan_short_day
+from hearthlog.tools.home.simulate import truth_of
 from hearthlog.tools.lab.home.person import Person, true_labelling
 from hearthlog.tools.lab.home.recording import record_composition
 

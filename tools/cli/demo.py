@@ -14,7 +14,7 @@ from hearthlog.tools.cli.options import parse_time, starter_here
 
 if TYPE_CHECKING:
     from hearthlog.models.classifiers.model import Model
-    from hearthlog.tools.home import LabelledSpan, Truth
+    from hearthlog.tools.home.simulate import LabelledSpan, Truth
 
 _START = "2026-03-01T00:00:00"
 _SEED = 1
@@ -46,7 +46,7 @@ def demo(
     from hearthlog.recorder.recording import record_files
     from hearthlog.recorder.sources.audio_files import FileSource
     from hearthlog.tools.cli.info import info
-    from hearthlog.tools.home import write_day
+    from hearthlog.tools.home.simulate import write_day
 
     if look and not has_display():
         raise HearthlogError(

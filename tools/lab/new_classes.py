@@ -31,10 +31,10 @@ from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.starter import BATHROOM, GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
-from hearthlog.tools.home import truth_of
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import LEVELS, LIVING_ROOM, RESIDENT, HomePlan, PlannedSound
+from hearthlog.tools.home.simulate import truth_of
 from hearthlog.tools.lab.adaptation import wrong_sounds
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.home.person import true_labelling, write_review

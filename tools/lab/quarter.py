@@ -24,10 +24,10 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.tools.home import truth_of
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import DAY_FRAMES, LIVING_ROOM, HomePlan
+from hearthlog.tools.home.simulate import truth_of
 from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.lab.bench.timing import HEARTHLOG
 from hearthlog.tools.lab.command import run

@@ -17,7 +17,7 @@ from hearthlog.models.modelfile import save_model
 from hearthlog.schemas.arrays import Float32, Int16
 from hearthlog.schemas.errors import ignore_progress
 from hearthlog.schemas.frames import FRAME_SAMPLES, SAMPLE_RATE
-from hearthlog.tools.home import write_day, write_training_set
+from hearthlog.tools.home.simulate import write_day, write_training_set
 from hearthlog.tools.home.sounds import LABELS
 from hearthlog.tools.lab.bench.hours import DENSE, lay_out, read_recordings
 from hearthlog.tools.lab.bench.live_logs import LiveLogs, record_as_live, record_file

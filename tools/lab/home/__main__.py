@@ -10,10 +10,10 @@ import typer
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
-from hearthlog.tools.home import reported, truth_of, write_sound, write_truth
 from hearthlog.tools.home.clips import SHIPPED, ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import LIVING_ROOM, ROOMS
+from hearthlog.tools.home.simulate import reported, truth_of, write_sound, write_truth
 from hearthlog.tools.home.sounds import SimulationError
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.home.days import Habits, plan_days

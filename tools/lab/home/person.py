@@ -17,7 +17,7 @@ from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN, class_name
 from hearthlog.models.registry import DEFAULT_FOLDER
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
-from hearthlog.tools.home import LabelledSpan
+from hearthlog.tools.home.simulate import LabelledSpan
 from hearthlog.tools.home.sounds import generator
 
 _LOOK_SECONDS = 5.0  # to look at a span and press a key, besides the time to hear it

@@ -21,8 +21,8 @@ from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.arrays import Bool, Float32, Int16
 from hearthlog.schemas.errors import Progress, ignore_progress
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
-from hearthlog.tools.home import BLOCK_FRAMES, blocks_of
 from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, audible_until, quantised
+from hearthlog.tools.home.simulate import BLOCK_FRAMES, blocks_of
 
 _COMPUTED_FRAMES = 12_000  # 10 minutes
 _FRAMES_AT_ONCE = 384

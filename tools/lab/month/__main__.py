@@ -13,7 +13,7 @@ import typer
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.tools.home import write_day
+from hearthlog.tools.home.simulate import write_day
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.month.faults import KINDS, plan_faults
 from hearthlog.tools.lab.month.folders import MonthFolder

@@ -16,10 +16,10 @@ from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
-from hearthlog.tools.home import truth_of, write_sound
 from hearthlog.tools.home.clips import ClipLibrary
 from hearthlog.tools.home.composition import Composition, Rooms
 from hearthlog.tools.home.routine import LIVING_ROOM
+from hearthlog.tools.home.simulate import truth_of, write_sound
 from hearthlog.tools.lab.home.days import Habits, plan_days
 from hearthlog.tools.lab.home.person import Person, true_labelling
 from hearthlog.tools.lab.home.recording import record_composition
