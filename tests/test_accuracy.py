@@ -351,6 +351,9 @@ def test_a_sound_that_somebody_marked_is_sure_whatever_the_model_thinks(tmp_path
     check(logs, at("10:00"), [(5, 7, "coughing")])
     count = report_day(tmp_path).count("coughing")
     assert (count.labelled, count.unsure, count.certain) == (2, 1, 1)
+    check(logs, at("12:00"))  # somebody went through it, and marked nothing
+    count = report_day(tmp_path).count("coughing")
+    assert (count.labelled, count.unsure, count.certain) == (2, 0, 2)
 
 
 def test_coughs_beside_a_television_are_counted_apart(tmp_path):
