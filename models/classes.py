@@ -19,6 +19,12 @@ OTHER, UNKNOWN = "other", topics.UNKNOWN  # for models and people; never trained
 # Answers of a person that are neither right nor wrong for a model, and teach nothing.
 UNDECIDED = frozenset({UNKNOWN, TELEVISION})
 OF_EVERY_SCENARIO = frozenset({SILENCE, UNKNOWN, OTHER})  # classes without a name in the scenario
+# Groups that counts and displays treat alike: a new class joins them here.
+WORRYING = (COUGHING, CRYING, YELLING)  # a person must look at them, also where one is only likely
+IMPORTANT = (*WORRYING, PHONE_RING)  # shown first
+WATER = (FLUSHING_WATER, SHOWER, TAP_WATER)
+# What also occurs on a television, or what a model takes its sounds for.
+ON_TELEVISION = (*IMPORTANT, LAUGHING, OBJECTS_ACTIVITY)
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 

@@ -6,14 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hearthlog.analyzer.activity.event_counts import (
-    AROUND,
-    MINUTE,
-    SET_APART,
-    events_of,
-    television_minutes,
-)
+from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE, events_of, television_minutes
 from hearthlog.analyzer.logs.labelling import Labelling
+from hearthlog.models.classes import ON_TELEVISION
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
@@ -105,7 +100,7 @@ def _counts(segments, zone, root: str) -> dict[str, str]:
         counted = events.starts[~np.isin(events.starts // MINUTE, television)]
         begun = [
             datetime.fromtimestamp(start / NANOSECONDS, zone)
-            for start in (counted if label in SET_APART else events.starts)
+            for start in (counted if label in ON_TELEVISION else events.starts)
         ]
         topic = f"{root}/class/{label}"
         values[f"{topic}/count_today"] = str(sum(start >= midnight for start in begun))

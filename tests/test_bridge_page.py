@@ -21,7 +21,6 @@ from viewers import address_of, browsing, free_port, patiently
 
 from hearthlog.analyzer import http
 from hearthlog.analyzer.activity import SoundEvent
-from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.bridge.bridge import open_outputs
 from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import REVIEWER, EventCorrections
@@ -38,6 +37,7 @@ from hearthlog.analyzer.bridge.wording import ENGLISH
 from hearthlog.analyzer.http import HttpServer
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import Mark, write_marks
+from hearthlog.models.classes import ON_TELEVISION
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -689,7 +689,7 @@ def test_a_day_of_thousands_of_sounds_is_small():
     )
     lanes = picture["rooms"][0]["lanes"]
     assert {lane["label"]: lane["count"] or 0 for lane in lanes} == {
-        name: 0 if name in SET_APART else 625 for name in labels
+        name: 0 if name in ON_TELEVISION else 625 for name in labels
     }, "like a television"
     assert len(json.dumps(picture)) < 40_000
 

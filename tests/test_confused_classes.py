@@ -5,6 +5,8 @@ from datetime import UTC, date
 import numpy as np
 import pytest
 
+from hearthlog.models.classes import WATER
+
 pytest.importorskip("hearthlog.tools.lab.home", reason="the wheel leaves the lab out")
 
 from hearthlog.analyzer.activity.home_data import read_home
@@ -15,7 +17,7 @@ from hearthlog.analyzer.bridge.wording import words_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.logs.shown_classes import WATER, common_names, common_names_of
+from hearthlog.analyzer.logs.shown_classes import common_names, common_names_of
 from hearthlog.analyzer.report.report import Period, make_report, read_account
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import BATHROOM, starter_file

@@ -13,7 +13,6 @@ from hearthlog.analyzer.activity.event_counts import (
     AROUND,
     FEWEST,
     MINUTE,
-    SET_APART,
     CheckedRates,
     beta_quantile,
     checked_rates,
@@ -37,7 +36,7 @@ from hearthlog.analyzer.marks.marks import (
     read_marks,
     read_reviewed,
 )
-from hearthlog.models.classes import SILENCE, TELEVISION, UNKNOWN, class_name
+from hearthlog.models.classes import ON_TELEVISION, SILENCE, TELEVISION, UNKNOWN, class_name
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.files import REVIEW_LAYER, log_of_layer
@@ -254,7 +253,7 @@ class CheckedMinutes:
     def _counted(self, name: str) -> tuple[Int64, Bool]:
         """Return the events of a class, and what sounds, in the minutes that count for it."""
         events = self.events.get(name, np.zeros((4, len(self)), np.int64))
-        kept = ~self.television if name in SET_APART else np.ones(len(self), bool)
+        kept = ~self.television if name in ON_TELEVISION else np.ones(len(self), bool)
         return events[:, kept], self.sounding[kept]
 
 

@@ -14,7 +14,6 @@ from hearthlog.analyzer.activity.checked_minutes import DOUBTFUL, CheckedMinutes
 from hearthlog.analyzer.activity.day_profile import HomeSegments, longest_quiet, stretches
 from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
-    SET_APART,
     CheckedRates,
     events_and_confidences,
     events_of,
@@ -39,7 +38,14 @@ from hearthlog.analyzer.logs.spans import (
     rows_at,
     without,
 )
-from hearthlog.models.classes import SILENCE, TELEVISION, UNKNOWN, class_name, ordered
+from hearthlog.models.classes import (
+    ON_TELEVISION,
+    SILENCE,
+    TELEVISION,
+    UNKNOWN,
+    class_name,
+    ordered,
+)
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
@@ -66,9 +72,9 @@ class HomeMinutes:
     def count(self, name: str, rates: CheckedRates | None) -> Count:
         """Count the events of a class.
 
-        `SET_APART` classes count in minutes without a television, and where a person reviewed.
+        `ON_TELEVISION` classes count in minutes without a television, and where a person reviewed.
         """
-        own = self.rows(~self.television) if name in SET_APART else self
+        own = self.rows(~self.television) if name in ON_TELEVISION else self
         if name not in own.events:
             return Count(rates=rates)
         labelled, corrected, certain, unsure = own.events[name]
@@ -85,14 +91,14 @@ class HomeMinutes:
 
     def counted(self, name: str, starts: Int64) -> Int64:
         """Return the events of a class, by starts within these minutes, that `count` counts."""
-        if name not in SET_APART:
+        if name not in ON_TELEVISION:
             return starts
         near_television = np.isin(starts // MINUTE * MINUTE, self.starts[self.television])
         return starts[~near_television | (rows_at(self.reviewed, starts) >= 0)]
 
     def beside_television(self, name: str) -> int:
-        """Count the events of a `SET_APART` class that `count` leaves out; 0 for other classes."""
-        if name not in SET_APART or name not in self.events:
+        """Count the events of `ON_TELEVISION` classes that `count` leaves out."""
+        if name not in ON_TELEVISION or name not in self.events:
             return 0
         _, corrected, certain, _ = self.events[name]
         return int((corrected - certain)[self.television].sum())

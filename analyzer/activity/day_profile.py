@@ -7,12 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.activity.event_counts import (
-    MINUTE,
-    SET_APART,
-    events_of,
-    television_minutes,
-)
+from hearthlog.analyzer.activity.event_counts import MINUTE, events_of, television_minutes
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import at_hour, awake_span, local_time, night_span
 from hearthlog.analyzer.logs.spans import (
@@ -32,6 +27,7 @@ from hearthlog.models.classes import (
     CRYING,
     FLUSHING_WATER,
     OBJECTS_ACTIVITY,
+    ON_TELEVISION,
     OTHER,
     SILENCE,
     TAP_WATER,
@@ -68,7 +64,7 @@ COUNT, LENGTH, CLOCK = "count", "minutes", "clock"
 STRETCHES, SOUND, FIRST, LAST, QUIET = "stretches", "sound", "first", "last", "quiet"
 BINS = 48  # of a day: half hours
 # Household sounds are a length here, and a length is as labelled, also beside a television.
-APART_IN_LENGTH = tuple(name for name in SET_APART if name != OBJECTS_ACTIVITY)
+APART_IN_LENGTH = tuple(name for name in ON_TELEVISION if name != OBJECTS_ACTIVITY)
 _NAMELESS = {SILENCE, OTHER, UNKNOWN}
 _AT_NIGHT = (FLUSHING_WATER, TAP_WATER, COUGHING, CRYING, YELLING)
 _LEAST = 0.9  # recorded share of a span for its figures to be present

@@ -11,12 +11,10 @@ from hearthlog.analyzer.activity.event_counts import events_and_confidences
 from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.models.classes import (
-    COUGHING,
-    CRYING,
-    PHONE_RING,
+    IMPORTANT,
     SILENCE,
     TELEVISION,
-    YELLING,
+    WORRYING,
     class_name,
 )
 from hearthlog.schemas.arrays import Bool, Float64
@@ -24,8 +22,7 @@ from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 
-WORRYING = (COUGHING, CRYING, YELLING)
-_LISTED = frozenset({*WORRYING, PHONE_RING, SILENCE, TELEVISION})  # labels that need no doubt
+_LISTED = frozenset({*IMPORTANT, SILENCE, TELEVISION})  # labels that need no doubt
 _DOUBTFUL = 0.5  # confidence below which no class has most of the probability
 _LOUD_DB = 30.0  # above the quiet around: household sounds reach 25, a scream in the room 45
 _NAMED, _LIKELY = 0.1, 0.25  # probability to name a class; to list a sound that is not loud

@@ -9,24 +9,18 @@ import numpy as np
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, lengths, rows_at
 from hearthlog.models.classes import (
-    COUGHING,
-    CRYING,
     LAUGHING,
     MUSIC,
-    OBJECTS_ACTIVITY,
-    PHONE_RING,
     SILENCE,
     SPEECH,
-    YELLING,
+    WORRYING,
 )
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 
 MINUTE = 60 * NANOSECONDS
-# Not counted beside a television: what also occurs on one, and what a model takes its sounds for.
-SET_APART = (COUGHING, CRYING, YELLING, PHONE_RING, LAUGHING, OBJECTS_ACTIVITY)
 AROUND = 10  # minutes before and after, in which a television would still be on
-_ALONE = (SILENCE, COUGHING, CRYING, YELLING)  # long crying is no television
+_ALONE = (SILENCE, *WORRYING)  # long crying is no television
 _SHARE = 0.1  # of the time
 _CHANGES = 2  # in a minute
 _VOICES = (SPEECH, MUSIC, LAUGHING)  # of a television, however sparse

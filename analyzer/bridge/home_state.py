@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.activity import ActiveClasses, EventRecord, SoundEvent
-from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE, SET_APART, television_minutes
+from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE, television_minutes
 from hearthlog.analyzer.activity.segments import (
     GrowingSpans,
     is_of_activity,
@@ -26,9 +26,17 @@ from hearthlog.analyzer.bridge.state import Report
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.recorder_info import status_value
-from hearthlog.analyzer.logs.shown_classes import WATER, common_names_of, read_list
+from hearthlog.analyzer.logs.shown_classes import common_names_of, read_list
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
-from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, UNKNOWN, class_name, ordered
+from hearthlog.models.classes import (
+    OF_EVERY_SCENARIO,
+    ON_TELEVISION,
+    SILENCE,
+    UNKNOWN,
+    WATER,
+    class_name,
+    ordered,
+)
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, decode
@@ -59,13 +67,6 @@ class Health(NamedTuple):
 
     level: int
     text: str
-
-
-class ListeningThreshold(NamedTuple):
-    """Whether coverage is sufficient for a count of 0: today, and in the last night."""
-
-    day: bool
-    night: bool
 
 
 class ClassSounds(NamedTuple):
@@ -217,7 +218,7 @@ class LiveMicrophone:
     ) -> dict[str, ClassSounds]:
         """Return the events of each shown class since a time, as the report counts them.
 
-        `SET_APART` classes do not count beside a television, but where a person confirmed them.
+        `ON_TELEVISION` classes do not count beside a television, but where a person confirmed them.
         `names` are common names of classes, such as `common_names`; empty for the classes of the
         model.
         """
@@ -261,17 +262,18 @@ class LiveMicrophone:
                 of_day = (event.start >= today.midnight for event in own.counted)
                 counts[name] = sum(of_day), sum(of_night)
             self._counts = key, counts
-        enough = self.known_of(today)
+        has_day = self.listened_share(today.midnight, today.now) > 0
+        has_night = self.is_night_covered(today)
         return {
-            name: (day if day or enough.day else None, night if night or enough.night else None)
+            name: (day if day or has_day else None, night if night or has_night else None)
             for name, (day, night) in self._counts[1].items()
         }
 
     def counted(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
-        """Return the events that count: `SET_APART` classes only without a television beside."""
-        apart = [event for event in events if event.label in SET_APART]
+        """Return the events that count: `ON_TELEVISION` ones only without a television."""
+        apart = [event for event in events if event.label in ON_TELEVISION]
         left = {*self.without_television(apart)}
-        return [event for event in events if event.label not in SET_APART or event in left]
+        return [event for event in events if event.label not in ON_TELEVISION or event in left]
 
     def without_television(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
         """Return the events of a class, or of several, that begin without a television beside."""
@@ -292,10 +294,9 @@ class LiveMicrophone:
             self._television = self._changes, minutes
         return minutes
 
-    def known_of(self, today: Today) -> ListeningThreshold:
-        """Return whether coverage of the day and the night is sufficient for a count of 0."""
-        night = self.listened_share(today.night, min(today.morning, today.now))
-        return ListeningThreshold(self.listened_share(today.midnight, today.now) > 0, night >= MOST)
+    def is_night_covered(self, today: Today) -> bool:
+        """Return whether enough of the night was listened to for a count of 0."""
+        return self.listened_share(today.night, min(today.morning, today.now)) >= MOST
 
     def listened_share(self, start: int, end: int) -> float:
         """Return the share of a time span, up to now, in which the microphone listened."""
@@ -395,9 +396,9 @@ class HomeState:
 
     def present(self) -> list[LiveMicrophone]:
         """Return the states of the microphones in the newest log."""
-        return [each for each in self.microphones.values() if not self.is_left_out(each.name)]
+        return [each for each in self.microphones.values() if not self.is_removed(each.name)]
 
-    def is_left_out(self, name: str) -> bool:
+    def is_removed(self, name: str) -> bool:
         """Whether the recorder no longer has a microphone or scenario."""
         return self.sources is not None and name not in self.sources
 

@@ -9,7 +9,11 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from hearthlog.analyzer.logs.recorder_info import attachments_of
-from hearthlog.models.classes import FLUSHING_WATER, RUNNING_WATER, SHOWER, TAP_WATER, class_name
+from hearthlog.models.classes import (
+    RUNNING_WATER,
+    WATER,
+    class_name,
+)
 from hearthlog.models.modelfile import DESCRIPTION
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.files import read_limited
@@ -61,7 +65,6 @@ def list_of_log(log: Path) -> frozenset[str]:
     return frozenset()
 
 
-WATER = (FLUSHING_WATER, SHOWER, TAP_WATER)
 _RECALL = 0.5  # of a class that a model finds
 _OF_HOME = 2  # classes that a home must have taught a model, to tell them apart
 

@@ -6,7 +6,7 @@ from datetime import timedelta
 import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
-from hearthlog.analyzer.activity.event_counts import MINUTE, SET_APART
+from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Count, Duration, rounded
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import common, joined, one, without
@@ -19,7 +19,13 @@ from hearthlog.analyzer.report.wording import (
     short_day,
     weekday,
 )
-from hearthlog.models.classes import COUGHING, CRYING, SILENCE, UNKNOWN, YELLING, in_words
+from hearthlog.models.classes import (
+    ON_TELEVISION,
+    SILENCE,
+    UNKNOWN,
+    WORRYING,
+    in_words,
+)
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import listed
 
@@ -27,7 +33,6 @@ LIVELY_MINUTES = 5  # minutes with sound of a lively hour
 QUIET_HOURS = 6  # most lively hours of a quiet day
 _RUNS = 3  # most times of day that are named
 _TIMES = 3
-_WORRYING = COUGHING, CRYING, YELLING
 _MISSING_HOURS = 1.0  # fewer hours without a record are not in the headline
 _ONE_MORE = 2
 _PAUSE = 5 * MINUTE  # longest between recorded spans of one stretch
@@ -65,7 +70,7 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
     else:
         parts = [f"Too little was recorded to judge any of the {of} days."]
     sounds: list[tuple[str, bool]] = []
-    for name in _WORRYING:
+    for name in WORRYING:
         counts = [(count, day) for day in known if (count := day.count(name)) and count.labelled]
         if counts:
             total = sum((count for count, _ in counts), Count())
@@ -173,9 +178,9 @@ def _recorded_part(day: DayMetrics) -> str:
 def _labelled(day: DayMetrics) -> str:
     """Return the classes labelled longest, but those that have a sentence of their own."""
     lengths: list[tuple[int, str]] = []
-    for name in set(day.home.classes) - {SILENCE, UNKNOWN, *_WORRYING}:
+    for name in set(day.home.classes) - {SILENCE, UNKNOWN, *WORRYING}:
         spans = common(day.home.spans[name], day.span)
-        if name in SET_APART:
+        if name in ON_TELEVISION:
             spans = without(spans, television_spans(day))
         if spans.length >= _NAMED:
             lengths.append((-spans.length, in_words(name).lower()))
@@ -231,7 +236,7 @@ def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
         (one(morning, evening), "by day"),
         (one(evening, int(day.span.ends[0])), f"after {EVENING}:00"),
     )
-    for name in _WORRYING:
+    for name in WORRYING:
         parts: list[str] = []
         is_known = True
         for span, when in times_of_day:

@@ -9,7 +9,6 @@ import jinja2
 import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
-from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
 from hearthlog.analyzer.report.headline import day_headline, week_headline
 from hearthlog.analyzer.report.report_data import (
@@ -53,6 +52,7 @@ from hearthlog.analyzer.report.wording import (
 from hearthlog.models.classes import (
     COUGHING,
     FLUSHING_WATER,
+    ON_TELEVISION,
     SHOWER,
     SILENCE,
     UNKNOWN,
@@ -203,7 +203,7 @@ def _page(account: Account, picture: PagePicture, **parts: Any) -> str:
     names = [name for name in account.classes if name not in {SILENCE, UNKNOWN}]
     absent = [name for name in names if _is_known(account, name) and not _occurs(account, name)]
     uncertain = [name for name in names if not _is_known(account, name)]
-    uncounted = [name for name in SET_APART if name in account.classes]
+    uncounted = [name for name in ON_TELEVISION if name in account.classes]
     return fill_page(
         account=account,
         picture=picture,

@@ -37,14 +37,13 @@ from hearthlog.models.classes import (
     SPEECH,
     TAP_WATER,
     UNKNOWN,
+    WATER,
     YELLING,
     in_words,
     ordered,
 )
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import listed
-
-BATHROOM = (FLUSHING_WATER, SHOWER, TAP_WATER)
 
 
 class ReportFigure(NamedTuple):
@@ -216,15 +215,15 @@ class Account:
     @property
     def unknown(self) -> list[str]:
         """Classes that a report is asked about, and the model of the home does not know."""
-        wanted = {*BATHROOM, *(item.needs for item in ASSESSED_ITEMS if item.needs)}
+        wanted = {*WATER, *(item.needs for item in ASSESSED_ITEMS if item.needs)}
         if RUNNING_WATER in self.classes:
-            wanted -= {*BATHROOM}
+            wanted -= {*WATER}
         return ordered(wanted - {*self.classes, *self.hidden})
 
     @property
     def confused(self) -> list[str]:
         """Classes that a report is asked about, and the model does not tell apart."""
-        return ordered(set(BATHROOM) - self.hidden) if RUNNING_WATER in self.classes else []
+        return ordered(set(WATER) - self.hidden) if RUNNING_WATER in self.classes else []
 
     @property
     def checked(self) -> bool:

@@ -16,13 +16,13 @@ from hearthlog.analyzer.activity.checked_minutes import (
     read_reviewed_labels,
 )
 from hearthlog.analyzer.activity.daily_metrics import EventTotal
-from hearthlog.analyzer.activity.event_counts import FEWEST, SET_APART
+from hearthlog.analyzer.activity.event_counts import FEWEST
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.shown_classes import common_names_of
 from hearthlog.analyzer.logs.summary import LogSummary
-from hearthlog.models.classes import SILENCE, UNKNOWN, class_name, in_words, ordered
+from hearthlog.models.classes import ON_TELEVISION, SILENCE, UNKNOWN, class_name, in_words, ordered
 from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.errors import listed
 from hearthlog.schemas.frames import FRAME_SECONDS
@@ -275,7 +275,7 @@ class Accuracy:
                 "intervals in brackets"
             )
             if television := int(self.minutes.television.sum()):
-                names = listed([in_words(name).lower() for name in SET_APART], "and")
+                names = listed([in_words(name).lower() for name in ON_TELEVISION], "and")
                 yield (
                     f"{names} are left out of {television} of these minutes, in which something "
                     "like a television, a radio or company sounded"

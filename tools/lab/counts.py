@@ -16,7 +16,6 @@ import typer
 from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
 from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
-    SET_APART,
     events_of,
     sounding_minutes,
     strata_of,
@@ -26,7 +25,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, unified
 from hearthlog.analyzer.logs.spans import joined, lengths
 from hearthlog.analyzer.review.candidates import RecordedMinutes, draw_minutes
-from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.models.classes import ON_TELEVISION, SILENCE, UNKNOWN
 from hearthlog.schemas.arrays import Bool, Int64
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.messages.topics import LIVE
@@ -179,7 +178,7 @@ def _range(
     if rates is None:
         return
     here = home.day == day
-    if name in SET_APART:
+    if name in ON_TELEVISION:
         here &= ~home.television
     low, high = rates.range_of(strata_of(home.labelled[name][here], home.sounding[here]))
     labelled, true = int(home.labelled[name][here].sum()), int(home.true[name][here].sum())

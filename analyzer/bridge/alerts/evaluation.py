@@ -15,7 +15,6 @@ from hearthlog.analyzer.activity.day_profile import (
     Profiles,
     television_spans,
 )
-from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.segments import HomeActivity, is_of_scenario
 from hearthlog.analyzer.activity.values import (
     BASELINE_DAYS,
@@ -56,7 +55,7 @@ from hearthlog.analyzer.logs.spans import (
     without,
 )
 from hearthlog.analyzer.report.wording import differences_text, rarity_text, short_day
-from hearthlog.models.classes import SILENCE
+from hearthlog.models.classes import ON_TELEVISION, SILENCE
 from hearthlog.recorder.pause_schedule import QuietHours
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS
@@ -314,7 +313,7 @@ def unlike_conditions(
         return []
     events = events_of_rule(rule, activity)
     spans, starts = events.counted_coverage(), events.counted
-    if rule.label in SET_APART:  # counted as in the report
+    if rule.label in ON_TELEVISION:  # counted as in the report
         television = television_spans(home_sound(activity).labels)
         starts = starts[rows_at(television, events.starts) < 0]
         if rule.label in APART_IN_LENGTH:

@@ -95,7 +95,7 @@ class MqttPublisher:
         """Publish an update."""
         self._keep(Place("recorder"), _ONLINE[news.state.is_recording()])
         for each in news.state.every():
-            if news.state.is_left_out(each.name):
+            if news.state.is_removed(each.name):
                 self._classes.pop(each.name, None)
                 continue
             if each.classes != self._classes.get(each.name, []):
@@ -273,7 +273,7 @@ class MqttPublisher:
             return True
         if not microphone:
             return kind in {CONFIG, TOLD} and not self._settings.commands
-        if state.is_left_out(microphone):
+        if state.is_removed(microphone):
             return True
         classes = self._classes.get(microphone)
         return bool(label) and classes is not None and label not in classes

@@ -25,25 +25,19 @@ from hearthlog.analyzer.logs.local_time import (
 )
 from hearthlog.analyzer.logs.spans import joined
 from hearthlog.models.classes import (
-    COUGHING,
-    CRYING,
-    FLUSHING_WATER,
-    PHONE_RING,
+    IMPORTANT,
     RUNNING_WATER,
-    SHOWER,
     SPEECH,
-    TAP_WATER,
-    YELLING,
+    WATER,
+    WORRYING,
     colour_on_paper,
     ordered,
 )
 from hearthlog.schemas.frames import NANOSECONDS
 
 BIN = 120 * NANOSECONDS  # as in the picture of the report
-IMPORTANT = frozenset({COUGHING, CRYING, YELLING, PHONE_RING})  # classes that need a look
 # What people ask about: the page states which of these no model of the home can tell.
-_EXPECTED = frozenset({*IMPORTANT, SPEECH, FLUSHING_WATER, SHOWER, TAP_WATER})
-_BATHROOM = frozenset({FLUSHING_WATER, SHOWER, TAP_WATER})
+_EXPECTED = frozenset({*IMPORTANT, SPEECH, *WATER})
 _HOUR = 3600 * NANOSECONDS
 _LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
 _MOST_TIMES = 40  # of a count
@@ -171,8 +165,8 @@ def _missing_classes(home: HomeDay) -> str:
     hidden = frozenset[str]().union(*(each.never_tell for each in home.microphones))
     missing = _EXPECTED - known - hidden
     notes = []
-    if RUNNING_WATER in known and (joined_classes := missing & _BATHROOM):
-        missing -= _BATHROOM
+    if RUNNING_WATER in known and (joined_classes := missing & {*WATER}):
+        missing -= {*WATER}
         water = words.inside(words.class_words(RUNNING_WATER))
         classes = _listed_classes(joined_classes, words)
         notes.append(words.text("missing.joined", classes=classes, water=water))
@@ -328,7 +322,7 @@ def day_sentence(home: HomeDay) -> str:
     end = min(moment.morning, moment.now)
     words, found = home.words, _events_of(home, moment.night, moment.morning)
     is_over = moment.now >= moment.morning
-    if not all(each.known_of(moment).night for each in home.microphones) or not home.microphones:
+    if not all(each.is_night_covered(moment) for each in home.microphones) or not home.microphones:
         when = words.text("night.partly")
     elif all(_is_quiet(own, end - moment.night) for own in _by_room(found).values()):
         when = words.text("night.quiet" if is_over else "night.quiet so far")
@@ -349,7 +343,7 @@ def _sentence_of_day(home: HomeDay) -> str:
     when = "" if home.is_past else words.text("since", time=clock(start, home.zone))
     if any(name in IMPORTANT for name in found):
         return _sentence(when, found, home)
-    known = {name for each in home.microphones for name in each.classes} & IMPORTANT
+    known = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
     names = [words.inside(words.class_words(name)) for name in ordered(known)]
     if not names:
         return _sentence(when, found, home) if found else ""
@@ -394,7 +388,7 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
     while True:
         shown = {name: found[name] for name in names}
         # Times of the first class matter more than a last one that worries nobody.
-        is_dispensable = bool(names[1:]) and names[-1] not in IMPORTANT - {PHONE_RING}
+        is_dispensable = bool(names[1:]) and names[-1] not in WORRYING
         for times in (_MOST_CLOCKS,) if is_dispensable else (_MOST_CLOCKS, 1, 0):
             sentence = _sentence_of(when, shown, home, times if is_brief else None)
             if not names[1:] or len(sentence) <= _LONGEST:

@@ -9,7 +9,6 @@ import numpy as np
 
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.doubtful_sounds import (
-    WORRYING,
     DoubtfulSound,
     is_doubtful,
     perhaps,
@@ -19,7 +18,7 @@ from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.logs.home_logs import HomeLog, find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE
-from hearthlog.models.classes import class_name
+from hearthlog.models.classes import WORRYING, class_name
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic

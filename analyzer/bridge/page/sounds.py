@@ -11,15 +11,21 @@ from typing import Any, NamedTuple
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import SURE, UNMEASURED, Sureness
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
-from hearthlog.analyzer.activity.event_counts import SET_APART
 from hearthlog.analyzer.activity.segments import source_microphone
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
-from hearthlog.analyzer.bridge.page.day import IMPORTANT
 from hearthlog.analyzer.bridge.page.doubts import Doubts
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.bridge.wording import Words, clock, room
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
-from hearthlog.models.classes import PHONE_RING, SILENCE, UNKNOWN, class_name, colour_on_paper
+from hearthlog.models.classes import (
+    IMPORTANT,
+    ON_TELEVISION,
+    PHONE_RING,
+    SILENCE,
+    UNKNOWN,
+    class_name,
+    colour_on_paper,
+)
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import AUDIO_LAYER, find_logs, log_name
@@ -130,7 +136,7 @@ def uncounted_ids(
 ) -> frozenset[str]:
     """Return the ids of the events that do not count, because of a television beside."""
     own = {each.name: each for each in microphones}
-    apart = [event for event in events if event.label in SET_APART]
+    apart = [event for event in events if event.label in ON_TELEVISION]
     by_room = {name: [e for e in apart if e.microphone == name] for name in own}
     counted = {e.id for name, same in by_room.items() for e in own[name].counted(same)}
     return frozenset(event.id for event in apart) - counted
