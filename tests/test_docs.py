@@ -5,6 +5,7 @@ import importlib
 import re
 import shlex
 import shutil
+import tomllib
 from importlib.resources import files
 from itertools import chain, pairwise
 from pathlib import Path
@@ -424,6 +425,40 @@ def test_a_typical_change_touches_at_most_three_files_that_exist(what, paths):
     assert tested
     for path in chain(*paths):
         assert (ROOT / path).exists(), f"{what}: {path}"
+
+
+def rooms():
+    """Yield package and line of each room in the table of the design."""
+    package = ""
+    table = (ROOT / "docs" / "design.md").read_text().partition("| package | room |")[2]
+    for line, row in enumerate(table.partition("\n\n")[0].splitlines()[2:]):
+        name, own, _ = (cell.strip() for cell in row.strip("|").split("|", 2))
+        package = name.strip("`") or package
+        for room in re.findall("`([^`]+)`", own):
+            yield package, room, line
+
+
+def layers():
+    """Yield package and layer of each room in the import contracts."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    for contract in contracts["contracts"]:
+        for package in contract.get("containers", ()):
+            for layer, own in enumerate(contract["layers"]):
+                for room in own.split(" | "):
+                    yield package.removeprefix("hearthlog."), room, layer
+
+
+def test_the_design_names_every_room_in_the_order_of_the_import_contracts():
+    lines = {(package, room): line for package, room, line in rooms()}
+    for package in dict.fromkeys(package for package, _ in lines):
+        own = {room for other, room in lines if other == package}
+        entries = [*(ROOT / package).iterdir()]
+        folders = {each.name for each in entries if each.is_dir()} - {"__pycache__"}
+        modules = {each.stem for each in entries if each.suffix == ".py"} - {"__init__"}
+        assert own == {name for name in folders | modules if not name.startswith(".")}, package
+        order = [(layer, room) for other, room, layer in layers() if other == package]
+        placed = [lines[package, room] for _, room in sorted(order)]
+        assert placed == sorted(placed), f"{package}: {order}"
 
 
 def test_the_pictures_show_the_program_of_today():
