@@ -176,12 +176,10 @@ def day(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture(scope="session", params=["simulated home", "real household"])
-def sounds(request) -> list[Path]:
-    """Sounds of a home to record, simulated and real."""
-    if request.param == "simulated home":
-        return [request.getfixturevalue("day")]
-    return spread_files(request.getfixturevalue("household"), 52)
+@pytest.fixture(scope="session")
+def sounds(household) -> list[Path]:
+    """Real sounds of a home to record."""
+    return spread_files(household, 52)
 
 
 @pytest.fixture(scope="session")

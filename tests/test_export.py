@@ -43,13 +43,10 @@ KINDS = ("features", "statistics", "label", "segment", "gap", "info")
 RATE = 16_000
 
 
-@pytest.fixture(scope="module", params=["simulated home", "real household"])
-def sound(request):
+@pytest.fixture(scope="module")
+def sound(household):
     """Some seconds of sound, 16 bits a sample."""
-    if request.param == "simulated home":
-        path = request.getfixturevalue("day")
-    else:
-        path = min(request.getfixturevalue("household").glob("*/*.flac"))
+    path = min(household.glob("*/*.flac"))
     samples = np.concatenate(list(read_audio(path)))[: 4 * RATE]
     return (samples * 32767).clip(-32768, 32767).astype("<i2")
 

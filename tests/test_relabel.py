@@ -56,9 +56,7 @@ def same_time(monkeypatch):
 
 
 # What works on files, processes and machines, whatever the sounds and the labels are.
-of_one_kind = pytest.mark.parametrize(
-    ("sounds", "model"), [("real household", "smoothed")], indirect=True
-)
+of_one_kind = pytest.mark.parametrize("model", ["smoothed"], indirect=True)
 
 
 @pytest.fixture(scope="module", params=["merged", "smoothed"])
@@ -188,6 +186,7 @@ def test_what_is_there_is_left_alone(model, logs, layers):
     assert {path: path.stat().st_mtime_ns for path in find_logs(logs)} == times
 
 
+@of_one_kind
 def test_what_is_missing_is_made(model, logs, layers):
     relabelled(model, logs)
     gone = [path for path in find_logs(logs) if is_layer(path)][1::2]
@@ -198,6 +197,7 @@ def test_what_is_missing_is_made(model, logs, layers):
     assert written(logs) == layers
 
 
+@of_one_kind
 def test_a_log_that_comes_later_has_the_layer_before_it_made_again(model, logs, layers, tmp_path):
     """Until then, what was open at its end had to be closed there."""
     later = recorded_logs(logs)[1:]
@@ -210,6 +210,7 @@ def test_a_log_that_comes_later_has_the_layer_before_it_made_again(model, logs, 
     assert written(logs) == layers
 
 
+@of_one_kind
 def test_a_log_behind_without_a_frame_does_not_end_what_is_open(model, logs, layers):
     """A recorder has begun the next log and not yet written into it."""
     log, behind, *_ = recorded_logs(logs)
@@ -224,6 +225,7 @@ def test_a_log_behind_without_a_frame_does_not_end_what_is_open(model, logs, lay
     assert written(logs) == layers
 
 
+@of_one_kind
 def test_layers_stay_when_logs_beside_theirs_are_deleted(model, logs, layers):
     relabelled(model, logs)
     for log in recorded_logs(logs)[:2]:
@@ -289,12 +291,14 @@ def test_a_layer_says_what_made_it(model, logs):
     assert (about.before, about.behind) == ("", behind.stem)
 
 
+@of_one_kind
 def test_layers_are_sound(model, logs):
     relabelled(model, logs)
     kinds = {kind for findings in examine(logs) for kind in findings.counts}
     assert kinds <= {("warning", "gap")}
 
 
+@of_one_kind
 def test_layers_do_not_run_back_in_time(model, logs):
     relabelled(model, logs)
     layers = [path for path in find_logs(logs) if is_layer(path)]
@@ -308,6 +312,7 @@ def test_layers_do_not_run_back_in_time(model, logs):
     assert any(segment for _, segment in read[:-1])
 
 
+@of_one_kind
 def test_a_chunk_of_a_layer_spans_a_minute_at_most(model, logs):
     relabelled(model, logs)
     for path in find_logs(logs):
@@ -317,6 +322,7 @@ def test_a_chunk_of_a_layer_spans_a_minute_at_most(model, logs):
                 assert (spans < 60 * NANOSECONDS).all()
 
 
+@of_one_kind
 def test_chunks_of_a_layer_are_cut_by_time(model, logs, monkeypatch):
     monkeypatch.setattr(labels, "_CHUNK_SPAN", 10 * NANOSECONDS)  # logs have a minute
     relabelled(model, logs)
@@ -327,6 +333,7 @@ def test_chunks_of_a_layer_are_cut_by_time(model, logs, monkeypatch):
     assert len(spans) > 3
 
 
+@of_one_kind
 def test_labels_that_were_written_out_of_order_give_the_same_layer(model, logs, monkeypatch):
     monkeypatch.setattr(labels, "_PIECE_SPAN", NANOSECONDS)
     loaded, log = load_model(model), recorded_logs(logs)[1]
@@ -343,6 +350,7 @@ def test_labels_that_were_written_out_of_order_give_the_same_layer(model, logs, 
     assert made[0] == made[1]
 
 
+@of_one_kind
 def test_a_damaged_log_is_labelled_where_it_is_whole(model, logs, tmp_path, capfd):
     log = recorded_logs(logs)[1]
     with LogFile(log) as file:
@@ -391,6 +399,7 @@ def test_logs_behind_a_damaged_one_do_not_depend_on_how_they_are_done(model, log
     assert written(other) == written(logs)
 
 
+@of_one_kind
 def test_a_log_that_is_cut_off_is_labelled_up_to_there(model, logs, capfd):
     log = recorded_logs(logs)[1]
     data = log.read_bytes()
@@ -558,12 +567,14 @@ def test_logs_of_two_microphones_one_by_one_in_any_order_give_the_same_bytes(mod
     assert (again.layers, len(again.current)) == ([], len(recorded_logs(one_by_one)))
 
 
+@of_one_kind
 def test_layers_of_two_microphones_are_sound(model, rooms):
     relabelled(model, rooms / "both")
     kinds = {kind for findings in examine(rooms / "both") for kind in findings.counts}
     assert kinds <= {("warning", "gap")}
 
 
+@of_one_kind
 def test_a_layer_that_names_no_microphone_of_its_open_segments_is_current(model, rooms):
     """As layers were before a log could be of several microphones."""
     relabelled(model, rooms / "bath")
@@ -585,6 +596,7 @@ def test_a_layer_that_names_no_microphone_of_its_open_segments_is_current(model,
     assert len(again.current) == len(recorded_logs(rooms / "bath"))
 
 
+@of_one_kind
 def test_a_microphone_of_other_features_is_left_out_and_named(model, day, tmp_path, capfd):
     source = {name: FileSource([day], START) for name in ("kitchen", "bath")}
     logs = record_together(tmp_path / "logs", {"bath": source["bath"]})
@@ -639,6 +651,7 @@ class DeadlyWorkers(InlineWorkers):
         return super().submit(function, *args)
 
 
+@of_one_kind
 def test_a_log_that_kills_its_worker_costs_nothing_but_its_own_layer(model, night, tmp_path):
     logs = Path(shutil.copytree(night, tmp_path / "night"))
     full = Path(shutil.copytree(night, tmp_path / "whole"))
@@ -674,6 +687,7 @@ def test_logs_of_two_nodes_in_one_folder_are_two_sounds(model, logs, layers):
     assert {name: data for name, data in found.items() if name in layers} == layers
 
 
+@of_one_kind
 def test_no_logs_are_one_line(model, tmp_path, capfd):
     done = run(capfd, "relabel", tmp_path, "--model", model)
     assert (done.returncode, done.stderr.count("\n")) == (1, 2)

@@ -167,14 +167,11 @@ def content(path):
         return file.read(0, bag.offset) + file.read(rest, contents.offset + contents.length - rest)
 
 
-@pytest.mark.parametrize("source", ["simulated home", "real household"])
-def test_messages_that_were_read_are_written_as_they_were(source, request, tmp_path, hearthlog):
-    if source == "simulated home":
-        audio = [request.getfixturevalue("day")]
-    else:
-        audio = spread_files(request.getfixturevalue("household"), 26)
-    model = request.getfixturevalue("model_file")
-    done = hearthlog("record", *audio, "-o", tmp_path, "--model", model)
+def test_messages_that_were_read_are_written_as_they_were(
+    household, model_file, tmp_path, hearthlog
+):
+    audio = spread_files(household, 26)
+    done = hearthlog("record", *audio, "-o", tmp_path, "--model", model_file)
     assert done.returncode == 0, done.stderr
     (log,) = find_logs(tmp_path)[:1]
     stream = BytesIO()
