@@ -61,8 +61,9 @@ def test_models_of_exact_values_know_what_they_have_learned_from():
 
 
 def test_flatness_is_that_of_librosa(real_frames):
-    power = np.abs(np.fft.rfft(real_frames.astype(np.float64), axis=1)[:, :400] / 400) ** 2 + 1e-9
-    values = HOME33.extractor()(real_frames)[:, FLATNESS]
+    frames = real_frames[::16]  # librosa takes its time
+    power = np.abs(np.fft.rfft(frames.astype(np.float64), axis=1)[:, :400] / 400) ** 2 + 1e-9
+    values = HOME33.extractor()(frames)[:, FLATNESS]
     for number, band in enumerate(BANDS):
         theirs = librosa.feature.spectral_flatness(S=power[:, band].T, power=1.0, amin=1e-12)[0]
         expected = 10 * np.log10(theirs)
