@@ -362,8 +362,8 @@ def test_coughs_beside_a_television_are_counted_apart(tmp_path):
     write_day(tmp_path, DAY, [*talking, *coughs])
     day = report_day(tmp_path)
     assert day.count("coughing").labelled == 1
-    assert day.beside_television("coughing") == 2
-    assert day.beside_television("speech") == 0
+    assert day.uncounted_events("coughing") == 2
+    assert day.uncounted_events("speech") == 0
 
 
 @pytest.mark.parametrize("name", ["phone_ring", "objects_activity"])
@@ -373,7 +373,7 @@ def test_what_a_television_is_taken_for_is_counted_apart_like_its_coughs(tmp_pat
     write_day(tmp_path, DAY, [*talking, *others])
     day = report_day(tmp_path)
     assert day.count(name).labelled == 1
-    assert day.beside_television(name) == 2
+    assert day.uncounted_events(name) == 2
 
 
 def test_the_page_says_of_a_night_what_its_table_counts(tmp_path):

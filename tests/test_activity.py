@@ -81,7 +81,7 @@ def reported(logs):
     counts = {}
     for name in SOUNDS:
         night = day.home.minutes.counted(name, day.home.events_in(name, day.night))
-        counts[name] = day.count(name).labelled, len(night), day.beside_television(name)
+        counts[name] = day.count(name).labelled, len(night), day.uncounted_events(name)
     assert sum(neighbour for *_, neighbour in counts.values()) > 100
     return counts
 
@@ -205,11 +205,11 @@ def test_the_contents_of_logs_name_the_counts_of_the_report(logs, capfd):
     assert found["counts"] == {
         name: {
             "counted": count.labelled,
-            "television": day.beside_television(name),
+            "television": day.uncounted_events(name),
             "unsure": count.unsure,
         }
         for name in day.home.classes
-        if (count := day.count(name)) is not None and count.labelled + day.beside_television(name)
+        if (count := day.count(name)) is not None and count.labelled + day.uncounted_events(name)
     }
     assert sum(each["counted"] for each in found["counts"].values()) > 10
 
@@ -244,7 +244,7 @@ def test_a_relabelling_has_the_counts_of_its_own_report_and_changes_no_other(log
                 counts = found.get(name, {"counted": 0, "television": 0})
                 count = day.count(name)
                 assert counts["counted"] == (0 if count is None else count.labelled), name
-                assert counts["television"] == day.beside_television(name), name
+                assert counts["television"] == day.uncounted_events(name), name
             assert ("yelling" in found) == (labelling == "live")
     finally:
         for layer in layers:
@@ -357,7 +357,7 @@ def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(
         return {
             name: {
                 "counted": day.count(name).labelled,
-                "television": day.beside_television(name),
+                "television": day.uncounted_events(name),
                 "unsure": day.count(name).unsure,
             }
             for name in SOUNDS
@@ -412,7 +412,7 @@ def test_a_sound_that_a_person_marked_counts_beside_a_television_too(logs, capfd
         count = day.count("crying")
         assert (
             after
-            == EventTotal(count.labelled, day.beside_television("crying"), count.unsure)._asdict()
+            == EventTotal(count.labelled, day.uncounted_events("crying"), count.unsure)._asdict()
         )
     finally:
         layer.unlink()

@@ -25,14 +25,14 @@ from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
-from hearthlog.analyzer.bridge.page.doubts import need_look
+from hearthlog.analyzer.bridge.page.doubts import events_to_review
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import (
     Bout,
     ShownBouts,
     bouts,
     events_between,
-    needs_look,
+    needs_review,
     uncounted_ids,
 )
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
@@ -805,11 +805,11 @@ def test_a_telephone_that_may_be_something_else_is_counted_apart_and_needs_no_lo
         Bout([SoundEvent("mic", "phone_ring", start, start + NANOSECONDS, confidence, 1.0)])
         for start, confidence in ((MIDNIGHT, 0.95), (MIDNIGHT + NANOSECONDS, 0.4))
     )
-    assert [needs_look(bout, 0, Sureness()) for bout in (sure, unsure)] == [True, False]
+    assert [needs_review(bout, 0, Sureness()) for bout in (sure, unsure)] == [True, False]
     both = Bout([*sure.events, *unsure.events])
     cough = Bout([sure.first._replace(label="coughing", confidence=0.4)])
-    assert needs_look(both, 0, Sureness())
-    assert needs_look(cough, 0, Sureness())
+    assert needs_review(both, 0, Sureness())
+    assert needs_review(cough, 0, Sureness())
 
 
 SCREAM = 4.0, "music", 0.33, {"coughing": 0.05, "yelling": 0.12}, 48.0
@@ -832,7 +832,11 @@ def test_what_may_be_a_cough_next_to_one_is_no_second_entry_that_needs_a_look():
         shares = {"coughing": 0.33, "crying": 0.0, "yelling": 0.0} | shares
         doubts = {e.id: doubt(e, level, **shares) for e in (before, after, elsewhere)}
         unsure = [before, after, elsewhere]
-        return [unsure.index(e) for e in unsure if e.id in need_look(doubts, unsure, every, hidden)]
+        return [
+            unsure.index(e)
+            for e in unsure
+            if e.id in events_to_review(doubts, unsure, every, hidden)
+        ]
 
     assert looked_at() == [0, 2], "ten seconds and more away, or in another room"
     assert looked_at(yelling=0.2) == [0, 1, 2], "it may be something else"

@@ -18,7 +18,7 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.logs.shown_classes import common_names, common_names_of
-from hearthlog.analyzer.report.report import Period, make_report, read_account
+from hearthlog.analyzer.report.report import Period, make_report, read_report_data
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import BATHROOM, starter_file
 from hearthlog.recorder.config import Settings
@@ -92,8 +92,8 @@ def test_the_page_has_one_lane_of_running_water_and_counts_what_the_report_count
     lanes = {lane["label"]: lane for lane in room["lanes"]}
     assert lanes["running_water"]["words"] == "Running water"
     assert not lanes.keys() & {*WATER}
-    account, _ = read_account(find_home_logs([logs]), Period(DAY, 1, UTC))
-    (day,) = account.days
+    data, _ = read_report_data(find_home_logs([logs]), Period(DAY, 1, UTC))
+    (day,) = data.days
     begun = np.concatenate([day.night_events("running_water"), day.events("running_water")])
     assert lanes["running_water"]["count"] == len({*begun.tolist()}) > 0
     assert words_of("de").class_words("running_water") == "Fließendes Wasser"

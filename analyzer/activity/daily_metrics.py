@@ -96,7 +96,7 @@ class HomeMinutes:
         near_television = np.isin(starts // MINUTE * MINUTE, self.starts[self.television])
         return starts[~near_television | (rows_at(self.reviewed, starts) >= 0)]
 
-    def beside_television(self, name: str) -> int:
+    def uncounted_events(self, name: str) -> int:
         """Count the events of `ON_TELEVISION` classes that `count` leaves out."""
         if name not in ON_TELEVISION or name not in self.events:
             return 0
@@ -303,9 +303,9 @@ class DayMetrics:
         share = _share(self.home.listened.get(name, NONE), self.night)
         return _if_covered(self._count(name, self.night), share)
 
-    def beside_television(self, name: str) -> int:
+    def uncounted_events(self, name: str) -> int:
         """Return the number of events of a class not counted because of a television."""
-        return self.home.minutes.between(self.span).beside_television(name)
+        return self.home.minutes.between(self.span).uncounted_events(name)
 
     def _count(self, name: str, span: Spans) -> Count:
         return self.home.minutes.between(span).count(name, self.home.rates.get(name))

@@ -49,8 +49,8 @@ class DoubtfulSound(NamedTuple):
         """Whether it was much louder than household sounds are."""
         return self.level_db >= _LOUD_DB
 
-    def needs_look(self, hidden: Collection[str] = ()) -> bool:
-        """Whether a person should look at it: it was loud, or is likely coughing or crying."""
+    def needs_review(self, hidden: Collection[str] = ()) -> bool:
+        """Whether a person should review it: it was loud, or is likely coughing or crying."""
         likely = (share >= _LIKELY for name, share in self.shares.items() if name not in hidden)
         return self.label not in hidden and (self.is_loud or any(likely))
 

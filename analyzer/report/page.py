@@ -14,8 +14,8 @@ from hearthlog.analyzer.report.headline import day_headline, week_headline
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
     ASSESSED_ITEMS,
-    Account,
     FigureSection,
+    ReportData,
     ReportFigure,
     apart_figure,
     counted_events,
@@ -25,14 +25,14 @@ from hearthlog.analyzer.report.report_data import (
     television_minutes_of,
 )
 from hearthlog.analyzer.report.summary_text import (
-    gist_of_day,
-    gist_of_week,
     longest_quiet,
-    needing_look,
     not_recorded,
-    not_well,
     percent,
     plain,
+    recorder_problems,
+    sounds_to_review,
+    summarize_day,
+    summarize_week,
 )
 from hearthlog.analyzer.report.timeline import (
     DayTimeline,
@@ -120,50 +120,49 @@ class PageSection(NamedTuple):
     remarks: Sequence[str] = ()
 
 
-def day_page(account: Account) -> str:
+def day_page(data: ReportData) -> str:
     """Return the page of a day."""
-    day = account.days[0]
+    day = data.days[0]
     timeline = timeline_of(day)
     title = day_in_words(day.day)
-    bars = hour_bars(day, account.earlier if account.comparable else [])
+    bars = hour_bars(day, data.earlier if data.comparable else [])
     return _page(
-        account,
+        data,
         PagePicture(f"The sounds of {title}", _description(timeline), [("", timeline)], bars),
         title=title,
         headline=_first_sentence(day_headline(day)),
-        gist=list(gist_of_day(account, day)),
-        overview=[(f"What was heard{_labelled(account)}", _sounds(account, day))],
-        parts=[_part(account, section, day) for section in sections(account.classes)],
+        summary=list(summarize_day(data, day)),
+        overview=[(f"What was heard{_labelled(data)}", _sounds(data, day))],
+        parts=[_part(data, section, day) for section in sections(data.classes)],
     )
 
 
-def week_page(account: Account) -> str:
+def week_page(data: ReportData) -> str:
     """Return the page of a week."""
-    first, last = account.days[0].day, account.days[-1].day
+    first, last = data.days[0].day, data.days[-1].day
     spoken = dates_in_words(first, last)
-    names = [name for name in account.classes if name != SILENCE and _occurs(account, name)]
-    drawn = occurring_classes(account.days)
-    days = [(short_day(day.day), timeline_of(day, drawn)) for day in account.days]
+    names = [name for name in data.classes if name != SILENCE and _occurs(data, name)]
+    drawn = occurring_classes(data.days)
+    days = [(short_day(day.day), timeline_of(day, drawn)) for day in data.days]
     described = " ".join(f"{name}: {_description(each)}" for name, each in days)
     return _page(
-        account,
+        data,
         PagePicture(f"The sounds of {spoken}", described, days),
         title=f"Week {first.isocalendar().week}, {spoken}",
-        headline=_first_sentence(week_headline(account.days)),
-        gist=list(gist_of_week(account)),
+        headline=_first_sentence(week_headline(data.days)),
+        summary=list(summarize_week(data)),
         overview=[
             (
-                f"How often it was heard{_labelled(account)}",
-                _week(account, list(map(event_figure, names))),
+                f"How often it was heard{_labelled(data)}",
+                _week(data, list(map(event_figure, names))),
             ),
             (
                 "How long it was heard, as labelled",
-                _week(account, list(map(apart_figure, names)), has_share=False),
+                _week(data, list(map(apart_figure, names)), has_share=False),
             ),
         ],
         parts=[
-            PageSection(section, _week(account, section.figures))
-            for section in sections(account.classes)
+            PageSection(section, _week(data, section.figures)) for section in sections(data.classes)
         ],
     )
 
@@ -174,9 +173,9 @@ def _first_sentence(headline: str) -> tuple[str, str]:
     return f"{first}{point.strip()}", rest
 
 
-def _labelled(account: Account) -> str:
+def _labelled(data: ReportData) -> str:
     """Return the end of a title above figures that are all as labelled."""
-    return "" if account.checked else ", as labelled"
+    return "" if data.checked else ", as labelled"
 
 
 def _description(timeline: DayTimeline) -> str:
@@ -198,30 +197,30 @@ def _description(timeline: DayTimeline) -> str:
     return text + (f" Not recorded: {', '.join(gaps)}." if gaps else "")
 
 
-def _page(account: Account, picture: PagePicture, **parts: Any) -> str:
-    days = [day for day in (*account.before, *account.days) if day.coverage.length]
-    names = [name for name in account.classes if name not in {SILENCE, UNKNOWN}]
-    absent = [name for name in names if _is_known(account, name) and not _occurs(account, name)]
-    uncertain = [name for name in names if not _is_known(account, name)]
-    uncounted = [name for name in ON_TELEVISION if name in account.classes]
+def _page(data: ReportData, picture: PagePicture, **parts: Any) -> str:
+    days = [day for day in (*data.before, *data.days) if day.coverage.length]
+    names = [name for name in data.classes if name not in {SILENCE, UNKNOWN}]
+    absent = [name for name in names if _is_known(data, name) and not _occurs(data, name)]
+    uncertain = [name for name in names if not _is_known(data, name)]
+    uncounted = [name for name in ON_TELEVISION if name in data.classes]
     return fill_page(
-        account=account,
+        data=data,
         picture=picture,
-        week=len(account.days) > 1,
+        week=len(data.days) > 1,
         default_home=_HOME,
         default_microphone=_MICROPHONE,
-        microphones=listed([plain(name) for name in account.microphones], "and"),
-        alerts=[*needing_look(account), *not_recorded(account), *not_well(account)],
+        microphones=listed([plain(name) for name in data.microphones], "and"),
+        alerts=[*sounds_to_review(data), *not_recorded(data), *recorder_problems(data)],
         absent=_listed(absent),
         uncertain=_listed(uncertain),
-        unknown=_listed(account.unknown),
-        confused=_listed(account.confused),
+        unknown=_listed(data.unknown),
+        confused=_listed(data.confused),
         uncounted=_listed(uncounted),
-        television=_television(account),
-        unsure=any(_is_unsure(account, name) for name in names),
-        scenarios=[(plain(name), _scenario(account, name)) for name in account.scenarios],
+        television=_television(data),
+        unsure=any(_is_unsure(data, name) for name in names),
+        scenarios=[(plain(name), _scenario(data, name)) for name in data.scenarios],
         days_before=BASELINE_DAYS,
-        interrai=_interrai(account, days),
+        interrai=_interrai(data, days),
         interrai_days=ASSESSED_DAYS,
         interrai_covered=_covered_days(days),
         **parts,
@@ -238,31 +237,29 @@ def _covered_days(days: Sequence[DayMetrics]) -> str:
     return f"{len(days)} of them heard" + (f", {partly} only in part" if partly else "")
 
 
-def _television(account: Account) -> str:
+def _television(data: ReportData) -> str:
     """Return a remark on labels during television sound, which are not counted."""
-    amounts = {
-        name: sum(day.beside_television(name) for day in account.days) for name in account.classes
-    }
+    amounts = {name: sum(day.uncounted_events(name) for day in data.days) for name in data.classes}
     return listed([f"{in_words(name).lower()} {n}" for name, n in amounts.items() if n], "and")
 
 
-def _scenario(account: Account, name: str) -> PageTable:
+def _scenario(data: ReportData, name: str) -> PageTable:
     """Return the minutes of each class of a scenario, a row per class, a column per day."""
-    days = account.scenarios[name]
+    days = data.scenarios[name]
     classes = ordered(sorted({label for day in days for label in day}))
     rows = [
         [
             Cell(in_words(label), colour=colour_on_paper(label)),
             *(
                 Cell(_scenario_text(found.get(label, 0.0), day), unbroken=True)
-                for found, day in zip(days, account.days, strict=True)
+                for found, day in zip(days, data.days, strict=True)
             ),
         ]
         for label in classes
     ]
     if len(days) == 1:
         return PageTable(["Sound", "How long, as labelled"], rows)
-    return PageTable(["Sound", *_day_heads(account)], rows, "wide")
+    return PageTable(["Sound", *_day_heads(data)], rows, "wide")
 
 
 def _scenario_text(minutes: float, day: DayMetrics) -> str:
@@ -270,19 +267,19 @@ def _scenario_text(minutes: float, day: DayMetrics) -> str:
     return Duration(minutes).text if minutes or day.share >= MOST else _NOTHING
 
 
-def _sounds(account: Account, day: DayMetrics) -> PageTable:
+def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
     """Return how often, when and how long each class was heard."""
-    labelled = ", as labelled" * account.checked  # else the title of the table has it
+    labelled = ", as labelled" * data.checked  # else the title of the table has it
     heads = ["Sound", "How often", f"When{labelled}", f"How long{labelled}"]
     rows = []
-    for name in account.classes:
+    for name in data.classes:
         figure = event_figure(name)
         lasting = (minutes_figure if name == SILENCE else apart_figure)(name)
-        value, uncounted = figure.value(day), day.beside_television(name)
+        value, uncounted = figure.value(day), day.uncounted_events(name)
         if name == SILENCE:
-            cells = [Cell(""), Cell(""), _cell(account, lasting, day)]
-        elif _occurs(account, name) and (value is not None or uncounted):
-            cell = _cell(account, figure, day)
+            cells = [Cell(""), Cell(""), _cell(data, lasting, day)]
+        elif _occurs(data, name) and (value is not None or uncounted):
+            cell = _cell(data, figure, day)
             notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{uncounted}"] * bool(uncounted) + [
                 cell.note
             ] * bool(cell.note)
@@ -290,14 +287,14 @@ def _sounds(account: Account, day: DayMetrics) -> PageTable:
             cells = [
                 cell._replace(note=", ".join(notes)),
                 Cell(_times(day, starts)),
-                _with_television(_cell(account, lasting, day), name, day),
+                _with_television(_cell(data, lasting, day), name, day),
             ]
         else:
             continue
-        right = [Cell(account.rightness(name))] * account.checked
+        right = [Cell(data.accuracy_text(name))] * data.checked
         rows.append([Cell(in_words(name), colour=colour_on_paper(name)), *cells, *right])
-    kind = "sounds stack" if account.checked else "sounds"  # five columns are too many for a phone
-    return PageTable([*heads, *["Right here"] * account.checked], rows, kind)
+    kind = "sounds stack" if data.checked else "sounds"  # five columns are too many for a phone
+    return PageTable([*heads, *["Right here"] * data.checked], rows, kind)
 
 
 def _with_television(cell: Cell, name: str, day: DayMetrics) -> Cell:
@@ -305,12 +302,12 @@ def _with_television(cell: Cell, name: str, day: DayMetrics) -> Cell:
     minutes = television_minutes_of(day, name)
     if minutes < 1:
         return cell
-    notes = [*[cell.note] * bool(cell.note), _beside(minutes)]
+    notes = [*[cell.note] * bool(cell.note), _television_note(minutes)]
     text = "none" if cell.text == Duration().text else cell.text
     return cell._replace(text=text, note=", ".join(notes))
 
 
-def _beside(minutes: float) -> str:
+def _television_note(minutes: float) -> str:
     return f"+{_SPACE}{Duration(minutes).text.replace(' ', _SPACE)} beside a television"
 
 
@@ -323,28 +320,28 @@ def _times(day: DayMetrics, starts: Int64) -> str:
     )
 
 
-def _occurs(account: Account, name: str) -> bool:
+def _occurs(data: ReportData, name: str) -> bool:
     """Return whether a class has a value, now or in its usual range."""
-    baseline = account.baseline(event_figure(name))
-    values = [day.count(name) for day in account.days]
-    uncounted = any(day.beside_television(name) for day in account.days)
+    baseline = data.baseline(event_figure(name))
+    values = [day.count(name) for day in data.days]
+    uncounted = any(day.uncounted_events(name) for day in data.days)
     now = any(value and value.labelled for value in values)
     return uncounted or now or bool(baseline and baseline[0].highest)
 
 
-def _is_unsure(account: Account, name: str) -> bool:
+def _is_unsure(data: ReportData, name: str) -> bool:
     """Whether the page shows how many events of a class are not sure."""
-    counts = [count for day in account.days if (count := day.count(name)) is not None]
+    counts = [count for day in data.days if (count := day.count(name)) is not None]
     return any(count.unsure and count.range is None for count in counts)
 
 
-def _is_known(account: Account, name: str) -> bool:
+def _is_known(data: ReportData, name: str) -> bool:
     """Whether enough was recorded on some of the days to tell how often a class was heard."""
-    return any(day.count(name) is not None or day.beside_television(name) for day in account.days)
+    return any(day.count(name) is not None or day.uncounted_events(name) for day in data.days)
 
 
 def _cell(
-    account: Account, figure: ReportFigure, day: DayMetrics, *, is_alone: bool = False
+    data: ReportData, figure: ReportFigure, day: DayMetrics, *, is_alone: bool = False
 ) -> Cell:
     """Return a figure, how it differs, and its usual range if there is a baseline.
 
@@ -352,22 +349,22 @@ def _cell(
     """
     value = figure.value(day)
     text = _text(value)
-    if is_alone and account.checked and not _is_checked(value):
+    if is_alone and data.checked and not _is_checked(value):
         text += ", as labelled"
-    if not account.comparable:
+    if not data.comparable:
         return Cell(text, unbroken=True)
-    usual = account.usually(figure)
+    usual = data.usually(figure)
     note = f"usually {usual}" if usual else ""
-    return Cell(text, account.change(figure, day), unbroken=True, note=note)
+    return Cell(text, data.change(figure, day), unbroken=True, note=note)
 
 
 def _text(value: Value | None) -> str:
     return _NOTHING if value is None else value.text
 
 
-def _part(account: Account, section: FigureSection, day: DayMetrics) -> PageSection:
+def _part(data: ReportData, section: FigureSection, day: DayMetrics) -> PageSection:
     known = [figure for figure in section.figures if figure.value(day) is not None]
-    rows = [[Cell(figure.title), _cell(account, figure, day, is_alone=True)] for figure in known]
+    rows = [[Cell(figure.title), _cell(data, figure, day, is_alone=True)] for figure in known]
     remarks = [*_remarks(section, day)]
     if len(known) < len(section.figures):
         more = "more" if known else "anything"
@@ -405,38 +402,38 @@ def _coughing(day: DayMetrics) -> str:
 
 
 def _week(
-    account: Account, figures: Sequence[ReportFigure], *, has_share: bool = True
+    data: ReportData, figures: Sequence[ReportFigure], *, has_share: bool = True
 ) -> PageTable:
     """Return the figures of seven days, a column for each, and their total.
 
     The first row is the share of each day that was recorded, unless another table has it.
     """
-    shares = [_share(figures, day) for day in account.days]
+    shares = [_share(figures, day) for day in data.days]
     recorded = [Cell(percent(share) if share else _NOTHING) for share in shares]
     rows = [[Cell("Recorded"), *recorded, Cell("")]] if has_share else []
     for figure in figures:
-        values = [figure.value(day) if day.coverage.length else None for day in account.days]
-        uncounted = [day.beside_television(figure.name) * figure.counts for day in account.days]
-        usual = _dense(account.usually(figure)) if account.comparable else ""
+        values = [figure.value(day) if day.coverage.length else None for day in data.days]
+        uncounted = [day.uncounted_events(figure.name) * figure.counts for day in data.days]
+        usual = _dense(data.usually(figure)) if data.comparable else ""
         notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{sum(uncounted)}"] * any(uncounted)
         notes += [f"usually {usual} a day"] * bool(usual)
         if figure.is_apart:
-            beside = sum(television_minutes_of(day, figure.name) for day in account.days)
-            length = Duration(beside).text.replace(" ", _SPACE)
-            notes += [f"television:{_SPACE}{length}"] * (beside >= 1)
+            minutes = sum(television_minutes_of(day, figure.name) for day in data.days)
+            length = Duration(minutes).text.replace(" ", _SPACE)
+            notes += [f"television:{_SPACE}{length}"] * (minutes >= 1)
         colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(
             [
                 Cell(figure.short, colour=colour, note=", ".join(notes)),
                 *map(Cell, map(_short, values)),
-                Cell(_total(account.days, figure)),
+                Cell(_total(data.days, figure)),
             ]
         )
-    return PageTable(["", *_day_heads(account), "All"], rows, "wide")
+    return PageTable(["", *_day_heads(data), "All"], rows, "wide")
 
 
-def _day_heads(account: Account) -> list[str]:
-    return [short_day(day.day).rpartition(" ")[0] for day in account.days]
+def _day_heads(data: ReportData) -> list[str]:
+    return [short_day(day.day).rpartition(" ")[0] for day in data.days]
 
 
 def _share(figures: Sequence[ReportFigure], day: DayMetrics) -> float:
@@ -473,22 +470,22 @@ def _sum(values: Sequence[Value | None]) -> Count | Duration | None:
     return total if total.middle or len(known) >= MOST * len(values) else None
 
 
-def _interrai(account: Account, days: Sequence[DayMetrics]) -> PageTable:
+def _interrai(data: ReportData, days: Sequence[DayMetrics]) -> PageTable:
     """Return the interRAI items that sound can inform, as far as they are known."""
     rows = []
     for item in ASSESSED_ITEMS:
         number = _sum([item.value(day) for day in days])
-        if number is None or item.needs not in ("", *account.classes):
+        if number is None or item.needs not in ("", *data.classes):
             continue
         text = _text(number)
-        if account.checked and not _is_checked(number):
+        if data.checked and not _is_checked(number):
             text += ", as labelled"
-        beside = 0.0
+        minutes = 0.0
         if isinstance(number, Duration) and item.needs:
-            beside = sum(television_minutes_of(day, item.needs) for day in days)
-        cell = Cell(text, note=_beside(beside) if beside >= 1 else "")
+            minutes = sum(television_minutes_of(day, item.needs) for day in days)
+        cell = Cell(text, note=_television_note(minutes) if minutes >= 1 else "")
         rows.append([Cell(item.topic), Cell(item.sounds), cell, Cell(item.limits)])
-    count = "Count" if account.checked else "Count, as labelled"
+    count = "Count" if data.checked else "Count, as labelled"
     heads = ["The form asks about", "Heard here", count, "What sound cannot tell"]
     return PageTable(heads, rows, "stack")
 

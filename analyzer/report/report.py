@@ -40,7 +40,7 @@ from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import Spans, common, joined, rows_at
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
-from hearthlog.analyzer.report.report_data import Account
+from hearthlog.analyzer.report.report_data import ReportData
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.files import RELABEL_LAYER
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
@@ -95,23 +95,23 @@ def make_report(  # noqa: PLR0913
     paths = [page] if draw is None else [page, picture]
     for path in paths:
         check_new(path)
-    account, losses = read_account(logs, period, labelling, progress, now)
-    text = day_page(account) if period.days == 1 else week_page(account)
+    data, losses = read_report_data(logs, period, labelling, progress, now)
+    text = day_page(data) if period.days == 1 else week_page(data)
     with ExitStack() as files:
         html, *png = [files.enter_context(new_file(path)) for path in paths]
         html.write_text(text, "utf-8")
         if draw is not None:
-            draw(png[0], account.days, account.earlier)
+            draw(png[0], data.days, data.earlier)
     return WrittenReport(page, None if draw is None else picture, losses)
 
 
-def read_account(
+def read_report_data(
     logs: HomeLogs,
     period: Period,
     labelling: str = LIVE,
     progress: Progress = ignore_progress,
     now: int | None = None,
-) -> tuple[Account, Sequence[str]]:
+) -> tuple[ReportData, Sequence[str]]:
     """Read the data of a page, and the read errors.
 
     Raise `DataError` and `LogError` as `make_report` does.
@@ -122,37 +122,37 @@ def read_account(
     close = day_span(days[0], zone)[0], day_span(days[-1], zone)[1]
     earlier = [first - timedelta(days=number) for number in range(BASELINE_DAYS, 0, -1)]
     since = midnight(earlier[0] - timedelta(days=1), zone)  # for the night that ends on that day
-    data = read_home(logs, labelling, since, close, progress)
+    home = read_home(logs, labelling, since, close, progress)
     model = _model(logs, close) if labelling == LIVE else ""
-    checks = read_checked_minutes(logs, labelling, since, close[1], data.losses).of_model(model)
-    metrics = metrics_of_home(data, checks)
-    routines = Routines(Profiles(home_sound(data, metrics), zone, night_after=False))
+    checks = read_checked_minutes(logs, labelling, since, close[1], home.losses).of_model(model)
+    metrics = metrics_of_home(home, checks)
+    routines = Routines(Profiles(home_sound(home, metrics), zone, night_after=False))
     past = [day_of(metrics, day, zone) for day in earlier]
     now = time.time_ns() if now is None else now
     shown = [day_of(metrics, day, zone, now) for day in days]
     span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
-    account = Account(
-        nodes=data.nodes,
-        microphones=sorted({microphone for _, microphone in data.segments}),
+    data = ReportData(
+        nodes=home.nodes,
+        microphones=sorted({microphone for _, microphone in home.segments}),
         labelling=labelling,
         zone=zone,
         days=shown,
         before=past[-(ASSESSED - 1) :],
         earlier=[day for day in past if any(map(day.comparable, metrics.classes))],
         judged={day: routines.judge(day) for day in days},
-        beside={day: len(routines.earlier(day)) for day in days},
-        uncovered=_unrecorded(data, [day.over for day in shown]),
-        gaps=_within(data.gaps, span),
-        troubles=_within(data.troubles, span),
-        doubts=_doubts(logs, data, labelling, shown),
+        baseline_days={day: len(routines.earlier(day)) for day in days},
+        uncovered=_unrecorded(home, [day.over for day in shown]),
+        gaps=_within(home.gaps, span),
+        troubles=_within(home.troubles, span),
+        doubts=_doubts(logs, home, labelling, shown),
         checks=checks,
         model=model,
-        scenarios=_scenarios(logs, days, zone, data) if labelling == LIVE else {},
-        unread=len(data.losses),
+        scenarios=_scenarios(logs, days, zone, home) if labelling == LIVE else {},
+        unread=len(home.losses),
         networks=network_changes(logs.between(since, close[1]), zone),
-        hidden=data.hidden,
+        hidden=home.hidden,
     )
-    return account, data.losses
+    return data, home.losses
 
 
 def _model(logs: HomeLogs, close: tuple[int, int]) -> str:
@@ -162,9 +162,9 @@ def _model(logs: HomeLogs, close: tuple[int, int]) -> str:
 
 
 def _doubts(
-    logs: HomeLogs, data: HomeData, labelling: str, days: Sequence[DayMetrics]
+    logs: HomeLogs, home: HomeData, labelling: str, days: Sequence[DayMetrics]
 ) -> list[DoubtfulSound]:
-    """Return the doubtful sounds of the days that need a look: none beside a television."""
+    """Return the doubtful sounds of the days that need review: none while a television is on."""
     start, end = int(days[0].span.starts[0]), int(days[-1].span.ends[0])
     close, name, layer = logs.between(start, end), LIVE, list[HomeLog]()
     if labelling != LIVE:
@@ -172,30 +172,30 @@ def _doubts(
     known = [day.home.minutes for day in days]
     television = np.concatenate([each.starts[each.television] for each in known])
     found: list[DoubtfulSound] = []
-    for (node, microphone), labels in data.labelled.items():
+    for (node, microphone), labels in home.labelled.items():
         events = doubtful_events(labels)
         own = (events.starts >= start) & (events.starts < end)
         own &= ~np.isin(events.starts // MINUTE * MINUTE, television)
         own &= rows_at(known[0].reviewed, events.starts) < 0
-        own &= ~np.isin(events.labels, [*data.hidden])
+        own &= ~np.isin(events.labels, [*home.hidden])
         entries = [(e.path, e.start, e.end) for e in (*close, *layer) if e.node == node]
         topics = labelling_topic(microphone, name, "label"), f"/{microphone}/features"
         found += read_doubtful_sounds(entries, topics, events.rows(own))
-    return [sound for sound in found if sound.needs_look(data.hidden)]
+    return [sound for sound in found if sound.needs_review(home.hidden)]
 
 
 def _scenarios(
-    logs: HomeLogs, days: Sequence[date], zone: tzinfo, data: HomeData
+    logs: HomeLogs, days: Sequence[date], zone: tzinfo, home: HomeData
 ) -> ScenarioMinutes:
     spans = [day_span(day, zone) for day in days]
-    return read_scenario_minutes(logs, spans, data.lose, data.hidden)
+    return read_scenario_minutes(logs, spans, home.lose, home.hidden)
 
 
-def _unrecorded(data: HomeData, days: Sequence[Spans]) -> dict[str, float]:
+def _unrecorded(home: HomeData, days: Sequence[Spans]) -> dict[str, float]:
     """Return the hours of some days without coverage of each microphone."""
     length = sum(day.length for day in days)
     hours: dict[str, float] = {}
-    for (_, microphone), segments in data.segments.items():
+    for (_, microphone), segments in home.segments.items():
         covered = joined(segments.starts, segments.ends)
         own = sum(common(covered, day).length for day in days)
         hours[microphone] = max(hours.get(microphone, 0.0), (length - own) / HOUR)

@@ -179,7 +179,7 @@ _CHANGES = {
 
 
 @dataclass(frozen=True)
-class Account:
+class ReportData:
     """Data of a page."""
 
     nodes: Sequence[str]
@@ -190,11 +190,11 @@ class Account:
     before: Sequence[DayMetrics]  # preceding days for three-day items
     earlier: Sequence[DayMetrics]  # baseline days
     judged: Mapping[date, DayAnomaly | None]  # of `days`: anomaly of each, if known
-    beside: Mapping[date, int]  # of `days`: number of baseline days
+    baseline_days: Mapping[date, int]  # of `days`: number of baseline days
     uncovered: Mapping[str, float]  # by microphone: hours without coverage
     gaps: Sequence[Trouble]
     troubles: Sequence[Trouble]
-    doubts: Sequence[DoubtfulSound]  # of `days`: those that need a look
+    doubts: Sequence[DoubtfulSound]  # of `days`: those that need review
     checks: CheckedMinutes  # randomly drawn, reviewed minutes of these weeks
     model: str  # SHA-256 of the model that labelled the days; empty if unknown
     scenarios: ScenarioMinutes  # of `days`; live labels only
@@ -235,7 +235,7 @@ class Account:
         """Number of checked minutes labelled by another model."""
         return sum(model != self.model for model in self.checks.models)
 
-    def rightness(self, name: str) -> str:
+    def accuracy_text(self, name: str) -> str:
         """Return the accuracy of a class in the checked minutes: `3 of 4, missed 1`.
 
         Empty for silence and `unknown`, since neither is a sound that can be counted as correct or

@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import joined, without
 from hearthlog.analyzer.report.headline import amount, states_missing_time
-from hearthlog.analyzer.report.report_data import Account, television_spans
+from hearthlog.analyzer.report.report_data import ReportData, television_spans
 from hearthlog.analyzer.report.wording import (
     WEEK,
     clock_text,
@@ -42,33 +42,33 @@ _HALF = 0.5  # hours
 _MORNING, _MIDNIGHT = 4 * 60 + 30, 23 * 60 + 30  # minutes
 
 
-def gist_of_day(account: Account, day: DayMetrics) -> Iterator[str]:
+def summarize_day(data: ReportData, day: DayMetrics) -> Iterator[str]:
     """Summarise a day in a few sentences, compared with earlier days."""
     if states_missing_time(day):  # and what sounded
-        yield _off_for_the_rest(account)
+        yield _off_for_the_rest(data)
     else:
         is_partly = day.missing.length >= _MINUTE  # `not_recorded` says so
         complete = "Recorded until then." if day.coming else "The whole day was recorded."
         yield f"{'' if is_partly else complete} {_loudest(day)}".strip()
     yield _television(day)
-    if account.comparable:
-        yield _changes(account, day)
+    if data.comparable:
+        yield _changes(data, day)
     if day.night_hours:
         yield _night(day)
     yield _still(day)
 
 
-def gist_of_week(account: Account) -> Iterator[str]:
+def summarize_week(data: ReportData) -> Iterator[str]:
     """Summarise a week in a few sentences, compared with earlier days."""
-    days = [day for day in account.days if day.coverage.length]
-    share = sum(day.coverage.length for day in days) / sum(day.span.length for day in account.days)
-    yield f"Recorded: {len(days)} of {len(account.days)} days, {percent(share)} of the time."
-    if not account.comparable:
+    days = [day for day in data.days if day.coverage.length]
+    share = sum(day.coverage.length for day in days) / sum(day.span.length for day in data.days)
+    yield f"Recorded: {len(days)} of {len(data.days)} days, {percent(share)} of the time."
+    if not data.comparable:
         return
-    if max(account.beside.values()) < FEWEST:
-        yield too_few_text(max(account.beside.values()))
+    if max(data.baseline_days.values()) < FEWEST:
+        yield too_few_text(max(data.baseline_days.values()))
         return
-    judgements = [(day.day, judged) for day in days if (judged := account.judged[day.day])]
+    judgements = [(day.day, judged) for day in days if (judged := data.judged[day.day])]
     unusual = [(day, judged) for day, judged in judgements if judged.once_in >= WEEK]
     if not unusual:
         yield f"None of the {len(judgements)} days that can be judged was unlike those before it."
@@ -76,14 +76,14 @@ def gist_of_week(account: Account) -> Iterator[str]:
         yield f"{short_day(day)}: {judgement_text(judged)}"
 
 
-def needing_look(account: Account) -> Iterator[str]:
+def sounds_to_review(data: ReportData) -> Iterator[str]:
     """Yield the times of loud or possibly worrying sounds that the model is not sure of.
 
     `Needs a look, 14:02 and 14:05: loud, and the model is not sure; it might be shouting.` At most
     five times, the loud ones first.
     """
     runs: list[list[DoubtfulSound]] = []
-    for sound in sorted(account.doubts, key=lambda sound: sound.start):
+    for sound in sorted(data.doubts, key=lambda sound: sound.start):
         if runs and sound.start <= runs[-1][-1].end + _BREAK:
             runs[-1].append(sound)
         else:
@@ -91,11 +91,11 @@ def needing_look(account: Account) -> Iterator[str]:
     shown = sorted(runs, key=lambda run: -max(sound.level_db for sound in run))[:_MOST_DOUBTS]
     lines: dict[str, list[str]] = {}
     for run in sorted(shown, key=lambda run: run[0].start):
-        labels = perhaps(run, account.hidden) or _labels_of(run)
+        labels = perhaps(run, data.hidden) or _labels_of(run)
         names = [in_words(name).lower() for name in labels]
         text = "the model is not sure" + (f"; it might be {listed(names, 'or')}" if names else "")
         loud = "loud, and " if any(sound.is_loud for sound in run) else ""
-        lines.setdefault(loud + text, []).append(_clocks(account, run[0].start, run[-1].end))
+        lines.setdefault(loud + text, []).append(_clocks(data, run[0].start, run[-1].end))
     for text, times in lines.items():
         yield f"Needs a look, {listed(times, 'and')}: {text}."
 
@@ -109,48 +109,48 @@ def _labels_of(sounds: Iterable[DoubtfulSound]) -> list[str]:
     return [label for label, _ in lengths.most_common(_MOST_LABELS)]
 
 
-def not_recorded(account: Account) -> Iterator[str]:
+def not_recorded(data: ReportData) -> Iterator[str]:
     """Yield a sentence or two on missing coverage, if any, and its reasons.
 
     The total comes first, unless the headline has it.
     """
-    length = sum(day.over.length for day in account.days)
-    missing = sum(day.missing.length for day in account.days)
-    is_stated = len(account.days) == 1 and states_missing_time(account.days[0])
+    length = sum(day.over.length for day in data.days)
+    missing = sum(day.missing.length for day in data.days)
+    is_stated = len(data.days) == 1 and states_missing_time(data.days[0])
     if missing >= _MINUTE and not is_stated:
         text = Duration(missing / _MINUTE).text
         share = percent(missing / length)
         yield f"Not recorded: {text} ({share}). The report knows nothing about that time."
-    for microphone, hours in account.uncovered.items():
+    for microphone, hours in data.uncovered.items():
         if hours * HOUR > missing + _MINUTE:  # another microphone covers this time
             text = Duration(hours * 60).text
             yield f"The microphone {plain(microphone)} did not record for {text}."
-    unexplained = _unexplained(account)
+    unexplained = _unexplained(data)
     is_explained = missing - unexplained >= _MINUTE
     if unexplained >= _MINUTE and (is_explained or not is_stated):
         text = Duration(unexplained / _MINUTE).text
         which = f"for {text} of the time not recorded" if is_explained else "then"
         yield f"The recorder was off {which}, or its logs are not here."
-    for reason, same in _by_lasting(account.gaps, lambda gap: gap.text):
-        yield f"{reason[:1].upper()}{reason[1:]}: {_when(account, same)}."
-    if account.unread:
-        logs = "1 log" if account.unread == 1 else f"{account.unread} logs"
+    for reason, same in _by_lasting(data.gaps, lambda gap: gap.text):
+        yield f"{reason[:1].upper()}{reason[1:]}: {_when(data, same)}."
+    if data.unread:
+        logs = "1 log" if data.unread == 1 else f"{data.unread} logs"
         yield f"{logs} could not be read, or only in part."
-    for line in account.networks:
+    for line in data.networks:
         yield f"{plain(line)}."
 
 
-def not_well(account: Account) -> Iterator[str]:
+def recorder_problems(data: ReportData) -> Iterator[str]:
     """Yield the troubles reported by the recorder that gaps do not explain.
 
     If there are any, an introduction, then a line for each kind of trouble, the longest first.
     """
-    reported = {gap.text for gap in account.gaps}
-    troubles = [trouble for trouble in account.troubles if trouble.text not in reported]
+    reported = {gap.text for gap in data.gaps}
+    troubles = [trouble for trouble in data.troubles if trouble.text not in reported]
     if troubles:
         yield "The box reported problems; have it checked if this goes on."
     for name, same in _by_lasting(troubles, lambda t: f"{t.source.split(': ')[-1]}: {t.text}"):
-        yield f"{plain(name)}: {_when(account, same)}."
+        yield f"{plain(name)}: {_when(data, same)}."
 
 
 def longest_quiet(day: DayMetrics) -> str:
@@ -174,12 +174,12 @@ def plain(name: str) -> str:
     return name.replace("_", " ")
 
 
-def _off_for_the_rest(account: Account) -> str:
+def _off_for_the_rest(data: ReportData) -> str:
     """Return why the time missing in the headline was not recorded, if no gap explains it."""
-    missing = sum(day.missing.length for day in account.days)
-    if missing < _MINUTE or missing - _unexplained(account) >= _MINUTE:
+    missing = sum(day.missing.length for day in data.days)
+    if missing < _MINUTE or missing - _unexplained(data) >= _MINUTE:
         return ""
-    rest = "Then" if account.days[0].coming else "In the rest of the day"
+    rest = "Then" if data.days[0].coming else "In the rest of the day"
     return f"{rest} the recorder was off, or its logs are not here."
 
 
@@ -223,12 +223,12 @@ def _still(day: DayMetrics) -> str:
     return f"Hardly any sound was labelled {times}{recorded}; {steady}." if times else ""
 
 
-def _changes(account: Account, day: DayMetrics) -> str:
-    judged = account.judged[day.day]
+def _changes(data: ReportData, day: DayMetrics) -> str:
+    judged = data.judged[day.day]
     if judged is not None:
         return judgement_text(judged)
-    if account.beside[day.day] < FEWEST:
-        return too_few_text(account.beside[day.day])
+    if data.baseline_days[day.day] < FEWEST:
+        return too_few_text(data.baseline_days[day.day])
     return "Too little was recorded to compare it with other days."
 
 
@@ -249,12 +249,12 @@ def _night(day: DayMetrics) -> str:
     return f"In the night, 22:00 to 07:00, as labelled: {', '.join(parts)}.{partly}"
 
 
-def _unexplained(account: Account) -> int:
+def _unexplained(data: ReportData) -> int:
     """Return the missing coverage without a gap message, in nanoseconds."""
-    starts = np.array([gap.start for gap in account.gaps], np.int64)
-    ends = np.array([gap.end for gap in account.gaps], np.int64)
+    starts = np.array([gap.start for gap in data.gaps], np.int64)
+    ends = np.array([gap.end for gap in data.gaps], np.int64)
     explained = joined(starts, ends)
-    missing = (without(day.missing, explained) for day in account.days)
+    missing = (without(day.missing, explained) for day in data.days)
     return sum(spans.length for spans in missing)
 
 
@@ -272,18 +272,18 @@ def _lasting(troubles: Sequence[Trouble]) -> int:
     return sum(trouble.end - trouble.start for trouble in troubles)
 
 
-def _when(account: Account, troubles: Sequence[Trouble]) -> str:
+def _when(data: ReportData, troubles: Sequence[Trouble]) -> str:
     """Return time and duration of troubles: `12 min, once (03:10 to 03:22)`."""
     how_often = "once" if len(troubles) == 1 else f"{len(troubles)} times"
     first = sorted(troubles, key=lambda trouble: trouble.start)[:3]
-    shown = [_clocks(account, trouble.start, trouble.end) for trouble in first]
+    shown = [_clocks(data, trouble.start, trouble.end) for trouble in first]
     more = " …" if len(troubles) > len(shown) else ""
     length = Duration(_lasting(troubles) / _MINUTE).text
     return f"{length}, {how_often} ({', '.join(shown)}{more})"
 
 
-def _clocks(account: Account, start: int, end: int) -> str:
+def _clocks(data: ReportData, start: int, end: int) -> str:
     """Format a time span: `03:10 to 03:22`, in a week with its day."""
-    times = dict.fromkeys(clock_text(time, account.zone) for time in (start, end))
-    day = local_time(start, account.zone).date()
-    return (f"{short_day(day)} " if len(account.days) > 1 else "") + " to ".join(times)
+    times = dict.fromkeys(clock_text(time, data.zone) for time in (start, end))
+    day = local_time(start, data.zone).date()
+    return (f"{short_day(day)} " if len(data.days) > 1 else "") + " to ".join(times)

@@ -33,10 +33,10 @@ from hearthlog.analyzer.logs.spans import NONE, Spans, common, cut, joined, leng
 from hearthlog.analyzer.logs.summary import summarise
 from hearthlog.analyzer.report.headline import LIVELY_MINUTES
 from hearthlog.analyzer.report.page import day_page
-from hearthlog.analyzer.report.report import Period, read_account
+from hearthlog.analyzer.report.report import Period, read_report_data
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_ITEMS,
-    Account,
+    ReportData,
     apart_figure,
     minutes_figure,
     sections,
@@ -213,7 +213,7 @@ def _time(day: DayMetrics, clock: str) -> int:
 
 
 def report_statements(
-    account: Account, truth: TrueDay, before: Sequence[TrueDay]
+    data: ReportData, truth: TrueDay, before: Sequence[TrueDay]
 ) -> Iterator[Statement]:
     """Yield the statements of the report of a day.
 
@@ -222,7 +222,7 @@ def report_statements(
     before : sequence of TrueDay
         The days before, as far as they are heard, for the assessment of three days.
     """
-    day, page = account.days[0], _Page(day_page(account))
+    day, page = data.days[0], _Page(day_page(data))
     for kind, text in page.paragraphs:
         yield from _paragraph(kind, text, day, truth)
     figures = {
@@ -619,8 +619,8 @@ def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
     before: list[TrueDay] = []
     sureness = read_sureness(logs, 0, entries[-1].start + 24 * HOUR)
     for day in logs.days(UTC):
-        account, _ = read_account(logs, Period(day, 1, UTC))
-        labelled = account.days[0]
+        data, _ = read_report_data(logs, Period(day, 1, UTC))
+        labelled = data.days[0]
         if labelled.share < 0.75:
             continue
         truth = true_day(sounds, labelled)
@@ -632,7 +632,7 @@ def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
         yield (
             day,
             [
-                *report_statements(account, truth, before[-2:]),
+                *report_statements(data, truth, before[-2:]),
                 *page_statements(page, truth, sureness),
                 *info_statements(own, sounds, labelled),
             ],

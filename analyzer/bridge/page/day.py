@@ -234,7 +234,7 @@ def _lane(
     of_day = [event for own in of_parts for event in own]
     count = len(of_day) if of_day or None not in counts else None
     uncounted = sorted({*events} - {*counted})
-    beside = sum(e.start >= day.start for e in uncounted)
+    uncounted_today = sum(e.start >= day.start for e in uncounted)
     of_last_days = [event for event in counted if event.start >= day.start - 24 * _HOUR]
     last = (of_last_days if home.is_past and of_last_days else [None, *sounds.counted])[-1]
     at = "" if last is None else home.when(last.end)
@@ -242,8 +242,8 @@ def _lane(
     often = words.text("count.not known") if count is None else words.times(count)
     key = "lane of a day" if home.is_past else "lane and last" if count else "lane"
     description = words.text(key, **{"class": name, "times": often, "last": at})
-    if beside:
-        times = words.times(beside)
+    if uncounted_today:
+        times = words.times(uncounted_today)
         description = words.text("lane beside", told=description, times=times)
     return {
         "label": label,

@@ -65,13 +65,13 @@ def read_doubts(
     return found
 
 
-def need_look(
+def events_to_review(
     doubts: Doubts,
     events: Iterable[SoundEvent],
     every: Iterable[SoundEvent],
     hidden: Collection[str] = (),
 ) -> Doubts:
-    """Return the doubts on some events that need a look of their own.
+    """Return the doubts on some events that need a review of their own.
 
     A sound that is not loud needs none if all it may be sounded just before or after it: were it
     of that class, both would be one event.
@@ -92,7 +92,7 @@ def need_look(
     return {
         event.id: doubt
         for event, doubt in own
-        if doubt.needs_look(hidden) and not is_part(event, doubt)
+        if doubt.needs_review(hidden) and not is_part(event, doubt)
     }
 
 

@@ -18,7 +18,7 @@ from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import News
 from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
-from hearthlog.analyzer.bridge.page.doubts import CurrentDoubts, doubtful, need_look
+from hearthlog.analyzer.bridge.page.doubts import CurrentDoubts, doubtful, events_to_review
 from hearthlog.analyzer.bridge.page.past_days import PastDay, PastDays
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
@@ -28,7 +28,7 @@ from hearthlog.analyzer.bridge.page.sounds import (
     ShownBouts,
     bouts,
     events_between,
-    needs_look,
+    needs_review,
     uncounted_ids,
 )
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scenario_lines
@@ -180,7 +180,9 @@ class HomePage:
             every = events_between(microphones, first, news.today.now + _DAY)
             self._events = {event.id: event for event in every}
             self._doubtful = doubtful(microphones, every)
-            folded = bouts(every, need_look(doubts, self._doubtful, every, news.state.never_tell))
+            folded = bouts(
+                every, events_to_review(doubts, self._doubtful, every, news.state.never_tell)
+            )
             self._bouts = {bout.first.id: bout for bout in folded}
             self._uncounted = uncounted_ids(microphones, every)
         self._doubts.update(self._doubtful, news.today.now)
@@ -239,12 +241,12 @@ class HomePage:
         }
 
     def _latest(self) -> list[Bout]:
-        """Return the newest bouts that need a look, and the newest others."""
+        """Return the newest bouts that need review, and the newest others."""
         left = {True: _MOST_LOOKED_AT, False: _MOST_OTHERS}
         found = []
         for bout in self._bouts.values():
             uncounted = sum(event.id in self._uncounted for event in bout.events)
-            look = needs_look(bout, uncounted, self._sureness)
+            look = needs_review(bout, uncounted, self._sureness)
             if left[look]:
                 left[look] -= 1
                 found.append(bout)
@@ -334,7 +336,7 @@ class HomePage:
     def _past_bouts(self, day: PastDay, events: Sequence[SoundEvent]) -> list[Bout]:
         microphones, hidden = day.state.microphones.values(), self._state.never_tell
         unsure = doubtful(microphones, events)
-        return bouts(events, need_look(day.doubts, unsure, events, hidden))
+        return bouts(events, events_to_review(day.doubts, unsure, events, hidden))
 
     def _mark(self, identifier: str, text: str, words: Words, *, is_single: bool) -> str:
         bout = None if is_single else self._bouts.get(identifier)

@@ -1,4 +1,4 @@
-"""List of sounds on the page: events of one class folded, what needs a look, and their sound."""
+"""List of sounds on the page: events of one class folded, what needs review, and their sound."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -45,7 +45,7 @@ class Bout(NamedTuple):
     """
 
     events: Sequence[SoundEvent]  # the oldest first; its id is that of the bout
-    doubts: Sequence[DoubtfulSound] = ()  # the same events if they are in doubt and need a look
+    doubts: Sequence[DoubtfulSound] = ()  # the same events if they are in doubt and need review
 
     @property
     def first(self) -> SoundEvent:
@@ -72,12 +72,12 @@ class Bout(NamedTuple):
 
     @property
     def is_important(self) -> bool:
-        """Whether the bout needs a look, if any of it counts."""
+        """Whether the bout needs review, if any of it counts."""
         return bool(self.doubts) or self.first.label in IMPORTANT
 
 
-def needs_look(bout: Bout, uncounted: int, sureness: Sureness) -> bool:
-    """Whether a bout needs a look, of which so many events do not count.
+def needs_review(bout: Bout, uncounted: int, sureness: Sureness) -> bool:
+    """Whether a bout needs review, of which so many events do not count.
 
     Nobody has to look at a telephone that may be something else.
     """
@@ -89,7 +89,7 @@ def needs_look(bout: Bout, uncounted: int, sureness: Sureness) -> bool:
 def bouts(events: Iterable[SoundEvent], doubts: Doubts = MappingProxyType({})) -> list[Bout]:
     """Fold events to bouts, the newest first.
 
-    Events that need a look are in `doubts`, by id: the loudest of them are bouts of their own, at
+    Events that need review are in `doubts`, by id: the loudest of them are bouts of their own, at
     most four.
     """
     events = list(events)
@@ -134,7 +134,7 @@ def events_between(microphones: Iterable[LiveMicrophone], start: int, end: int) 
 def uncounted_ids(
     microphones: Iterable[LiveMicrophone], events: Iterable[SoundEvent]
 ) -> frozenset[str]:
-    """Return the ids of the events that do not count, because of a television beside."""
+    """Return the ids of the events that do not count, because a television was on."""
     own = {each.name: each for each in microphones}
     apart = [event for event in events if event.label in ON_TELEVISION]
     by_room = {name: [e for e in apart if e.microphone == name] for name in own}
@@ -176,11 +176,11 @@ class ShownBouts(NamedTuple):
             "time": time,
             "length": "" if is_mixed else length,
             "sure": self._sureness(bout),
-            "beside": self._beside(bout),
+            "beside": self._uncounted_note(bout),
             "doubtful": bool(bout.doubts),
             "room": "" if self.is_alone else room(first.microphone),
             "said": corrections[-1] if corrections else "",
-            "look": needs_look(bout, self._uncounted_of(bout), self.sureness),
+            "look": needs_review(bout, self._uncounted_of(bout), self.sureness),
             "ids": [event.id for event in reversed(bout.events)],
         }
 
@@ -217,8 +217,8 @@ class ShownBouts(NamedTuple):
         word = self.sureness.word(max(event.confidence for event in events))
         return self.words.text(word) if word == SURE or unsure else ""
 
-    def _beside(self, bout: Bout) -> str:
-        """Return how many events of a bout do not count, because of a television beside."""
+    def _uncounted_note(self, bout: Bout) -> str:
+        """Return how many events of a bout do not count, because a television was on."""
         number = self._uncounted_of(bout)
         if not number:
             return ""
