@@ -19,8 +19,8 @@ from hearthlog.recorder.stream import stream_info
 from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
-from hearthlog.tools.lab.month.account import account_for, holes
 from hearthlog.tools.lab.month.faults import KINDS, plan_faults
+from hearthlog.tools.lab.month.log_coverage import account_for, holes
 
 START = 1_772_348_390 * NANOSECONDS  # ten seconds before a full hour
 

@@ -9,10 +9,10 @@ import numpy as np
 from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import stem
-from hearthlog.tools.lab.month.account import holes
 from hearthlog.tools.lab.month.fast_microphone import PPM
 from hearthlog.tools.lab.month.faults import Fault
 from hearthlog.tools.lab.month.folders import MonthFolder
+from hearthlog.tools.lab.month.log_coverage import holes
 from hearthlog.tools.lab.month.watch import MonthRecord, Run
 
 _DAY = 86_400 * NANOSECONDS

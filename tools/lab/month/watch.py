@@ -16,9 +16,9 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import SUFFIX, is_layer, stem
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.tools.lab.bench.timing import HEARTHLOG
-from hearthlog.tools.lab.month.account import LogAccount, account_for
 from hearthlog.tools.lab.month.faults import Fault
 from hearthlog.tools.lab.month.folders import NODE, MonthFolder
+from hearthlog.tools.lab.month.log_coverage import LogAccount, account_for
 from hearthlog.tools.lab.month.shared_state import SharedState, shared_state
 
 _RECORDER = module_command("hearthlog.tools.lab.month.recorder")
