@@ -1,4 +1,4 @@
-"""A recorder on a fast clock, with faults thrown in, and the accounts that are kept of it."""
+"""A recorder on a fast clock, with faults thrown in, and the coverage of its logs."""
 
 import re
 import subprocess
@@ -20,7 +20,7 @@ from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.lab.month.faults import KINDS, plan_faults
-from hearthlog.tools.lab.month.log_coverage import account_for, holes
+from hearthlog.tools.lab.month.log_coverage import read_log_coverage, holes
 
 START = 1_772_348_390 * NANOSECONDS  # ten seconds before a full hour
 
@@ -52,13 +52,13 @@ def logs(tmp_path):
 
 
 def test_time_in_a_gap_is_no_hole(logs):
-    accounts = [account_for(log) for log in logs]
-    assert sum(account.frames for account in accounts) == 300
-    assert not holes(accounts)
+    coverages = [read_log_coverage(log) for log in logs]
+    assert sum(coverage.frames for coverage in coverages) == 300
+    assert not holes(coverages)
 
 
 def test_a_log_that_is_missing_is_a_hole(logs):
-    first, _, last = [account_for(log) for log in logs]
+    first, _, last = [read_log_coverage(log) for log in logs]
     assert holes([first, last]) == [f"{last.path.name}: 10.000 s before frames"]
 
 

@@ -1,4 +1,4 @@
-"""Where the sound of a month is: which of it is in frames, which in gaps, and which in neither."""
+"""Coverage of a month: which time is in frames, in gaps, or in neither."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _TOLERANCE = FRAME_NANOSECONDS // 2
 
 
 @dataclass(frozen=True)
-class LogAccount:
+class LogCoverage:
     """What one log holds.
 
     Attributes
@@ -39,7 +39,7 @@ class LogAccount:
     errors: list[str]
 
 
-def account_for(path: Path) -> LogAccount:
+def read_log_coverage(path: Path) -> LogCoverage:
     """Read what a log holds, and let the doctor check it.
 
     Parameters
@@ -66,7 +66,7 @@ def account_for(path: Path) -> LogAccount:
         rows = zip(gaps["header.stamp"], gaps.log_times, gaps["reason"], strict=True)
         spans += [(int(end) - 1, int(start), int(end), str(why)) for start, end, why in rows]
     findings = examine_file(path).findings
-    return LogAccount(
+    return LogCoverage(
         path,
         [(start, end, why) for _, start, end, why in sorted(spans)],
         len(frames),
@@ -78,12 +78,12 @@ def account_for(path: Path) -> LogAccount:
 _FIELDS = ("frame", "header.stamp", "reason")
 
 
-def holes(accounts: Iterable[LogAccount]) -> list[str]:
+def holes(coverages: Iterable[LogCoverage]) -> list[str]:
     """Find the time that is neither in a frame nor in a gap.
 
     Parameters
     ----------
-    accounts : iterable of LogAccount
+    coverages : iterable of LogCoverage
         In the order of recording.
 
     Returns
@@ -92,13 +92,13 @@ def holes(accounts: Iterable[LogAccount]) -> list[str]:
         A line for each.
     """
     end, ends, found = 0, [0], []
-    for account in accounts:
-        for start, until, why in account.spans:
+    for coverage in coverages:
+        for start, until, why in coverage.spans:
             # What was recorded while the clock was ahead is not looked at by what comes after.
             from_earlier = why and np.min(np.abs(np.array(ends) - start)) <= _TOLERANCE
             if ends[1:] and start > end + _TOLERANCE and not from_earlier:
                 what = f"gap ({why})" if why else "frames"
-                found.append(f"{account.path.name}: {(start - end) / 1e9:.3f} s before {what}")
+                found.append(f"{coverage.path.name}: {(start - end) / 1e9:.3f} s before {what}")
             end = until
             ends.append(end)
     return found

@@ -54,9 +54,9 @@ def summarize(record: MonthRecord, faults: Sequence[Fault], folder: MonthFolder)
     summary.add(", ".join(f"{count} {kind}" for kind, count in kinds.most_common()))
     for problem in record.problems:
         summary.add(problem, met=False)
-    for hole in (found := holes(record.accounts)):
+    for hole in (found := holes(record.coverages)):
         summary.add(hole, met=False)
-    errors = [error for account in record.accounts for error in account.errors]
+    errors = [error for coverage in record.coverages for error in coverage.errors]
     errors += [
         str(finding)
         for findings in examine(folder.logs)
@@ -65,10 +65,10 @@ def summarize(record: MonthRecord, faults: Sequence[Fault], folder: MonthFolder)
     ]
     for error in errors:
         summary.add(error, met=False)
-    frames = sum(account.frames for account in record.accounts)
-    gaps = Counter(why for each in record.accounts for _, _, why in each.spans if why)
+    frames = sum(coverage.frames for coverage in record.coverages)
+    gaps = Counter(why for each in record.coverages for _, _, why in each.spans if why)
     summary.add(
-        f"{len(record.accounts)} logs, {frames} frames, {sum(gaps.values())} gaps, "
+        f"{len(record.coverages)} logs, {frames} frames, {sum(gaps.values())} gaps, "
         f"{len(found)} holes that are in no gap, {len(errors)} errors of the doctor"
     )
     _add_losses(summary, record, folder)
@@ -80,9 +80,9 @@ def _add_losses(summary: Summary, record: MonthRecord, folder: MonthFolder) -> N
     """Say how much of the sound that the recorder was given is in no log, by what ended it."""
     process_of = {log: process for process, log in folder.begun()}
     last: dict[int, int] = {}
-    for account in record.accounts:
-        process = process_of[stem(account.path)]
-        last[process] = max(last.get(process, -1), account.last_frame)
+    for coverage in record.coverages:
+        process = process_of[stem(coverage.path)]
+        last[process] = max(last.get(process, -1), coverage.last_frame)
     lost: dict[str, list[float]] = {}
     for run in record.runs:
         frames = last.get(run.process, -1) + 1

@@ -1,4 +1,4 @@
-"""The watcher of a fast month: starts the recorder, does to it what is due, and keeps accounts."""
+"""The watcher of a fast month: starts the recorder, injects the faults that are due, and reads the logs."""
 
 import os
 import random
@@ -18,7 +18,7 @@ from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX
 from hearthlog.tools.lab.bench.timing import HEARTHLOG
 from hearthlog.tools.lab.month.faults import Fault
 from hearthlog.tools.lab.month.folders import NODE, MonthFolder
-from hearthlog.tools.lab.month.log_coverage import LogAccount, account_for
+from hearthlog.tools.lab.month.log_coverage import LogCoverage, read_log_coverage
 from hearthlog.tools.lab.month.shared_state import SharedState, shared_state
 
 _RECORDER = module_command("hearthlog.tools.lab.month.recorder")
@@ -77,14 +77,14 @@ class MonthRecord:
     Attributes
     ----------
     runs : list of Run
-    accounts : list of LogAccount
+    coverages : list of LogCoverage
         In the order of recording.
     problems : list of str
         What should not have happened.
     """
 
     runs: list[Run]
-    accounts: list[LogAccount]
+    coverages: list[LogCoverage]
     problems: list[str]
 
 
@@ -109,7 +109,7 @@ class Watcher:
         self._state: SharedState = shared_state(folder.state)
         self._random = random.Random(seed)
         self._pool = ProcessPoolExecutor(1)
-        self._accounts: dict[str, Future[LogAccount]] = {}
+        self._coverages: dict[str, Future[LogCoverage]] = {}
         self._problems: list[str] = []
         self._listed = 0.0
 
@@ -130,12 +130,12 @@ class Watcher:
                 break
         self._list_logs()
         with self._pool:
-            accounts = [future.result() for future in self._accounts.values()]
+            coverages = [future.result() for future in self._coverages.values()]
         order = {log: number for number, (_, log) in enumerate(self._folder.begun())}
-        known = [account for account in accounts if stem(account.path) in order]
-        strange = [account.path.name for account in accounts if account not in known]
+        known = [coverage for coverage in coverages if stem(coverage.path) in order]
+        strange = [coverage.path.name for coverage in coverages if coverage not in known]
         self._problems += [f"{name}: no recorder of this month has begun it" for name in strange]
-        known.sort(key=lambda account: order[stem(account.path)])
+        known.sort(key=lambda coverage: order[stem(coverage.path)])
         return MonthRecord(runs, known, self._problems)
 
     def _run(self) -> Run:
@@ -224,10 +224,10 @@ class Watcher:
             run.samples += [] if sample is None else [sample]
 
     def _list_logs(self) -> None:
-        """Account for the logs that have their names now, before they are thinned or deleted."""
+        """Read the coverage of the logs that have their names now, before they are thinned or deleted."""
         for path in self._folder.logs.rglob(f"*{SUFFIX}"):
-            if path.name not in self._accounts and not is_layer(path):
-                self._accounts[path.name] = self._pool.submit(account_for, path)
+            if path.name not in self._coverages and not is_layer(path):
+                self._coverages[path.name] = self._pool.submit(read_log_coverage, path)
 
 
 def _sample(process: int, now: int) -> Sample | None:
