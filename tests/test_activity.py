@@ -26,7 +26,7 @@ from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.activity.segments import read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.home_state import follow_home
-from hearthlog.analyzer.bridge.output import News, Totals
+from hearthlog.analyzer.bridge.output import OutputUpdate, Totals
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.prometheus import HomeCollector
 from hearthlog.analyzer.bridge.settings import RecorderAddress
@@ -102,10 +102,10 @@ def test_the_broker_and_the_figures_get_the_counts_of_the_report(logs, followed)
     # In the evening before 22:00 the last night is the one that ended in the morning.
     moment = today(at_hour(DAY, EVENING, ZONE) - 1, ZONE)
     counts = own.counts(moment)
-    news = News(followed, [], [], moment, ZONE)
+    update = OutputUpdate(followed, [], [], moment, ZONE)
     metrics = {
         metric.name: {sample.labels["label"]: sample.value for sample in metric.samples}
-        for metric in HomeCollector(news, RecorderAddress(logs, "home", ZONE), []).collect()
+        for metric in HomeCollector(update, RecorderAddress(logs, "home", ZONE), []).collect()
         if metric.name.startswith("hearthlog_events_")
     }
     assert {name: (day or 0, night or 0) for name, (day, night) in counts.items()} == {

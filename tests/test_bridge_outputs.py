@@ -11,7 +11,7 @@ import pytest
 
 from hearthlog.analyzer.bridge.bridge import ProblemReporter, open_outputs, output_problems
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.settings import BridgeSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.http import free_port, listen
@@ -20,7 +20,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 
 pytestmark = pytest.mark.fast
 
-NEWS = News(HomeState(), [], [], today(0, UTC), UTC)
+UPDATE = OutputUpdate(HomeState(), [], [], today(0, UTC), UTC)
 
 
 @pytest.fixture
@@ -47,12 +47,12 @@ def test_an_output_that_cannot_be_opened_is_tried_again_and_stops_no_other(
             BridgeState(tmp_path, "home", pytest.fail),
             ProblemReporter(printed.append),
         )
-        opened["prometheus"].update(NEWS)
+        opened["prometheus"].update(UPDATE)
         assert list(opened) == ["prometheus", "ping"]
         (line,) = printed
         assert line.startswith(f"bridge.prometheus: cannot listen on port {port} (")
         assert line.endswith("; take another; trying again")
-    opened["prometheus"].update(NEWS)
+    opened["prometheus"].update(UPDATE)
     assert opened["prometheus"].output is not None
     for output in opened.values():
         output.close()
@@ -130,7 +130,7 @@ def test_a_text_file_that_cannot_be_looked_at_is_no_reason_to_refuse_the_configu
         BridgeState(tmp_path, "home", pytest.fail),
         ProblemReporter(printed.append),
     )
-    opened["prometheus"].update(NEWS)
+    opened["prometheus"].update(UPDATE)
     opened["prometheus"].close()
     assert printed[0].startswith("bridge.prometheus: text_file: ")
     assert printed[0].endswith("; trying again")
@@ -146,7 +146,7 @@ def test_an_output_that_is_tried_again_leaves_no_thread(home, tmp_path, monkeypa
     )
     count = threading.active_count()
     for _ in range(5):
-        opened["mqtt"].update(NEWS)
+        opened["mqtt"].update(UPDATE)
     assert threading.active_count() == count
 
 

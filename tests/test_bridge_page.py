@@ -25,7 +25,7 @@ from hearthlog.analyzer.bridge.bridge import open_outputs
 from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import REVIEWER, EventCorrections
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
-from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.page import server
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.home_page import HomePage
@@ -654,10 +654,10 @@ def test_a_microphone_that_is_away_is_not_said_to_listen(output, why):
     state, now = HomeState(), time.time_ns()
     state.push([segments("mic", (now - 60 * NANOSECONDS, now - 30 * NANOSECONDS, "silence"))])
     state.health["mic"] = Health(0, output)
-    news = News(state, [], [], today(now, UTC), UTC)
-    (recorded,) = RoomStatus().describe(news)["rooms"]
+    update = OutputUpdate(state, [], [], today(now, UTC), UTC)
+    (recorded,) = RoomStatus().describe(update)["rooms"]
     assert (recorded["words"], recorded["why"]) == ("Not listening", why)
-    health = health_list(news, "home", now)[0]
+    health = health_list(update, "home", now)[0]
     assert health["text"] == (f"not listening: {why}" if why else "not listening")
 
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from hearthlog.analyzer import http
 from hearthlog.analyzer.bridge.bridge import PingOutput
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
-from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.settings import PingSettings
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.local_time import today
@@ -52,11 +52,11 @@ def often(monkeypatch):
     return lambda url: PingSettings(url=url).model_copy(update={"every_seconds": 0.05})
 
 
-def news(*, is_recording=True, **health):
+def update(*, is_recording=True, **health):
     state = HomeState()
     state._seen = time.monotonic() - (0.0 if is_recording else 60.0)
     state.health = {name: Health(level, "") for name, level in health.items()}
-    return News(state, [], [], today(0, UTC), UTC)
+    return OutputUpdate(state, [], [], today(0, UTC), UTC)
 
 
 def last_request(pings, requested, what):
@@ -71,17 +71,17 @@ def last_request(pings, requested, what):
 def test_a_watchdog_is_asked_while_all_is_well_and_told_of_a_failure(often):
     with watchdog() as (url, requested):
         pings = PingOutput(often(url), pytest.fail)
-        assert last_request(pings, requested, news(mic=0, clock=1)) == "/box"
-        assert last_request(pings, requested, news(mic=2)) == "/box/fail"
-        assert last_request(pings, requested, news(is_recording=False)) == "/box/fail"
-        assert last_request(pings, requested, news(mic=0)) == "/box"
+        assert last_request(pings, requested, update(mic=0, clock=1)) == "/box"
+        assert last_request(pings, requested, update(mic=2)) == "/box/fail"
+        assert last_request(pings, requested, update(is_recording=False)) == "/box/fail"
+        assert last_request(pings, requested, update(mic=0)) == "/box"
         pings.close()
 
 
 def test_a_bridge_that_hangs_asks_no_more(often):
     with watchdog() as (url, requested):
         pings = PingOutput(often(url), pytest.fail)
-        last_request(pings, requested, news(mic=0))
+        last_request(pings, requested, update(mic=0))
         until, count = time.monotonic() + 60, -1
         while len(requested) > count:
             assert time.monotonic() < until
@@ -95,7 +95,7 @@ def test_a_watchdog_that_is_away_is_said_to_be(often):
     pings = PingOutput(often(f"http://127.0.0.1:{free_port()}"), output.append)
     until = time.monotonic() + 60
     while not output and time.monotonic() < until:
-        pings.update(news())
+        pings.update(update())
         time.sleep(0.02)
     pings.close()
     assert output[0] == "ping: not accepted (Connection refused); trying again"
@@ -108,7 +108,7 @@ def test_the_address_may_be_in_a_file_and_is_in_no_line(tmp_path):
         file.write_text(f"\ufeff{url}/a-secret\r\n")
         settings = PingSettings(url_file=file).model_copy(update={"every_seconds": 0.05})
         pings = PingOutput(settings, output.append)
-        assert last_request(pings, requested, news(mic=0)) == "/box/a-secret"
+        assert last_request(pings, requested, update(mic=0)) == "/box/a-secret"
         pings.close()
     for wrong in ("", "a-secret", "https://", "http://x/a secret", "http://x:y/", "http://[x/"):
         file.write_text(wrong)

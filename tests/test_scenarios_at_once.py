@@ -28,7 +28,7 @@ from hearthlog.analyzer.activity.segments import is_of_activity, read_activity
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.mqtt.home_assistant import discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
-from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.page.status import scenario_lines
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
@@ -550,7 +550,7 @@ def test_what_a_bridge_tells_of_a_scenario_is_apart_from_its_microphone(log):
 def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_path):
     state = HomeState()
     columns = read_columns([log], [*OF_WATER, "/mic/gap", "/mic/label", "/mic/segment"])
-    news = News(state, [], [], today(START + 60 * NANOSECONDS, UTC), UTC)
+    update = OutputUpdate(state, [], [], today(START + 60 * NANOSECONDS, UTC), UTC)
     figures, home = tmp_path / "figures.prom", RecorderAddress(tmp_path, "home", UTC)
     output = PrometheusOutput(
         PrometheusSettings(text_file=figures, readable_by="all"),
@@ -562,7 +562,7 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
 
     def samples() -> dict[tuple[str, ...], float]:
         output._due = 0.0
-        output.update(news)
+        output.update(update)
         return {
             (sample.name, *(value for key, value in sample.labels.items() if key != "node")): float(
                 sample.value
@@ -575,7 +575,7 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
     state.push([part for topic, part in columns.items() if topic not in OF_WATER])
     without = samples()
     assert not any("scenario" in name for name, *_ in without)
-    assert scenario_lines(news) == []
+    assert scenario_lines(update) == []
     state.push([part for topic, part in columns.items() if topic in OF_WATER])
     found = samples()
     assert without.items() <= found.items()
@@ -587,14 +587,14 @@ def test_figures_and_the_page_tell_of_a_scenario_beside_its_microphone(log, tmp_
     assert water["hearthlog_scenario_event_seconds_total", *names] == sum(
         flush.seconds for flush in flushes
     )
-    (line,) = scenario_lines(news)
+    (line,) = scenario_lines(update)
     assert line["what"] == "Water"
     assert line["about"].startswith("Now not listening. Today ")
     assert f"toilet flush {ENGLISH.times(len(flushes))} (" in line["about"]
     state.scenarios["mic-water"].seen = math.inf
-    assert scenario_lines(news)[0]["about"].startswith("Now ")
-    assert "not listening" not in scenario_lines(news)[0]["about"]
-    tomorrow = News(state, [], [], today(START + 86_400 * NANOSECONDS, UTC), UTC)
+    assert scenario_lines(update)[0]["about"].startswith("Now ")
+    assert "not listening" not in scenario_lines(update)[0]["about"]
+    tomorrow = OutputUpdate(state, [], [], today(START + 86_400 * NANOSECONDS, UTC), UTC)
     assert scenario_lines(tomorrow)[0]["about"].endswith("Today nothing.")
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, follow_home
-from hearthlog.analyzer.bridge.output import RECENT, News, Output, Totals
+from hearthlog.analyzer.bridge.output import RECENT, Output, OutputUpdate, Totals
 from hearthlog.analyzer.bridge.secret_files import (
     figures_token,
     page_secrets,
@@ -67,10 +67,10 @@ class PingOutput:
         self._stop = Flag()
         Thread(target=self._ping, daemon=True).start()
 
-    def update(self, news: News) -> None:
+    def update(self, update: OutputUpdate) -> None:
         """Record whether the recorder works."""
-        fails = any(health.level >= _ERROR for health in news.state.health.values())
-        self._is_well = news.state.is_recording() and not fails
+        fails = any(health.level >= _ERROR for health in update.state.health.values())
+        self._is_well = update.state.is_recording() and not fails
         self._judged = time.monotonic()
 
     def close(self) -> None:
@@ -146,9 +146,9 @@ class Bridge:
             give_back()  # memory used while reading the log
             ended = [event for event in ended if now - event.end <= RECENT]
         recent = [event for event in begun if now - event.end <= RECENT]
-        news = News(state, recent, ended, moment, self.home.zone, columns)
+        update = OutputUpdate(state, recent, ended, moment, self.home.zone, columns)
         for name, output in self.outputs.items():
-            self._try(name, partial(output.update, news))
+            self._try(name, partial(output.update, update))
         for microphone in state.every():
             microphone.forget(min(moment.midnight, moment.night) - _FORGOTTEN, now + _AHEAD)
 
@@ -200,12 +200,12 @@ class ReopenedOutput:
         self._due = 0.0  # by CLOCK_MONOTONIC
         self._open()
 
-    def update(self, news: News) -> None:
+    def update(self, update: OutputUpdate) -> None:
         """Update the output if it is open; retry opening it once a minute."""
         if self.output is None and time.monotonic() >= self._due:
             self._open()
         if self.output is not None:
-            self.output.update(news)
+            self.output.update(update)
 
     def close(self) -> None:
         """Close the output if it is open."""

@@ -17,7 +17,7 @@ from hearthlog.schemas.logs.columns import Columns
 RECENT = 60 * NANOSECONDS  # after its end an event is no longer reported
 
 
-class News(NamedTuple):
+class OutputUpdate(NamedTuple):
     """An update for the outputs."""
 
     state: HomeState
@@ -31,7 +31,7 @@ class News(NamedTuple):
 class Output(Protocol):
     """Output of the bridge; its methods must not block, as all outputs share a thread."""
 
-    def update(self, news: News) -> None:
+    def update(self, update: OutputUpdate) -> None:
         """Process an update; called several times a second."""
 
     def close(self) -> None:

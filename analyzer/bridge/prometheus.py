@@ -16,7 +16,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from hearthlog.analyzer.activity.segments import is_of_scenario, source_parts
-from hearthlog.analyzer.bridge.output import News, Total, Totals
+from hearthlog.analyzer.bridge.output import OutputUpdate, Total, Totals
 from hearthlog.analyzer.bridge.secret_files import figures_token
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report
@@ -60,17 +60,19 @@ class PrometheusOutput:
         self._server: _Server | None = None
         self._open_port()
 
-    def update(self, news: News) -> None:
+    def update(self, update: OutputUpdate) -> None:
         """Compute the metrics again if they are ten seconds old."""
         if time.monotonic() < self._due:
             return
         self._due = time.monotonic() + _EVERY_SECONDS
         self._open_port()
-        self.totals.keep(news.state, min(news.today.midnight, news.today.night) - SEGMENT_DELAY)
+        self.totals.keep(
+            update.state, min(update.today.midnight, update.today.night) - SEGMENT_DELAY
+        )
         registry = CollectorRegistry()
-        totals = self.totals.count(news.state)
-        shown = [total for total in totals if total.label not in news.state.never_tell]
-        registry.register(HomeCollector(news, self._home, shown))
+        totals = self.totals.count(update.state)
+        shown = [total for total in totals if total.label not in update.state.never_tell]
+        registry.register(HomeCollector(update, self._home, shown))
         text = generate_latest(registry)
         self._made = text, time.monotonic()
         if self._settings.text_file is not None:
@@ -157,14 +159,16 @@ class _Handler(HttpHandler):
 class HomeCollector(Collector):
     """The metrics of a home at one moment."""
 
-    def __init__(self, news: News, home: RecorderAddress, totals: Sequence[Total]) -> None:
-        self._news = news
+    def __init__(
+        self, update: OutputUpdate, home: RecorderAddress, totals: Sequence[Total]
+    ) -> None:
+        self._update = update
         self._home = home
         self._totals = totals
 
     def collect(self) -> Iterator[Metric]:
         """Yield each metric, by microphone and class."""
-        node, state = self._home.node, self._news.state
+        node, state = self._home.node, self._update.state
         for of, labels in ("", ("microphone",)), ("scenario_", ("microphone", "scenario")):
             own = {
                 (node, *source_parts(one.microphone)[: len(labels)], one.label): one
@@ -207,12 +211,12 @@ class HomeCollector(Collector):
         self, labels: tuple[str, ...], part: int, *, is_scenario: bool
     ) -> dict[tuple[str, ...], int]:
         """Return the counts of the day (part 0) or night (part 1) that are known."""
-        news = self._news
+        update = self._update
         return {
             (self._home.node, *source_parts(each.name)[: len(labels)], label): count
-            for each in news.state.every()
+            for each in update.state.every()
             if is_of_scenario(each.name) == is_scenario
-            for label, counts in each.counts(news.today, news.state.corrections).items()
+            for label, counts in each.counts(update.today, update.state.corrections).items()
             if (count := counts[part]) is not None
         }
 

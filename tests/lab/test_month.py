@@ -20,7 +20,7 @@ from hearthlog.recorder.stream.pipeline import Pipeline
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 from hearthlog.tools.lab.month.faults import KINDS, plan_faults
-from hearthlog.tools.lab.month.log_coverage import read_log_coverage, holes
+from hearthlog.tools.lab.month.log_coverage import holes, read_log_coverage
 
 START = 1_772_348_390 * NANOSECONDS  # ten seconds before a full hour
 

@@ -36,7 +36,7 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     is_hidden,
     live_history,
 )
-from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.secret_files import secret_path
 from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report, StateEntry
@@ -219,14 +219,14 @@ class AlertsOutput:
         self._thread = Thread(target=self._run, daemon=True, name="alerts")
         self._thread.start()
 
-    def update(self, news: News) -> None:
+    def update(self, update: OutputUpdate) -> None:
         """Queue the current labels, and deliver notifications to the broker."""
-        for microphone in news.state.every():
+        for microphone in update.state.every():
             if microphone.label:
                 label = LiveLabel(microphone.active.time, microphone.label, microphone.confidence)
                 self._labels.append((microphone.name, label, microphone.classes))
-        self._watch.never_tell = news.state.never_tell
-        self._columns += news.columns
+        self._watch.never_tell = update.state.never_tell
+        self._columns += update.columns
         self._has_news.set()
         if self._on_notification is not None:
             while self._offer(self._on_notification):
@@ -294,7 +294,7 @@ class AlertsOutput:
         self._delivery.set_targets(targets)
 
     def _follow(self) -> None:
-        """Read what the rules need of the past, and evaluate the rules as news come.
+        """Read what the rules need of the past, and evaluate the rules at each update.
 
         Returns when the clock is set back: messages so far may be from the future.
         """

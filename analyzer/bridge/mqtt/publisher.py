@@ -19,7 +19,7 @@ from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     home_id,
 )
 from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, RetainedTopics, Topics
-from hearthlog.analyzer.bridge.output import RECENT, News
+from hearthlog.analyzer.bridge.output import RECENT, OutputUpdate
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState, Report
 from hearthlog.analyzer.logs.local_time import iso_time
@@ -91,30 +91,30 @@ class MqttPublisher:
         self._announced.add(topics.at("bridge"), Place("bridge"))
         self._commands = self._take_commands() if settings.commands else None
 
-    def update(self, news: News) -> None:
+    def update(self, update: OutputUpdate) -> None:
         """Publish an update."""
-        self._keep(Place("recorder"), _ONLINE[news.state.is_recording()])
-        for each in news.state.every():
-            if news.state.is_removed(each.name):
+        self._keep(Place("recorder"), _ONLINE[update.state.is_recording()])
+        for each in update.state.every():
+            if update.state.is_removed(each.name):
                 self._classes.pop(each.name, None)
                 continue
             if each.classes != self._classes.get(each.name, []):
                 self._describe(each)
             self._leave_out_again(each.classes)
-            self._publish_state(each, news)
-            if each.name in news.state.microphones:
-                self._publish_problem(each, news.state)
-        self._clear_gone(news.state)
+            self._publish_state(each, update)
+            if each.name in update.state.microphones:
+                self._publish_problem(each, update.state)
+        self._clear_gone(update.state)
         self._describe_switches()
-        self._begun += news.begun
-        self._ended += news.ended
+        self._begun += update.begun
+        self._ended += update.ended
         if self._connection.is_ready():
             self._was_ready = True
             self._announced.save()  # before publishing retained values that must be cleared later
             self._report_muted()
-            self._publish_begun(news)
-            self._send_events("event_ended", self._recent(self._ended, news), news)
-        self._obey(news.state)
+            self._publish_begun(update)
+            self._send_events("event_ended", self._recent(self._ended, update), update)
+        self._obey(update.state)
         if self._is_born:
             self._is_born = False
             self._connection.repeat()
@@ -122,26 +122,26 @@ class MqttPublisher:
         if self._was_ready or not self._reads_back:
             self._announced.save()
 
-    def _publish_begun(self, news: News) -> None:
+    def _publish_begun(self, update: OutputUpdate) -> None:
         """Publish the events that began, except those that an earlier bridge published."""
-        events = self._announced.new_events(self._recent(self._begun, news))
-        self._send_events("event", events, news)
+        events = self._announced.new_events(self._recent(self._begun, update))
+        self._send_events("event", events, update)
         for event in events:
             self._announced.note_event(event)
             if self._announced.is_published(event.label):
                 place = Place("last_event", event.microphone)
-                self._keep(place, json.dumps(event_fields(event, news)))
+                self._keep(place, json.dumps(event_fields(event, update)))
 
-    def _recent(self, waiting: deque[SoundEvent], news: News) -> list[SoundEvent]:
+    def _recent(self, waiting: deque[SoundEvent], update: OutputUpdate) -> list[SoundEvent]:
         """Take the waiting events, without those that are too old."""
-        recent = [event for event in waiting if news.today.now - event.end <= RECENT]
+        recent = [event for event in waiting if update.today.now - event.end <= RECENT]
         waiting.clear()
         return recent
 
-    def _send_events(self, kind: str, events: Sequence[SoundEvent], news: News) -> None:
+    def _send_events(self, kind: str, events: Sequence[SoundEvent], update: OutputUpdate) -> None:
         for event in (each for each in events if self._announced.is_published(each.label)):
             topic = self._topics.at(kind, event.microphone)
-            self._connection.send(topic, json.dumps(event_fields(event, news)))
+            self._connection.send(topic, json.dumps(event_fields(event, update)))
 
     def alert(self, name: str, text: str, time: int) -> bool:
         """Publish an alert with a time in ns of UTC; call again until this returns True."""
@@ -278,7 +278,7 @@ class MqttPublisher:
         classes = self._classes.get(microphone)
         return bool(label) and classes is not None and label not in classes
 
-    def _publish_state(self, microphone: LiveMicrophone, news: News) -> None:
+    def _publish_state(self, microphone: LiveMicrophone, update: OutputUpdate) -> None:
         def keep(kind: str, value: str) -> None:
             self._keep(Place(kind, microphone.name), value)
 
@@ -292,10 +292,10 @@ class MqttPublisher:
         keep("sound", _ON[microphone.active.is_active(ANY_SOUND)])
         if math.isfinite(microphone.level_dbfs):
             keep("level", f"{microphone.level_dbfs:.1f}")
-        counts = microphone.counts(news.today, news.state.corrections)
+        counts = microphone.counts(update.today, update.state.corrections)
         began = {
-            "day_start": iso_time(news.today.midnight, news.zone),
-            "night_start": iso_time(news.today.night, news.zone),
+            "day_start": iso_time(update.today.midnight, update.zone),
+            "night_start": iso_time(update.today.night, update.zone),
         }
         for label in (each for each in microphone.classes if each != SILENCE):
             is_published = self._announced.is_published(label)
@@ -310,7 +310,7 @@ class MqttPublisher:
             }
             last = microphone.last_event(label)
             if last is not None:  # otherwise the retained value of an earlier bridge is right
-                values["last_heard"] = iso_time(last.end, news.zone)
+                values["last_heard"] = iso_time(last.end, update.zone)
             for kind, value in values.items():
                 self._keep(Place(kind, microphone.name, label), value)
 
@@ -325,13 +325,13 @@ class MqttPublisher:
         self._keep(Place("problem", microphone.name), json.dumps(value))
 
 
-def event_fields(event: SoundEvent, news: News) -> dict[str, str | float]:
+def event_fields(event: SoundEvent, update: OutputUpdate) -> dict[str, str | float]:
     """Return the JSON fields of an event."""
     return {
         "event_type": event.label,
         "id": event.id,
-        "start": iso_time(event.start, news.zone),
-        "end": iso_time(event.end, news.zone),
+        "start": iso_time(event.start, update.zone),
+        "end": iso_time(event.end, update.zone),
         "seconds": round(event.seconds, 2),
         "confidence": round(event.confidence, 3),
     }

@@ -16,7 +16,7 @@ from hearthlog.analyzer.activity.values import BASELINE_DAYS
 from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.doubts import CurrentDoubts, doubtful, events_to_review
 from hearthlog.analyzer.bridge.page.past_days import PastDay, PastDays
@@ -158,7 +158,7 @@ class HomePage:
         """Return the name of the home."""
         return room(self._home.node)
 
-    def update(self, news: News) -> None:
+    def update(self, update: OutputUpdate) -> None:
         """Update the page, at most once a second."""
         with self._lock:
             views = [*self._views.values()]
@@ -167,48 +167,48 @@ class HomePage:
         if time.monotonic() - self._made < _EVERY_SECONDS:
             return
         self._made = time.monotonic()
-        self._state = news.state
-        day = local_time(news.today.now, news.zone).date()
+        self._state = update.state
+        day = local_time(update.today.now, update.zone).date()
         if self._measured != day:
             self._measured = day
-            threading.Thread(target=self._measure, args=(news.today.now,), daemon=True).start()
-        first = evening_before(day, news.zone)
-        microphones, doubts = news.state.microphones.values(), self._doubts.found
-        key = _events_key(news), len(doubts)
+            threading.Thread(target=self._measure, args=(update.today.now,), daemon=True).start()
+        first = evening_before(day, update.zone)
+        microphones, doubts = update.state.microphones.values(), self._doubts.found
+        key = _events_key(update), len(doubts)
         if key != self._events_key:
             self._events_key = key
-            every = events_between(microphones, first, news.today.now + _DAY)
+            every = events_between(microphones, first, update.today.now + _DAY)
             self._events = {event.id: event for event in every}
             self._doubtful = doubtful(microphones, every)
             folded = bouts(
-                every, events_to_review(doubts, self._doubtful, every, news.state.never_tell)
+                every, events_to_review(doubts, self._doubtful, every, update.state.never_tell)
             )
             self._bouts = {bout.first.id: bout for bout in folded}
             self._uncounted = uncounted_ids(microphones, every)
-        self._doubts.update(self._doubtful, news.today.now)
+        self._doubts.update(self._doubtful, update.today.now)
         for view in views:
-            self._update_view(view, news)
+            self._update_view(view, update)
         self.is_settled = self._doubts.is_up_to_date and self._doubts.found == doubts
 
-    def _update_view(self, view: PageView, news: News) -> None:
-        moment, words, started = Moment(news.today.now, news.zone), view.words, self._started
-        view.put("now", view.now.describe(news))
-        view.put("scenarios", scenario_lines(news, words))
+    def _update_view(self, view: PageView, update: OutputUpdate) -> None:
+        moment, words, started = Moment(update.today.now, update.zone), view.words, self._started
+        view.put("now", view.now.describe(update))
+        view.put("scenarios", scenario_lines(update, words))
         about = {
             "home": self.home_name(),
-            "clock": clock(moment.now, news.zone),
+            "clock": clock(moment.now, update.zone),
             "sound": self._settings.sound,
         }
         view.put("home", about)
         view.put("recurring", self._recurring.describe(moment, words))
         problem = self._recurring.problem
-        view.put("health", health_list(news, self._home.node, started, problem, words))
-        day, corrections = local_time(moment.now, news.zone).date(), news.state.corrections
-        key = self._events_key, corrections.number, day, self._sureness, _classes_key(news)
-        view.put_changed("events", key, lambda: self._last_bouts(news, words))
-        every = [*news.state.microphones.values()]
-        home = HomeDay(every, news.today, news.zone, words, False, corrections, self._sureness)
-        key_of_day = _day_key(news), corrections.number, self._sureness
+        view.put("health", health_list(update, self._home.node, started, problem, words))
+        day, corrections = local_time(moment.now, update.zone).date(), update.state.corrections
+        key = self._events_key, corrections.number, day, self._sureness, _classes_key(update)
+        view.put_changed("events", key, lambda: self._last_bouts(update, words))
+        every = [*update.state.microphones.values()]
+        home = HomeDay(every, update.today, update.zone, words, False, corrections, self._sureness)
+        key_of_day = _day_key(update), corrections.number, self._sureness
         view.put_changed("day", key_of_day, lambda: picture_of(home))
 
     def close(self) -> None:
@@ -221,19 +221,19 @@ class HomePage:
         with self._lock:
             return [view.board for view in self._views.values()]
 
-    def _last_bouts(self, news: News, words: Words) -> Any:
-        microphones = news.state.microphones.values()
+    def _last_bouts(self, update: OutputUpdate, words: Words) -> Any:
+        microphones = update.state.microphones.values()
         names = ordered(label for each in microphones for label in [*each.classes, *each.labels()])
         shown = self._shown(
-            words, news.today.now, news.state.corrections, is_alone=len(microphones) == 1
+            words, update.today.now, update.state.corrections, is_alone=len(microphones) == 1
         )
         shown = shown._replace(
-            common_names=news.state.common_names,
+            common_names=update.state.common_names,
             uncounted=self._uncounted,
-            hidden=news.state.never_tell,
+            hidden=update.state.never_tell,
         )
         every = [shown.describe(bout) for bout in self._latest()]
-        hidden = ordered(news.state.never_tell)
+        hidden = ordered(update.state.never_tell)
         return {
             "events": every,
             "classes": [(label, words.class_words(label)) for label in names if is_sound(label)],
@@ -383,29 +383,29 @@ class HomePage:
             self._sureness = read_sureness(logs, now - BASELINE_DAYS * _DAY, now)
 
 
-def _classes_key(news: News) -> Any:
+def _classes_key(update: OutputUpdate) -> Any:
     """Return a key that changes whenever the shown classes change."""
-    microphones = news.state.microphones.values()
-    return news.state.never_tell, [(each.name, each.classes) for each in microphones]
+    microphones = update.state.microphones.values()
+    return update.state.never_tell, [(each.name, each.classes) for each in microphones]
 
 
-def _events_key(news: News) -> Any:
+def _events_key(update: OutputUpdate) -> Any:
     """Return a key that changes whenever an event begins, grows or is hidden."""
     return (
-        news.today.midnight,
-        news.today.night,
-        news.state.never_tell,
+        update.today.midnight,
+        update.today.night,
+        update.state.never_tell,
         [
             (each.name, [(n, each.last_event(n), len(each.events(n, 0))) for n in each.labels()])
-            for each in news.state.microphones.values()
+            for each in update.state.microphones.values()
         ],
     )
 
 
-def _day_key(news: News) -> Any:
+def _day_key(update: OutputUpdate) -> Any:
     """Return a key that changes whenever the picture of the day changes."""
     listening = [
         (each.name, each.is_listening(), each.since, len(each.gaps))
-        for each in news.state.microphones.values()
+        for each in update.state.microphones.values()
     ]
-    return news.today.now // BIN, listening, _classes_key(news), _events_key(news)
+    return update.today.now // BIN, listening, _classes_key(update), _events_key(update)

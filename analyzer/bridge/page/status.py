@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from hearthlog.analyzer.activity import ANY_SOUND, HOLD_SECONDS
 from hearthlog.analyzer.activity.segments import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
-from hearthlog.analyzer.bridge.output import News
+from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.wording import ENGLISH, Words, one_line, reason, room
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.schemas.frames import NANOSECONDS
@@ -29,25 +29,25 @@ class RoomStatus:
         self._words = words
         self._last: dict[str, _Current] = {}
 
-    def describe(self, news: News) -> Any:
+    def describe(self, update: OutputUpdate) -> Any:
         """Return the current sounds for JSON."""
-        words, microphones = self._words, news.state.present()
-        nothing = "now.nothing" if news.state.is_recording() else "now.not recording"
+        words, microphones = self._words, update.state.present()
+        nothing = "now.nothing" if update.state.is_recording() else "now.not recording"
         return {
             "nothing": "" if microphones else words.text(nothing) + ".",
             "rooms": [
-                self._room(each, news, is_alone=len(microphones) == 1) for each in microphones
+                self._room(each, update, is_alone=len(microphones) == 1) for each in microphones
             ],
         }
 
-    def _room(self, microphone: LiveMicrophone, news: News, *, is_alone: bool) -> Any:
+    def _room(self, microphone: LiveMicrophone, update: OutputUpdate, *, is_alone: bool) -> Any:
         words, sound = self._words, _sounds_in_words(microphone, self._words)
         last = self._last.get(microphone.name)
         if last is None or last.words != sound:
-            since = _active_since(microphone) or (news.today.now if last is not None else 0)
+            since = _active_since(microphone) or (update.today.now if last is not None else 0)
             last = self._last[microphone.name] = _Current(sound, since)
-        since_words = words.when(last.since, news.today.now, news.zone) if last.since else ""
-        health = news.state.health.get(microphone.name)
+        since_words = words.when(last.since, update.today.now, update.zone) if last.since else ""
+        health = update.state.health.get(microphone.name)
         is_listening = microphone.is_listening()
         why = reason(one_line(health.text)) if health is not None and not is_listening else ""
         sentence = sound
@@ -120,21 +120,21 @@ def _line(what: str, level: int, text: str) -> dict[str, Any]:
 
 
 def health_list(
-    news: News, node: str, started: int, recurring: str = "", words: Words = ENGLISH
+    update: OutputUpdate, node: str, started: int, recurring: str = "", words: Words = ENGLISH
 ) -> list[Any]:
     """Return the health of all subjects for JSON.
 
     `started` is the start of the bridge, in nanoseconds of UTC; `recurring` is a problem with the
     recurring sounds, if any.
     """
-    lines = [*_lines(news, node, started, words)]
+    lines = [*_lines(update, node, started, words)]
     if recurring:
         lines.append(_line(words.text("health.recurring"), _WARNING, recurring))
     return lines
 
 
-def _lines(news: News, node: str, started: int, words: Words) -> Iterator[Any]:
-    state = news.state
+def _lines(update: OutputUpdate, node: str, started: int, words: Words) -> Iterator[Any]:
+    state = update.state
     for microphone in state.present():
         yield _of_microphone(microphone, state, words)
     is_recording = state.is_recording()
@@ -147,7 +147,7 @@ def _lines(news: News, node: str, started: int, words: Words) -> Iterator[Any]:
         if subject not in state.microphones:
             level, text = min(health.level, _WRONG), words.translated(one_line(health.text))
             yield _line(_thing(subject, node, words), level, text)
-    since = words.when(started, news.today.now, news.zone)
+    since = words.when(started, update.today.now, update.zone)
     yield _line(words.text("health.bridge"), _WELL, words.text("health.follows", time=since))
 
 
@@ -172,9 +172,9 @@ def _thing(subject: str, node: str, words: Words) -> str:
     return one_line(subject.replace("_", " ")).capitalize()
 
 
-def scenario_lines(news: News, words: Words = ENGLISH) -> list[Any]:
+def scenario_lines(update: OutputUpdate, words: Words = ENGLISH) -> list[Any]:
     """Return a line for each scenario of each microphone, for JSON."""
-    state, midnight = news.state, news.today.midnight
+    state, midnight = update.state, update.today.midnight
     lines = []
     for name in sorted(state.scenarios):
         own = state.scenarios[name]
