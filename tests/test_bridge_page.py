@@ -758,9 +758,9 @@ def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):
     write_marks(log, [Mark("mic", start, event.end, "phone_ring", "Ann")])
     corrections = EventCorrections(tmp_path, "home")
     corrections.read_back()
-    assert corrections.of(event) == ("phone_ring", False)
+    assert corrections.correction_of(event) == ("phone_ring", False)
     later = event._replace(start=event.end, end=event.end + NANOSECONDS)
-    assert corrections.of(later) is None
+    assert corrections.correction_of(later) is None
 
 
 # In a browser

@@ -21,7 +21,7 @@ from viewers import browsing, patiently
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import Sureness
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
-from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
+from hearthlog.analyzer.bridge.corrections import EventCorrections, user_error
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import past_days
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
@@ -37,7 +37,7 @@ from hearthlog.analyzer.bridge.page.sounds import (
 )
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import languages, preferred_language, words_of
+from hearthlog.analyzer.bridge.wording import languages, preferred_language, translation_for
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time, today
 from hearthlog.analyzer.marks.marks import Mark
@@ -86,7 +86,7 @@ def home_of_rooms(hour, rooms, language="en"):
         own.names, own.seen = ["silence", "coughing", "crying", "speech"], time.monotonic()
     moment = today(MIDNIGHT + int(hour * HOUR), UTC)
     microphones = [*state.microphones.values()]
-    return HomeDay(microphones, moment, UTC, words_of(language))
+    return HomeDay(microphones, moment, UTC, translation_for(language))
 
 
 def segments_of(name, parts):
@@ -380,7 +380,7 @@ def test_what_is_not_counted_is_drawn_pale_and_its_entry_says_so():
     assert [{round(hour, 2) for hour in own} for own in marked] == [{9.23}, {13.4, 13.43}]
     events = events_between(home.microphones, MIDNIGHT, MIDNIGHT + 24 * HOUR)
     uncounted = uncounted_ids(home.microphones, events)
-    shown = ShownBouts(MIDNIGHT + 15 * HOUR, UTC, words_of("en"), lambda _: "", True)
+    shown = ShownBouts(MIDNIGHT + 15 * HOUR, UTC, translation_for("en"), lambda _: "", True)
     shown = shown._replace(uncounted=uncounted)
     texts = {bout.first.label: [] for bout in bouts(events)}
     for bout in bouts(events):
@@ -681,15 +681,15 @@ def test_a_refusal_speaks_the_language_of_the_browser(lived):
 
 
 def test_a_refusal_keeps_its_cause_in_another_language():
-    words = words_of("de")
-    error = explained(BridgeError("disk full"))
+    words = translation_for("de")
+    error = user_error(BridgeError("disk full"))
     assert words.translated(str(error)) == "Es wurde nicht gespeichert: disk full"
     assert words.translated("nothing of ours") == "nothing of ours"
 
 
 @pytest.mark.parametrize("language", sorted(languages() - {"en"}))
 def test_each_language_has_the_texts_of_english_with_their_placeholders(language):
-    english, other = words_of("en").texts, words_of(language).texts
+    english, other = translation_for("en").texts, translation_for(language).texts
     own = {key for key in other if not key.startswith("class.")}
     assert own == english.keys()
     assert {key: placeholders(other[key]) for key in own} == {
@@ -727,7 +727,7 @@ def test_a_german_browser_gets_german_words_dates_and_errors(lived):
     assert "{{" not in page
     _, day = got(lived, f"/day?{lived.date}", **GERMAN)
     assert {"Husten", "Weinen", "Telefon"} <= {n["words"] for n in day["rooms"][0]["lanes"]}
-    assert day["title"].split(",")[0] in words_of("de").texts["weekdays"].split()
+    assert day["title"].split(",")[0] in translation_for("de").texts["weekdays"].split()
     assert got(lived, "/day?x", **GERMAN)[1]["error"].startswith("Von diesem Tag")
     origin = f"http://127.0.0.1:{lived.port}"
     for event, label, text in (
@@ -877,7 +877,7 @@ def test_doubtful_sounds_of_one_moment_are_one_entry_that_names_their_classes():
     doubts = {each.id: DoubtfulSound(each.label, each.start, each.end, 40.0, {}) for each in moment}
     folded = bouts([*moment, *others], doubts)
     assert [[*bout.events] for bout in folded] == [others[1:], others[:1], moment]
-    shown = ShownBouts(folded[0].end, UTC, words_of("en"), lambda _: "", is_alone=True)
+    shown = ShownBouts(folded[0].end, UTC, translation_for("en"), lambda _: "", is_alone=True)
     entry = shown.describe(folded[-1])
     assert entry["words"] == "A loud sound"
     assert entry["sure"] == "loud, and the model is not sure: perhaps music or talking"

@@ -13,7 +13,7 @@ from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.settings import RecorderAddress
-from hearthlog.analyzer.bridge.wording import words_of
+from hearthlog.analyzer.bridge.wording import translation_for
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.local_time import day_span
@@ -96,4 +96,4 @@ def test_the_page_has_one_lane_of_running_water_and_counts_what_the_report_count
     (day,) = data.days
     begun = np.concatenate([day.night_events("running_water"), day.events("running_water")])
     assert lanes["running_water"]["count"] == len({*begun.tolist()}) > 0
-    assert words_of("de").class_words("running_water") == "Fließendes Wasser"
+    assert translation_for("de").class_words("running_water") == "Fließendes Wasser"

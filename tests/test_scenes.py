@@ -245,7 +245,7 @@ def new_clips(tmp_path_factory):
     return write_training_set(tmp_path_factory.mktemp("new"), clips_per_class=2, seed=12)
 
 
-def words_of(model, data, *more):
+def translation_for(model, data, *more):
     return "evaluate", "scenes", model, "--data", data, "--scenes", 1, "--minutes", 1, *more
 
 
@@ -253,7 +253,8 @@ def test_the_same_seed_gives_the_same_scores_and_another_one_others(
     model_file, new_clips, tmp_path, capfd
 ):
     first, again, other = (
-        run(capfd, *words_of(model_file, new_clips, "--json", "--seed", seed)) for seed in (4, 4, 5)
+        run(capfd, *translation_for(model_file, new_clips, "--json", "--seed", seed))
+        for seed in (4, 4, 5)
     )
     assert first.returncode == 0, first.stderr
     assert first.stdout == again.stdout != other.stdout
@@ -264,7 +265,7 @@ def test_the_same_seed_gives_the_same_scores_and_another_one_others(
     assert [one["seed"] for one in found["scenes"]] == [4]
     picture = tmp_path / "scenes.png"
     options = ("--plot", picture, "--seed", 4, "--colour", "pink", "--floor", -60, "--gain", -6)
-    table = run(capfd, *words_of(model_file, new_clips, *options))
+    table = run(capfd, *translation_for(model_file, new_clips, *options))
     assert table.returncode == 0, table.stderr
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert max(map(len, table.stdout.splitlines())) <= 100
@@ -280,13 +281,13 @@ def test_what_the_model_has_learned_from_is_counted(captured, training_set, new_
     others = read_manifest(new_clips, scenario.labels)
     new = evaluate_scenes(model_file, model, others, scenario, OPTIONS, ignore_progress)
     assert new.sources_learned == 0
-    result = run(capfd, *words_of(model_file, training_set))
+    result = run(capfd, *translation_for(model_file, training_set))
     assert result.returncode == 3
     assert f"was trained on {known.sources} of the {known.sources} sources" in result.stderr
 
 
 def test_a_model_of_simulated_sounds_is_said_to_be_one_once(second_file, new_clips, capfd):
-    result = run(capfd, *words_of(second_file, new_clips, "--scenes", 2))
+    result = run(capfd, *translation_for(second_file, new_clips, "--scenes", 2))
     assert result.returncode == 0, result.stderr
     assert result.stderr.count("simulated sounds only") == 1
 
@@ -296,7 +297,7 @@ def test_a_clip_may_be_a_part_of_a_file(model_file, tmp_path, capfd):
     (data / "manifest.csv").write_text(
         "path,label,source_group,start,end\n0.wav,speech,a,1,1.5\n0.wav,music,a,3,3.01\n"
     )
-    result = run(capfd, *words_of(model_file, data, "--json"))
+    result = run(capfd, *translation_for(model_file, data, "--json"))
     found = json.loads(result.stdout)
     assert (found["clips"], found["skipped"]) == (1, {"shorter than a frame of 50 ms": 1})
     seconds = found["per_class"]["speech"]["support"] / 20
@@ -317,7 +318,7 @@ def manifest_of(folder, *rows):
 
 def test_a_class_without_a_clip_is_said(model_file, tmp_path, capfd):
     data = manifest_of(tmp_path / "two", ("speech", 2.0), ("Cough", 1.0), ("music", 0.01))
-    result = run(capfd, *words_of(model_file, data))
+    result = run(capfd, *translation_for(model_file, data))
     assert result.returncode == 3
     assert "has no clip of music, phone_ring, crying" in result.stderr
     assert "speech" not in result.stderr
@@ -344,12 +345,12 @@ def test_bad_input_is_one_line_that_says_what_to_do(model_file, training_set, tm
         ((training_set, "--plot", "p.pdf"), 2, "*.png"),
     )
     for (data, *options), status, output in cases:
-        result = run(capfd, *words_of(model_file, data, *options))
+        result = run(capfd, *translation_for(model_file, data, *options))
         assert result.returncode == status, options
         assert output in result.stderr
         lines = [line for line in result.stderr.splitlines() if "recording 1 scene" not in line]
         assert len(lines) == 1
         assert result.stdout == ""
-    missing = run(capfd, *words_of(tmp_path / "no.safetensors", training_set))
+    missing = run(capfd, *translation_for(tmp_path / "no.safetensors", training_set))
     assert (missing.returncode, missing.stderr.count("\n")) == (1, 1)
     assert "no such model file" in missing.stderr

@@ -112,7 +112,7 @@ class EventCorrections:
         self._folder = folder
         self._node = node
         self._marks: list[Mark] = []
-        self._own: dict[str, Correction] = {}  # by the ids of events: not read back yet
+        self._pending: dict[str, Correction] = {}  # by the ids of events: not read back yet
         self._lock = threading.Lock()
         self._reader = threading.Lock()  # one at a time
         self._read: dict[Path, tuple[int, int]] = {}  # layers that were read: time and size
@@ -147,7 +147,7 @@ class EventCorrections:
         with self._reader:
             names = ((log, log_name(log)) for log in find_logs(self._folder))
             logs = [log for log, name in names if name.node == self._node and not name.layer]
-            found, written = {}, list(self._own.items())
+            found, written = {}, list(self._pending.items())
             for log in logs[-_MOST_LOGS:]:
                 with suppress(FileNotFoundError):
                     state = review_path(log).stat()
@@ -158,19 +158,19 @@ class EventCorrections:
             self._marks = [mark for log in found for mark in read_marks(log)]
             with self._lock:
                 for identifier, correction in written:
-                    if self._own.get(identifier) == correction:
-                        del self._own[identifier]
+                    if self._pending.get(identifier) == correction:
+                        del self._pending[identifier]
                 self.number += 1
 
     def of_day(self, marks: Sequence[Mark]) -> "EventCorrections":
         """Return the corrections by the marks of a past day in place of the newest logs."""
         past = EventCorrections(self._folder, self._node)
-        past._marks, past._own, past.number = [*marks], self._own, self.number
+        past._marks, past._pending, past.number = [*marks], self._pending, self.number
         return past
 
-    def of(self, event: SoundEvent) -> Correction | None:
+    def correction_of(self, event: SoundEvent) -> Correction | None:
         """Return the correction of an event; None if there is none."""
-        written = self._own.get(event.id)
+        written = self._pending.get(event.id)
         if written is not None:
             return written
         own = [mark for mark in self._marks if mark.microphone == event.microphone]
@@ -197,10 +197,12 @@ class EventCorrections:
                 common = min(mark.end, event.end) - max(mark.start, event.start)
                 if common > longest.get(event.id, 0):
                     longest[event.id], found[event.id] = common, class_name(mark.label)
-        own = self._own
+        own = self._pending
         return found | {event.id: own[event.id].label for event in events if event.id in own}
 
-    def added(self, microphone: str, events: Sequence[SoundEvent], since: int) -> list[SoundEvent]:
+    def sounds_without_event(
+        self, microphone: str, events: Sequence[SoundEvent], since: int
+    ) -> list[SoundEvent]:
         """Return the marked sounds since a time that no event of the microphone (any class) has."""
         marks = [
             mark
@@ -230,10 +232,10 @@ class EventCorrections:
         """Correct the class of an event; raise `BridgeError` if it cannot be marked."""
         with self._lock:
             correct_event(self._folder, self._node, event, label, reviewer)
-            self._own[event.id] = Correction(label, reviewer == REVIEWER)
+            self._pending[event.id] = Correction(label, reviewer == REVIEWER)
             self.number += 1
-            while len(self._own) > _MOST_OWN:
-                del self._own[next(iter(self._own))]
+            while len(self._pending) > _MOST_OWN:
+                del self._pending[next(iter(self._pending))]
 
 
 def _pause(event: SoundEvent, mark: Mark) -> int:
@@ -241,7 +243,7 @@ def _pause(event: SoundEvent, mark: Mark) -> int:
     return EVENT_PAUSE if event.label == class_name(mark.label) else 0
 
 
-def explained(error: Exception) -> HearthlogError:
+def user_error(error: Exception) -> HearthlogError:
     """Convert an error to one with a message for people at home."""
     cause: BaseException | None = error
     while cause is not None:

@@ -238,7 +238,7 @@ class LiveMicrophone:
                     own.given.update({event.id} & given.keys())
                     if event.id in counted or event.id in given:
                         own.counted.append(event)
-        for event in corrections.added(self.name, every, since):
+        for event in corrections.sounds_without_event(self.name, every, since):
             own = found.get(names.get(event.label, event.label))
             if own is not None:
                 own.events.append(event)

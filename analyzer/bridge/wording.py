@@ -1,4 +1,4 @@
-"""Words of the page of the home, in each language that has a file of texts."""
+"""Texts of the page of the home, in each language that has a file of texts."""
 
 import json
 import re
@@ -24,7 +24,7 @@ _TIMES = {0: "never", 1: "once", 2: "twice"}  # keys of counts that have a word
 _WITH_CAUSE = ("error.not saved", "error.not played")
 
 
-class Words:
+class Translation:
     """The texts of a language, `en`, `de` …, by key, with placeholders in braces."""
 
     def __init__(self, language: str, texts: Mapping[str, str]) -> None:
@@ -136,15 +136,15 @@ def languages() -> frozenset[str]:
 
 
 @cache
-def words_of(language: str) -> Words:
-    """Return the words of a language; those of English if it has no file."""
+def translation_for(language: str) -> Translation:
+    """Return the texts of a language; those of English if it has no file."""
     own = language if language in languages() else _DEFAULT
-    return Words(own, json.loads(files(_FILES).joinpath(f"{own}.json").read_text("utf-8")))
+    return Translation(own, json.loads(files(_FILES).joinpath(f"{own}.json").read_text("utf-8")))
 
 
 @cache
 def _keys_of_english() -> dict[str, str]:
-    return {text: key for key, text in words_of(_DEFAULT).texts.items()}
+    return {text: key for key, text in translation_for(_DEFAULT).texts.items()}
 
 
 def preferred_language(header: str) -> str:
@@ -162,7 +162,7 @@ def preferred_language(header: str) -> str:
     return next((tag for tag in ordered if tag in languages()), _DEFAULT)
 
 
-ENGLISH = words_of(_DEFAULT)
+ENGLISH = translation_for(_DEFAULT)
 
 
 def clock(time: int, zone: tzinfo) -> str:

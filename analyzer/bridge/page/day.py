@@ -13,7 +13,7 @@ from hearthlog.analyzer.bridge.home_state import (
     ClassSounds,
     LiveMicrophone,
 )
-from hearthlog.analyzer.bridge.wording import ENGLISH, Words, clock, room
+from hearthlog.analyzer.bridge.wording import ENGLISH, Translation, clock, room
 from hearthlog.analyzer.logs.local_time import (
     EVENING,
     MORNING,
@@ -73,7 +73,7 @@ class HomeDay(NamedTuple):
     microphones: Sequence[LiveMicrophone]
     moment: Today  # the current day; for a past day, its last moment
     zone: tzinfo
-    words: Words = ENGLISH
+    words: Translation = ENGLISH
     is_past: bool = False
     corrections: EventCorrections = NO_CORRECTIONS
     sureness: Sureness = UNMEASURED
@@ -83,7 +83,7 @@ class HomeDay(NamedTuple):
 
         What somebody has answered needs none.
         """
-        if self.corrections.of(event) is not None:
+        if self.corrections.correction_of(event) is not None:
             return ""
         return self.words.sureness(event.confidence, self.sureness)
 
@@ -93,7 +93,10 @@ class HomeDay(NamedTuple):
 
     def is_unsure(self, event: SoundEvent) -> bool:
         """Whether an event is shown as not sure: nobody has answered what it was, either."""
-        return self.sureness.is_unsure(event.confidence) and self.corrections.of(event) is None
+        return (
+            self.sureness.is_unsure(event.confidence)
+            and self.corrections.correction_of(event) is None
+        )
 
     def sounds(self, microphone: LiveMicrophone, since: int) -> dict[str, ClassSounds]:
         """Return the events of each shown class since a time, corrected by people."""
@@ -175,7 +178,7 @@ def _missing_classes(home: HomeDay) -> str:
     return " ".join(notes)
 
 
-def _listed_classes(names: Iterable[str], words: Words) -> str:
+def _listed_classes(names: Iterable[str], words: Translation) -> str:
     return words.listed([words.inside(words.class_words(name)) for name in ordered(names)])
 
 
@@ -452,7 +455,7 @@ def _class_and_times(
     return parts
 
 
-def _times_of(times: str, where: str, name: str, words: Words) -> str:
+def _times_of(times: str, where: str, name: str, words: Translation) -> str:
     """Format a count, with its class and where it was if these are given."""
     if not name:
         return words.text("times and clocks", times=times, clocks=where) if where else times

@@ -14,7 +14,7 @@ from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, read_sureness
 from hearthlog.analyzer.activity.values import BASELINE_DAYS
 from hearthlog.analyzer.bridge.commands import class_of
-from hearthlog.analyzer.bridge.corrections import EventCorrections, explained
+from hearthlog.analyzer.bridge.corrections import EventCorrections, user_error
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
@@ -35,7 +35,13 @@ from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scena
 from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, page_token
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, Report
-from hearthlog.analyzer.bridge.wording import Words, clock, preferred_language, room, words_of
+from hearthlog.analyzer.bridge.wording import (
+    Translation,
+    clock,
+    preferred_language,
+    room,
+    translation_for,
+)
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time
 from hearthlog.analyzer.logs.shown_classes import read_list, write_list
@@ -57,7 +63,7 @@ _DAY = 24 * 3600 * NANOSECONDS
 class PageView:
     """The parts of the page in one language."""
 
-    def __init__(self, words: Words) -> None:
+    def __init__(self, words: Translation) -> None:
         self.words = words
         self.board = Board()
         self.now = RoomStatus(words)
@@ -139,18 +145,18 @@ class HomePage:
                 "to this machine"
             )
 
-    def words(self, accepted: str) -> Words:
+    def words(self, accepted: str) -> Translation:
         """Return the words of the configured language, else of one that a browser accepts."""
-        return words_of(self._settings.language or preferred_language(accepted))
+        return translation_for(self._settings.language or preferred_language(accepted))
 
     def view(self, language: str) -> PageView:
         """Return the parts of the page in a language."""
         with self._lock:
             if language not in self._views:
-                self._views[language] = PageView(words_of(language))
+                self._views[language] = PageView(translation_for(language))
             return self._views[language]
 
-    def board(self, words: Words) -> Board:
+    def board(self, words: Translation) -> Board:
         """Return the parts of the page in a language, for its stream."""
         return self.view(words.language).board
 
@@ -221,7 +227,7 @@ class HomePage:
         with self._lock:
             return [view.board for view in self._views.values()]
 
-    def _last_bouts(self, update: OutputUpdate, words: Words) -> Any:
+    def _last_bouts(self, update: OutputUpdate, words: Translation) -> Any:
         microphones = update.state.microphones.values()
         names = ordered(label for each in microphones for label in [*each.classes, *each.labels()])
         shown = self._shown(
@@ -253,10 +259,10 @@ class HomePage:
         return found
 
     def _shown(
-        self, words: Words, now: int, corrections: EventCorrections, *, is_alone: bool
+        self, words: Translation, now: int, corrections: EventCorrections, *, is_alone: bool
     ) -> ShownBouts:
         def correction(event: SoundEvent) -> str:
-            found = corrections.of(event)
+            found = corrections.correction_of(event)
             if found is None:
                 return ""
             is_nothing = found.label == SILENCE
@@ -265,7 +271,7 @@ class HomePage:
 
         return ShownBouts(now, self._home.zone, words, correction, is_alone, self._sureness)
 
-    def act(self, path: str, subject: str, label: str, words: Words) -> str:
+    def act(self, path: str, subject: str, label: str, words: Translation) -> str:
         """Carry out what a person asked for; return what was done, in words."""
         if path in _MARKS:
             return self._mark(subject, label, words, is_single=_MARKS[path])
@@ -273,7 +279,7 @@ class HomePage:
             return self._recurring.name(subject, label, words)
         return self._show(subject, label, words)
 
-    def answer(self, path: str, text: str, words: Words) -> Any:
+    def answer(self, path: str, text: str, words: Translation) -> Any:
         """Return what a browser asks for, for JSON: days, a day, or events with kept sound."""
         if path == "/days":
             days = self._past.dates()
@@ -312,7 +318,7 @@ class HomePage:
             event = None if past is None else past[1]
         return None if event is None or event.label in self._state.never_tell else event
 
-    def _day(self, text: str, words: Words) -> Any:
+    def _day(self, text: str, words: Translation) -> Any:
         try:
             requested = date.fromisoformat(text)
         except ValueError as error:
@@ -338,7 +344,7 @@ class HomePage:
         unsure = doubtful(microphones, events)
         return bouts(events, events_to_review(day.doubts, unsure, events, hidden))
 
-    def _mark(self, identifier: str, text: str, words: Words, *, is_single: bool) -> str:
+    def _mark(self, identifier: str, text: str, words: Translation, *, is_single: bool) -> str:
         bout = None if is_single else self._bouts.get(identifier)
         events: Sequence[SoundEvent] = [] if bout is None else bout.events
         past = None if events else self._past.find_event(identifier)
@@ -356,11 +362,11 @@ class HomePage:
             for event in events:
                 self._state.corrections.add(event, label)
         except BridgeError as error:
-            raise explained(error) from error
+            raise user_error(error) from error
         name = words.text("mark.nothing") if label == SILENCE else words.class_words(label)
         return words.text("mark.own", **{"class": name})
 
-    def _show(self, choice: str, label: str, words: Words) -> str:
+    def _show(self, choice: str, label: str, words: Translation) -> str:
         """Hide a class from all outputs and reports, or show it again."""
         name = class_of(label)
         if name == SILENCE or choice not in _SHOW:
@@ -372,7 +378,7 @@ class HomePage:
             names = read_list(folder)
             write_list(folder, names - {name} if _SHOW[choice] else names | {name})
         except (HearthlogError, OSError) as error:
-            raise explained(error) from error
+            raise user_error(error) from error
         key = "shown again" if _SHOW[choice] else "shown nowhere"
         return words.text(key, **{"class": words.class_words(name)})
 

@@ -12,7 +12,7 @@ from typing import IO, Any, NamedTuple, cast
 from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import READ_ONLY, REVIEWER
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import ENGLISH, Words, one_line, room
+from hearthlog.analyzer.bridge.wording import ENGLISH, Translation, one_line, room
 from hearthlog.analyzer.discover.summary import (
     SUMMARY,
     GroupsSummary,
@@ -50,7 +50,7 @@ def recurring_list(
     looked: int,
     outcomes: Mapping[str, str],
     moment: Moment,
-    words: Words = ENGLISH,
+    words: Translation = ENGLISH,
 ) -> Any:
     """Return the recurring sounds for JSON.
 
@@ -71,7 +71,12 @@ def recurring_list(
 
 
 def _described(
-    key: str, group: GroupSummary, outcome: str, shown: tuple[Moment, Words], *, is_alone: bool
+    key: str,
+    group: GroupSummary,
+    outcome: str,
+    shown: tuple[Moment, Translation],
+    *,
+    is_alone: bool,
 ) -> Any:
     moment, words = shown
     number = words.text("recurring.sound", number=group.number)
@@ -87,7 +92,7 @@ def _described(
     }
 
 
-def _how_often(group: GroupSummary, words: Words) -> str:
+def _how_often(group: GroupSummary, words: Translation) -> str:
     hours = busiest_hours(group.hours)
     first, _, last = hours.partition(" to ")
     often = words.times(group.times)
@@ -100,13 +105,13 @@ def _how_often(group: GroupSummary, words: Words) -> str:
     )
 
 
-def _named_as(group: GroupSummary, words: Words) -> str:
+def _named_as(group: GroupSummary, words: Translation) -> str:
     labels = [*group.labels.items()][:_LABELS]
     shares = [f"{words.class_words(label)} ({100 * share:.0f}{_SPACE}%)" for label, share in labels]
     return words.text("recurring.labels", classes=words.listed(shares, "or")) if shares else ""
 
 
-def _examples(group: GroupSummary, moment: Moment, words: Words, *, is_alone: bool) -> str:
+def _examples(group: GroupSummary, moment: Moment, words: Translation, *, is_alone: bool) -> str:
     return words.listed(
         [
             words.when(read_time(each.start), *moment, seconds=True)
@@ -136,7 +141,7 @@ class GroupNaming:
         self._thread: Thread | None = None
         self._lock = Lock()
 
-    def start(self, key: str, number: int, label: str, words: Words = ENGLISH) -> str:
+    def start(self, key: str, number: int, label: str, words: Translation = ENGLISH) -> str:
         """Start marking the sounds of a group, or unmarking for an empty label; return a status.
 
         Raise `BridgeError` if another group is being named, or the folder is not writable.
@@ -167,7 +172,9 @@ class GroupNaming:
             if self._process is not None:
                 self._process.terminate()
 
-    def _follow(self, process: subprocess.Popen[str], key: str, number: int, words: Words) -> None:
+    def _follow(
+        self, process: subprocess.Popen[str], key: str, number: int, words: Translation
+    ) -> None:
         """Wait for the process to end, and store its result."""
         timer = Timer(_LONGEST_SECONDS, process.kill)
         timer.daemon = True
@@ -206,7 +213,7 @@ def _read(stream: IO[str], wanted: str) -> tuple[str, str]:
     return one_line(result), one_line(last)
 
 
-def _outcome(status: int, result: str, last: str, words: Words) -> str:
+def _outcome(status: int, result: str, last: str, words: Translation) -> str:
     if status < 0:
         return words.text("recurring.signal", number=-status)
     if not result or status not in {0, _DONE_WITH_LOSSES}:
@@ -230,7 +237,7 @@ class RecurringSounds:
         self._naming = GroupNaming(folder)
         self._described: dict[str, tuple[Any, Any]] = {}  # state and content, by language
 
-    def describe(self, moment: Moment, words: Words = ENGLISH) -> Any:
+    def describe(self, moment: Moment, words: Translation = ENGLISH) -> Any:
         """Return the groups for JSON; empty without a readable summary."""
         self._look()
         if self._summary is None:
@@ -243,7 +250,7 @@ class RecurringSounds:
             described = self._described[words.language] = state, shown
         return described[1]
 
-    def name(self, key: str, text: str, words: Words = ENGLISH) -> str:
+    def name(self, key: str, text: str, words: Translation = ENGLISH) -> str:
         """Start naming a group by a class or its words, or removing an empty name; return a status.
 
         Raise `BridgeError` if the group no longer exists, the text is no valid class name, or

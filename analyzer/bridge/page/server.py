@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol, cast
 from urllib.parse import unquote
 
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import ENGLISH, Words
+from hearthlog.analyzer.bridge.wording import ENGLISH, Translation
 from hearthlog.analyzer.http import (
     SECONDS,
     HttpHandler,
@@ -79,7 +79,7 @@ class PageAdmission:
         changes: bool,
         client: str = "",
         has_pass: bool = False,
-        words: Words = ENGLISH,
+        words: Translation = ENGLISH,
     ) -> str:
         """Check a request; return the reason of a refusal and its remedy, empty if it is admitted.
 
@@ -232,10 +232,10 @@ _ENTRANCE = (
 class PageContent(Protocol):
     """Content and actions of the page; called from many threads."""
 
-    def words(self, accepted: str) -> Words:
+    def words(self, accepted: str) -> Translation:
         """Return the words for an `Accept-Language`."""
 
-    def board(self, words: Words) -> Board:
+    def board(self, words: Translation) -> Board:
         """Return the parts of the page in a language."""
 
     def boards(self) -> Sequence[Board]:
@@ -244,10 +244,10 @@ class PageContent(Protocol):
     def home_name(self) -> str:
         """Return the name of the home."""
 
-    def act(self, path: str, subject: str, label: str, words: Words) -> str:
+    def act(self, path: str, subject: str, label: str, words: Translation) -> str:
         """Carry out a POST request; return what was done, or raise `HearthlogError`."""
 
-    def answer(self, path: str, text: str, words: Words) -> Any:
+    def answer(self, path: str, text: str, words: Translation) -> Any:
         """Return the answer to a GET request for JSON, or raise `HearthlogError`."""
 
     def sound(self, identifier: str) -> bytes:
@@ -308,7 +308,7 @@ class _Handler(HttpHandler):
         super().setup()
 
     @property
-    def _words(self) -> Words:
+    def _words(self) -> Translation:
         return self._server.content.words(self.headers.get("Accept-Language", ""))
 
     def do_GET(self) -> None:

@@ -15,7 +15,7 @@ from hearthlog.analyzer.activity.segments import source_microphone
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.bridge.page.doubts import Doubts
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import Words, clock, room
+from hearthlog.analyzer.bridge.wording import Translation, clock, room
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.models.classes import (
     IMPORTANT,
@@ -147,7 +147,7 @@ class ShownBouts(NamedTuple):
 
     now: int
     zone: tzinfo
-    words: Words
+    words: Translation
     correction: Callable[[SoundEvent], str]  # of an event in words; empty if there is none
     is_alone: bool
     sureness: Sureness = UNMEASURED

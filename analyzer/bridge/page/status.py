@@ -8,7 +8,7 @@ from hearthlog.analyzer.activity import ANY_SOUND, HOLD_SECONDS
 from hearthlog.analyzer.activity.segments import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import OutputUpdate
-from hearthlog.analyzer.bridge.wording import ENGLISH, Words, one_line, reason, room
+from hearthlog.analyzer.bridge.wording import ENGLISH, Translation, one_line, reason, room
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
@@ -25,7 +25,7 @@ class _Current(NamedTuple):
 class RoomStatus:
     """Current sounds of each microphone, with their start times."""
 
-    def __init__(self, words: Words = ENGLISH) -> None:
+    def __init__(self, words: Translation = ENGLISH) -> None:
         self._words = words
         self._last: dict[str, _Current] = {}
 
@@ -68,7 +68,7 @@ class RoomStatus:
         }
 
 
-def _sounds_in_words(microphone: LiveMicrophone, words: Words) -> str:
+def _sounds_in_words(microphone: LiveMicrophone, words: Translation) -> str:
     if not microphone.is_listening():
         return words.text("now.not listening")
     names = [words.class_words(label) for label in active_classes(microphone)]
@@ -120,7 +120,7 @@ def _line(what: str, level: int, text: str) -> dict[str, Any]:
 
 
 def health_list(
-    update: OutputUpdate, node: str, started: int, recurring: str = "", words: Words = ENGLISH
+    update: OutputUpdate, node: str, started: int, recurring: str = "", words: Translation = ENGLISH
 ) -> list[Any]:
     """Return the health of all subjects for JSON.
 
@@ -133,7 +133,7 @@ def health_list(
     return lines
 
 
-def _lines(update: OutputUpdate, node: str, started: int, words: Words) -> Iterator[Any]:
+def _lines(update: OutputUpdate, node: str, started: int, words: Translation) -> Iterator[Any]:
     state = update.state
     for microphone in state.present():
         yield _of_microphone(microphone, state, words)
@@ -151,7 +151,7 @@ def _lines(update: OutputUpdate, node: str, started: int, words: Words) -> Itera
     yield _line(words.text("health.bridge"), _WELL, words.text("health.follows", time=since))
 
 
-def _of_microphone(microphone: LiveMicrophone, state: HomeState, words: Words) -> Any:
+def _of_microphone(microphone: LiveMicrophone, state: HomeState, words: Translation) -> Any:
     health = state.health.get(microphone.name)
     text, level = ("", _WELL) if health is None else (one_line(health.text), health.level)
     is_alone = len(state.present()) == 1
@@ -165,14 +165,14 @@ def _of_microphone(microphone: LiveMicrophone, state: HomeState, words: Words) -
     return _line(what, min(level, _WRONG), words.text(key, text=text))
 
 
-def _thing(subject: str, node: str, words: Words) -> str:
+def _thing(subject: str, node: str, words: Translation) -> str:
     whose, _, part = subject.partition(" ")
     if whose == node and part in _THINGS:
         return words.text(_THINGS[part])
     return one_line(subject.replace("_", " ")).capitalize()
 
 
-def scenario_lines(update: OutputUpdate, words: Words = ENGLISH) -> list[Any]:
+def scenario_lines(update: OutputUpdate, words: Translation = ENGLISH) -> list[Any]:
     """Return a line for each scenario of each microphone, for JSON."""
     state, midnight = update.state, update.today.midnight
     lines = []
@@ -188,14 +188,14 @@ def scenario_lines(update: OutputUpdate, words: Words = ENGLISH) -> list[Any]:
     return lines
 
 
-def _now(own: LiveMicrophone, words: Words) -> str:
+def _now(own: LiveMicrophone, words: Translation) -> str:
     if not own.is_listening():
         return words.inside_first(words.text("now.not listening"))
     names = [words.inside(words.class_words(label)) for label in active_classes(own)]
     return words.listed(names) or words.text("now.none")
 
 
-def _today(own: LiveMicrophone, midnight: int, words: Words) -> str:
+def _today(own: LiveMicrophone, midnight: int, words: Translation) -> str:
     """Format count and total length of each class since midnight, longest first."""
     events = {label: own.events(label, midnight) for label in own.labels()}
     seconds = {label: sum(each.seconds for each in same) for label, same in events.items() if same}

@@ -1,4 +1,4 @@
-"""The watcher of a fast month: starts the recorder, injects the faults that are due, and reads the logs."""
+"""The watcher of a fast month: runs the recorder, injects faults, and reads the logs."""
 
 import os
 import random
@@ -224,7 +224,7 @@ class Watcher:
             run.samples += [] if sample is None else [sample]
 
     def _list_logs(self) -> None:
-        """Read the coverage of the logs that have their names now, before they are thinned or deleted."""
+        """Read the coverage of the finished logs, before they are thinned or deleted."""
         for path in self._folder.logs.rglob(f"*{SUFFIX}"):
             if path.name not in self._coverages and not is_layer(path):
                 self._coverages[path.name] = self._pool.submit(read_log_coverage, path)
