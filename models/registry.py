@@ -90,7 +90,7 @@ def write_judgement(folder: Path, judgement: Judgement) -> None:
         raise ModelError(f"{path}: cannot be written ({error})") from error
 
 
-def insist(folder: Path, sha256: str) -> None:
+def override_judgement(folder: Path, sha256: str) -> None:
     """Allow a model to label regardless of its judgement, or without one.
 
     Raise `ModelError` if the permission cannot be written.
@@ -269,7 +269,7 @@ def rollback(folder: Path) -> tuple[Model, str]:
         while earlier:
             with suppress(ModelError):
                 model = load(folder, earlier.pop())
-                insist(folder, model.sha256)
+                override_judgement(folder, model.sha256)
                 _point(folder, CHAMPION, model.name)
                 _write_history(folder, earlier)
                 return model, before
@@ -283,7 +283,7 @@ def rollback(folder: Path) -> tuple[Model, str]:
                 "to return to that, or promote a model"
             )
         _copy_starter(folder, model)
-        insist(folder, model.sha256)
+        override_judgement(folder, model.sha256)
         _point(folder, CHAMPION, model.name)
         _write_history(folder, [])
         return model, before

@@ -31,7 +31,7 @@ from hearthlog.models.features.auros21 import WINDOW_FRAMES
 from hearthlog.models.features.infrasound import InfrasoundFilter
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.models.registry import insist
+from hearthlog.models.registry import override_judgement
 from hearthlog.recorder.config import Settings, load_settings
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.labelling.model_watch import ReloadRequests
@@ -705,7 +705,7 @@ def test_clips_stop_while_a_model_speaks_that_does_not_know_what_is_private(
     save_model(one, folder / "one.safetensors")
     save_model(other, folder / "other.safetensors")
     for name in ("one", "other"):
-        insist(folder, load_model(folder / f"{name}.safetensors").sha256)
+        override_judgement(folder, load_model(folder / f"{name}.safetensors").sha256)
     (folder / "champion.safetensors").symlink_to("one.safetensors")
     requests = ReloadRequests()
     names = ["other.safetensors", "one.safetensors"]

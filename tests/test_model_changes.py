@@ -25,7 +25,7 @@ from spliced import run
 from hearthlog.models.classifiers.classifier import Classifier, label_timing
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, model_card
-from hearthlog.models.registry import insist, promote
+from hearthlog.models.registry import override_judgement, promote
 from hearthlog.models.starter import SHA256, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import Frames, Gap
@@ -358,7 +358,7 @@ def test_a_champion_that_was_replaced_is_named_at_the_start(folder, capfd):
         ModelWatch(folder / "champion.safetensors", SimpleQueue()).close()
         return [line for line in capfd.readouterr().err.splitlines() if "was promoted" in line]
 
-    insist(folder, load_model(folder / "champion.safetensors").sha256)
+    override_judgement(folder, load_model(folder / "champion.safetensors").sha256)
     assert output_at_start() == []
     file = (folder / "champion.safetensors").resolve()
     shutil.copyfile(starter_file("bathroom"), file)

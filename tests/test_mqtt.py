@@ -17,7 +17,7 @@ from livehome import LiveHome, following, midday_zone
 from paho.mqtt.client import MQTTMessage
 
 from hearthlog.analyzer.bridge import state as bridge_state
-from hearthlog.analyzer.bridge.mqtt.home_assistant import described, device_id, discovery
+from hearthlog.analyzer.bridge.mqtt.home_assistant import device_id, discovery, topics_in_discovery
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics, Topics
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
@@ -627,7 +627,7 @@ def test_what_comes_to_a_broker_later_is_not_taken_for_what_a_bridge_left(home, 
         listener.publish(f"{ROOT}/hall/level", "-3", retain=True)
         message = MQTTMessage(topic=config.encode())
         message.payload, message.retain = text.encode(), True
-        assert described(Topics("hearthlog", "home"), message.payload)
+        assert topics_in_discovery(Topics("hearthlog", "home"), message.payload)
         bridged.publisher._take(message)
         home.write_segment("coughing", 0.1)
         listener.wait_for(f"{ROOT}/mic/event")

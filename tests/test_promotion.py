@@ -40,8 +40,8 @@ from hearthlog.analyzer.promotion.paired_labels import (
 from hearthlog.analyzer.promotion.promotion_check import (
     Verdict,
     clearly_better,
-    damages,
     find_champion,
+    regressions,
 )
 from hearthlog.analyzer.promotion.recent_time import (
     LogSpan,
@@ -58,8 +58,8 @@ from hearthlog.models.classifiers.model import Amount, Description
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.models.registry import (
     Judgement,
-    insist,
     judgement_path,
+    override_judgement,
     promote,
     read_judgement,
     rollback,
@@ -351,7 +351,7 @@ def test_a_recorder_takes_over_only_what_was_judged(place, monkeypatch, capfd):
     assert "`hearthlog models promote deaf --anyway` overrides this" in line
     time.sleep(0.3)
     assert (list(watch.refusals()), watch.ready) == ([], None)  # said once
-    insist(folder, model.sha256)
+    override_judgement(folder, model.sha256)
     deadline = time.monotonic() + 120
     while watch.ready is None:
         assert time.monotonic() < deadline
@@ -493,29 +493,29 @@ def evidence(minutes, right=NOTHING_KNOWN, sure=None):
 @pytest.mark.parametrize(("minutes", "more"), [(9.6, "1 more minute,"), (8.2, "2 more minutes,")])
 def test_how_much_more_has_to_be_recorded_is_said(minutes, more):
     short = replace(evidence([[1, 0], [0, 1]]), minutes=minutes)
-    (line,) = damages(short, "one")
+    (line,) = regressions(short, "one")
     assert f" judge it: record {more} then promote it" in line
 
 
 def test_a_model_that_changes_much_has_to_be_right_about_more():
     much = [[1300, 0, 0], [0, 70, 30], [0, 0, 40]]
-    (output,) = damages(evidence(much, PairedAccuracy(40, 30, 30, 3, 3)), "one")
+    (output,) = regressions(evidence(much, PairedAccuracy(40, 30, 30, 3, 3)), "one")
     assert "it is right about 30, one about 30, and 30 min a day would change: " in output
-    assert damages(evidence(much, PairedAccuracy(40, 30, 33, 6, 3)), "one") == []
-    assert damages(evidence(much), "one") == []  # nothing was drawn at random
+    assert regressions(evidence(much, PairedAccuracy(40, 30, 33, 6, 3)), "one") == []
+    assert regressions(evidence(much), "one") == []  # nothing was drawn at random
     little = [[1300, 0, 0], [0, 80, 20], [0, 0, 40]]
-    assert damages(evidence(little, PairedAccuracy(40, 30, 30, 3, 3)), "one") == []
+    assert regressions(evidence(little, PairedAccuracy(40, 30, 30, 3, 3)), "one") == []
 
 
 def test_marks_that_agree_with_the_champion_less_than_by_chance_are_said_to_be_wrong():
     better = evidence([[1300, 0, 0], [0, 20, 80], [0, 0, 40]], PairedAccuracy(55, 3, 50, 48, 1))
-    (output,) = damages(replace(better, named=NamedSounds(55, 3, 5)), "one")
+    (output,) = regressions(replace(better, named=NamedSounds(55, 3, 5)), "one")
     assert output.startswith(
         "of 55 sounds of the minutes that were drawn at random, one gives 3 the"
     )
     assert "the marks are wrong" in output
     for few in (NamedSounds(19, 0, 5), NamedSounds(55, 3, 2), NamedSounds(55, 6, 5), NamedSounds()):
-        assert damages(replace(better, named=few), "one") == []
+        assert regressions(replace(better, named=few), "one") == []
 
 
 def test_a_sound_is_named_if_a_person_and_the_champion_give_it_classes_that_the_champion_has():
@@ -576,7 +576,7 @@ def with_new_class(known):
     ],
 )
 def test_a_new_class_may_take_what_marks_say_was_wrong_and_not_what_a_person_left(known, harmless):
-    reasons = damages(with_new_class(known), "one")
+    reasons = regressions(with_new_class(known), "one")
     assert harmless or "most becomes laughing" in reasons[0]
     assert len(reasons) == (not harmless)
 
@@ -584,7 +584,7 @@ def test_a_new_class_may_take_what_marks_say_was_wrong_and_not_what_a_person_lef
 def test_an_old_class_may_take_what_marks_say_was_wrong_where_what_was_right_is_known_and_stays():
     def reasons(known):
         table = [[1300, 0, 0], [0, 40, 40], [0, 0, 60]]
-        return damages(replace(evidence(table, sure=table), known=known), "one")
+        return regressions(replace(evidence(table, sure=table), known=known), "one")
 
     wrong = {("music", "speech", "music"): 3}
     right = {("speech", "speech", "speech"): 3}
@@ -604,7 +604,7 @@ def test_a_new_class_that_swallows_what_was_right_or_silence_or_the_day_is_refus
         changes = LabelChanges(["silence", "speech", "music", "hum"], table, each)
         nothing = PairedAccuracy()
         home = 60.0, 1440.0, changes, np.zeros((4, 4)), nothing, nothing, [], nothing
-        return damages(HomeComparison(*home, {"hum"}, known), "one")
+        return regressions(HomeComparison(*home, {"hum"}, known), "one")
 
     marks = {("hum", "silence", "hum"): 9, ("hum", "speech", "hum"): 9}
     assert reasons(marks | {("music", "music", "music"): 12, ("music", "music", "hum"): 4}) == []
@@ -682,34 +682,34 @@ def test_right_is_said_of_sounds_and_a_model_is_wrong_about_a_class_that_it_lack
 
 def test_fewer_right_by_chance_is_no_damage():
     same = [[1300, 0, 0], [0, 100, 0], [0, 0, 40]]
-    assert damages(evidence(same, PairedAccuracy(40, 30, 29, 4, 5)), "one") == []
-    assert damages(evidence(same, PairedAccuracy(40, 30, 25, 2, 7)), "one") != []
+    assert regressions(evidence(same, PairedAccuracy(40, 30, 29, 4, 5)), "one") == []
+    assert regressions(evidence(same, PairedAccuracy(40, 30, 25, 2, 7)), "one") != []
     recorded = replace(evidence(same), quiet=PairedAccuracy(9, 9, 3, 0, 6))
-    assert damages(recorded, "one") == [
+    assert regressions(recorded, "one") == [
         "of 9 silences of the minutes that were drawn at random it leaves 3 silent, one 9"
     ]
 
 
 def test_sound_that_vanishes_and_a_class_that_multiplies_are_damage_unless_random_minutes_say_not():
     deaf = [[1300, 0, 0], [60, 40, 0], [20, 0, 20]]
-    assert damages(evidence(deaf), "one") == [
+    assert regressions(evidence(deaf), "one") == [
         "what is not silence falls from 2 h 20 min a day to 1 h 00 min"
     ]
     music = [[1290, 0, 10], [0, 30, 70], [0, 0, 15]]
-    assert damages(evidence(music), "one") == ["music rises from 15 min a day to 1 h 35 min"]
-    assert damages(evidence(music, PairedAccuracy(60, 20, 50, 32, 2)), "one") == []
+    assert regressions(evidence(music), "one") == ["music rises from 15 min a day to 1 h 35 min"]
+    assert regressions(evidence(music, PairedAccuracy(60, 20, 50, 32, 2)), "one") == []
     quiet = replace(evidence(music), quiet=PairedAccuracy(40, 0, 40, 40, 0))
-    assert damages(quiet, "one") == ["music rises from 15 min a day to 1 h 35 min"]
+    assert regressions(quiet, "one") == ["music rises from 15 min a day to 1 h 35 min"]
 
 
 def test_what_the_champion_is_sure_of_stays():
     table = [[1300, 0, 0], [0, 85, 15], [0, 0, 40]]
-    (output,) = damages(evidence(table, sure=[[900, 0, 0], [0, 5, 10], [0, 0, 0]]), "one")
+    (output,) = regressions(evidence(table, sure=[[900, 0, 0], [0, 5, 10], [0, 0, 0]]), "one")
     assert output == (
         "of 15 min a day of talking of which one is sure 5.0 min are left, most becomes music"
     )
-    assert damages(evidence(table, sure=[[900, 0, 0], [0, 9, 3], [0, 0, 0]]), "one") == []
-    assert damages(evidence(table, sure=[[900, 0, 0], [0, 1, 4], [0, 0, 0]]), "one") == []
+    assert regressions(evidence(table, sure=[[900, 0, 0], [0, 9, 3], [0, 0, 0]]), "one") == []
+    assert regressions(evidence(table, sure=[[900, 0, 0], [0, 1, 4], [0, 0, 0]]), "one") == []
 
 
 # What would change, as spans to look at

@@ -11,7 +11,7 @@ import pytest
 
 from hearthlog.models.classifiers.model import SIMULATED, Amount, PublicCollection
 from hearthlog.models.modelfile import load_model, save_model
-from hearthlog.models.registry import insist
+from hearthlog.models.registry import override_judgement
 from hearthlog.recorder.labelling.model_watch import ModelWatch
 
 LINE = (
@@ -62,7 +62,7 @@ def test_a_model_that_takes_the_place_of_another_is_looked_at_as_well(
 ):
     link = tmp_path / "champion.safetensors"
     link.symlink_to(model_file)
-    insist(tmp_path, load_model(simulated).sha256)
+    override_judgement(tmp_path, load_model(simulated).sha256)
     watch = ModelWatch(link, requested := SimpleQueue())
     link.unlink()
     link.symlink_to(simulated)

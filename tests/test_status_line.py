@@ -21,7 +21,7 @@ from test_capture import features, wait_for_frames
 
 from hearthlog.models.labels.labeller import FrameLabels
 from hearthlog.models.modelfile import load_model
-from hearthlog.models.registry import insist, promote
+from hearthlog.models.registry import override_judgement, promote
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.events import OK, Frames, SourceHealth
 from hearthlog.recorder.labelling.labelling_models import LabellingModels
@@ -159,7 +159,7 @@ def test_a_terminal_shows_models_and_microphones_that_change_and_may_stop(
         labmic.restore()
         (tmp_path / "models").mkdir()
         terminal.wait_for(r"hearthlog: mic: listening")
-        insist(tmp_path / "models", load_model(Path("bathroom")).sha256)
+        override_judgement(tmp_path / "models", load_model(Path("bathroom")).sha256)
         promote(tmp_path / "models", "bathroom")
         terminal.wait_for(r"hearthlog: the labels are by bathroom now, after general")
         lines = re.split(r"[\r\n]+", terminal.text)

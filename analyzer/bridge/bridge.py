@@ -263,8 +263,8 @@ def open_outputs(
     if settings.alert:
         from hearthlog.analyzer.bridge.alerts.output import AlertsOutput  # noqa: PLC0415
 
-        def publish_alert(rule: str, text: str, rung: int) -> bool:
-            return publisher.output is not None and publisher.output.alert(rule, text, rung)
+        def publish_alert(rule: str, text: str, time: int) -> bool:
+            return publisher.output is not None and publisher.output.alert(rule, text, time)
 
         rules, delivery = settings.alert, settings.delivery
         on_notification = None if mqtt is None else publish_alert

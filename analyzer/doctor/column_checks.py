@@ -29,8 +29,8 @@ from hearthlog.schemas.messages.topics import (
 FEATURES, STATISTICS, LABEL, SEGMENT, GAP = "features", "statistics", "label", "segment", "gap"
 DIRECTION = "direction"  # only from a microphone array
 EMBEDDING = "embedding"  # only with an embedding network
-_BESIDE = "beside"  # topics of a candidate or a scenario
-BESIDE_LABEL, BESIDE_SEGMENT = f"{_BESIDE}/{LABEL}", f"{_BESIDE}/{SEGMENT}"
+_SECONDARY = "secondary"  # topics of a candidate or a scenario
+SECONDARY_LABEL, SECONDARY_SEGMENT = f"{_SECONDARY}/{LABEL}", f"{_SECONDARY}/{SEGMENT}"
 TYPES = {
     "info": message_types.STREAM_INFO,
     FEATURES: message_types.FEATURES,
@@ -40,8 +40,8 @@ TYPES = {
     GAP: message_types.GAP,
     DIRECTION: message_types.DIRECTION,
     EMBEDDING: message_types.EMBEDDING,
-    BESIDE_LABEL: message_types.LABEL,
-    BESIDE_SEGMENT: message_types.SEGMENT,
+    SECONDARY_LABEL: message_types.LABEL,
+    SECONDARY_SEGMENT: message_types.SEGMENT,
 }
 ALWAYS = {"info", FEATURES, STATISTICS, GAP}  # channels in every log of a recorder
 LOG_NAME = re.compile(r"(?P<node>.+)_(?P<time>\d{8}T\d{6}Z)(_\d+)?\.mcap(\.active)?")
@@ -51,8 +51,8 @@ SHARED = {DIAGNOSTICS: message_types.DIAGNOSTICS, ROSOUT: message_types.LOG}
 def split_topic(topic: str) -> tuple[str, str]:
     """Split a topic of a recorder into microphone and kind, such as `mic` and `features`.
 
-    The kind is `BESIDE_LABEL` or `BESIDE_SEGMENT` for a candidate or a scenario; an empty text and
-    the complete topic are returned for other topics.
+    The kind is `SECONDARY_LABEL` or `SECONDARY_SEGMENT` for a candidate or a scenario. For other
+    topics, return an empty text and the complete topic.
     """
     name = parse_topic(topic)
     if name is None:
@@ -60,7 +60,7 @@ def split_topic(topic: str) -> tuple[str, str]:
     kind = name.kind
     if name.labelling != LIVE:
         is_other = name.labelling.partition("/")[0] in {CANDIDATE, SCENARIO}
-        kind = f"{_BESIDE if is_other else name.labelling}/{kind}"
+        kind = f"{_SECONDARY if is_other else name.labelling}/{kind}"
     return (name.microphone, kind) if kind in TYPES else ("", topic)
 
 
@@ -75,11 +75,11 @@ _SUM_TOLERANCE = 1e-4
 _LABEL_LATE = MOST_AHEAD_FRAMES * FRAME_NANOSECONDS + 10_000_000  # ns; of labels by network names
 _LATE = {  # ns, including the tolerance of stamps
     LABEL: _LABEL_LATE,
-    BESIDE_LABEL: _LABEL_LATE,
+    SECONDARY_LABEL: _LABEL_LATE,
     SEGMENT: 75_000_000_000,
     DIRECTION: 400_000_000,
     EMBEDDING: 1_010_000_000,
-    BESIDE_SEGMENT: 75_000_000_000,
+    SECONDARY_SEGMENT: 75_000_000_000,
 }
 
 
@@ -98,7 +98,7 @@ class ColumnChecks:
         """Compare log times with stamps, and `frame_id` with the microphone, if any."""
         columns = self._columns
         stamps = columns["stamp" if kind == ROSOUT else STAMP]
-        if kind in {SEGMENT, BESIDE_SEGMENT, GAP}:
+        if kind in {SEGMENT, SECONDARY_SEGMENT, GAP}:
             stamps = stamps + columns["duration"]
         late = columns.log_times - stamps
         if kind == "info" and not named:
@@ -125,11 +125,11 @@ class ColumnChecks:
         if kind in _ARRAYS and info is not None:
             for field in _ARRAYS[kind]:
                 self._check_array(field, len(info["feature_names"]))
-        elif kind == BESIDE_LABEL:
+        elif kind == SECONDARY_LABEL:
             self._check_labels(_class_names(self._columns))
         elif kind == LABEL and classes is not None:
             self._check_labels(classes)
-        elif kind in {SEGMENT, BESIDE_SEGMENT}:
+        elif kind in {SEGMENT, SECONDARY_SEGMENT}:
             self._check_segments(classes if kind == SEGMENT else None)
         elif kind == GAP:
             self._check_gaps()

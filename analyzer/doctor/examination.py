@@ -308,7 +308,7 @@ def _check_layers(files: Sequence[ExaminedFile]) -> None:
 
 def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
     """Report logs of one node that overlap, unless the clock was set back."""
-    twice = [again for file in files if (again := _lived_twice(file)) is not None]
+    twice = [again for file in files if (again := _repeated_time_span(file)) is not None]
     latest = files[0]
     for file in files[1:]:
         assert file.span is not None
@@ -323,7 +323,7 @@ def _check_overlaps(files: Sequence[ExaminedFile]) -> None:
             latest = file
 
 
-def _lived_twice(file: ExaminedFile) -> tuple[int, int] | None:
+def _repeated_time_span(file: ExaminedFile) -> tuple[int, int] | None:
     """Return the time span that was repeated because the clock was set back, or None."""
     gaps = [
         gap for frames in file.frames.values() if (gap := frames.gap_before) and gap[1] < gap[0]
@@ -341,11 +341,11 @@ def _check_frames(microphone: str, files: Sequence[ExaminedFile]) -> None:
             continue
         missing = frames.first[0] - last[0] - 1 - frames.lost_before
         missing -= earlier.frames[microphone].lost_behind
-        if missing and not _goes_on(frames, [each.frames[microphone] for each in files]):
+        if missing and not _continues(frames, [each.frames[microphone] for each in files]):
             _report_missing(microphone, earlier, file, missing)
 
 
-def _goes_on(frames: FrameSequence, others: Sequence[FrameSequence]) -> bool:
+def _continues(frames: FrameSequence, others: Sequence[FrameSequence]) -> bool:
     """Whether frames continue where any other log ends: the clock may have been set in between."""
     assert frames.first is not None
     number = frames.first[0] - frames.lost_before

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from hearthlog.analyzer.doctor import DISTRUST, Findings
 from hearthlog.analyzer.doctor.column_checks import (
-    BESIDE_LABEL,
     DIRECTION,
     EMBEDDING,
     FEATURES,
     GAP,
     LABEL,
     LOG_NAME,
+    SECONDARY_LABEL,
     SEGMENT,
     SHARED,
     STAMP,
@@ -432,7 +432,7 @@ class MetadataChecks:
         for name, topic in expected.items():
             if name not in self._channels and split_topic(name)[0]:
                 self._error("topics", f"{name} is missing")
-            if name in self._channels and split_topic(name)[1] != BESIDE_LABEL:
+            if name in self._channels and split_topic(name)[1] != SECONDARY_LABEL:
                 self._check_arrays(self._channels[name], topic)
         counts = Counter(c.topic for c in self._data.definitions.channels.values())
         for name, channel in self._channels.items():

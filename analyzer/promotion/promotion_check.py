@@ -51,7 +51,7 @@ _BY_CHANCE = 0.1  # of the sounds: a model of eight classes that knows nothing i
 _MARKS_ALONE = 3  # marks that show a wrong class, if no sound of that class is known
 
 
-def damages(evidence: HomeComparison, champion: str) -> list[str]:
+def regressions(evidence: HomeComparison, champion: str) -> list[str]:
     """Return a sentence for each damage by a model, or one on too little sound for a decision."""
     if evidence.minutes < LEAST_MINUTES:
         loss = f" ({evidence.losses[0]})" if evidence.losses else ""
@@ -282,7 +282,7 @@ def judge(
     elif champion.sha256 != model.sha256:
         logs = recent_logs(home)
         evidence = gather_evidence(champion, model, logs, progress)
-        reasons = damages(evidence, champion.name) or _worse_than_at_first(
+        reasons = regressions(evidence, champion.name) or _worse_than_at_first(
             folder, model, champion, home, logs
         )
     judgement = Judgement(

@@ -19,7 +19,7 @@ from hearthlog.analyzer.logs.recorder_info import RecorderInfo
 from hearthlog.analyzer.relabel.stream_labeller import (
     StreamLabeller,
     UnreadableError,
-    goes_on_in,
+    continues_in,
     infos_for_model,
     read_sound,
     recover_copy,
@@ -264,11 +264,11 @@ def _label(job: Job, log: Path, before: _Labellers) -> tuple[UnfinishedLayer, _L
     frames = _write_labels(part, job, infos, labellers)
     undecided = False
     for info in infos:
-        labeller, goes_on = labellers[info.microphone], None
+        labeller, continues = labellers[info.microphone], None
         if job.next_log is not None:
-            goes_on = goes_on_in(labeller, info, job.next_log)
-            undecided |= goes_on is None
-        if not goes_on:
+            continues = continues_in(labeller, info, job.next_log)
+            undecided |= continues is None
+        if not continues:
             labeller.close()
     metadata = LayerMetadata(
         model=model.name,

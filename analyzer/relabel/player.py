@@ -127,7 +127,7 @@ class Player:
         if info.path == self._opened:
             return
         self._opened = info.path
-        if self._info is not None and self._goes_on(info):
+        if self._info is not None and self._continues(info):
             self._change_model(info)
         elif self._info is None or _is_new_run(info, self._info, self._next):
             self._close()
@@ -235,7 +235,7 @@ class Player:
                     by_scenario[name] = own
         return {name: by_scenario[name] for name in self._options.scenarios if name in by_scenario}
 
-    def _goes_on(self, info: RecorderInfo) -> bool:
+    def _continues(self, info: RecorderInfo) -> bool:
         """Return whether a log is of the same recorder run, but of another model."""
         assert self._info is not None
         if info.first_frame is None or info.model_sha256 == self._info.model_sha256:

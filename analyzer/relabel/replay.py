@@ -268,10 +268,10 @@ def _play_features(logs: LogSet, player: Player, start: int, end: int, *, compar
     for info in logs.between(start, end):
         player.open(info)
         for batch in read_recorded(info, start, end):
-            goes_on = all(player.push(event) for event in batch.events)
+            continues = all(player.push(event) for event in batch.events)
             if compare:
                 player.compare(batch)
-            if not goes_on:
+            if not continues:
                 return
 
 
@@ -280,12 +280,12 @@ def _play_clips(logs: LogSet, player: Player, end: int) -> None:
     player.open(infos[0])
     for event in _clip_events(infos):
         if isinstance(event, Gap):
-            goes_on = event.end < end and player.push(event)
+            continues = event.end < end and player.push(event)
         else:
             count = int(np.searchsorted(event.stamps, end))
             part = Frames(event.first, event.samples[:count], event.stamps[:count])
-            goes_on = player.push(part) and count == len(event.stamps)
-        if not goes_on:
+            continues = player.push(part) and count == len(event.stamps)
+        if not continues:
             return
 
 

@@ -293,7 +293,7 @@ def _label_readable(
     return labeller, from_start
 
 
-def goes_on_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> bool | None:
+def continues_in(labeller: StreamLabeller, info: RecorderInfo, next_log: Path) -> bool | None:
     """Return whether the sound of a log continues in the next log.
 
     None while undecided: the next log is being written and has no frame.

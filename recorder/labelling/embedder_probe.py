@@ -36,7 +36,7 @@ _MOST_MEGABYTES = 300  # of the service's limit of 600
 _PATIENCE_SECONDS = 30.0
 _WINDOWS = 5
 _MODULE = "hearthlog.recorder.labelling.embedder_probe"
-_GOES_ON = "it is recorded without a network"
+_WITHOUT_NETWORK = "it is recorded without a network"
 _SIGNALS: dict[int, str] = {
     signal.SIGILL: "this processor lacks instructions that its runtime needs",
     signal.SIGKILL: "perhaps there is too little memory",
@@ -114,14 +114,14 @@ def open_embedder(wanted: str = "", microphones: int = 1) -> tuple[Embedder | No
     try:
         path = network_path(name)
     except ModelError as error:
-        return None, f"{error}; {_GOES_ON}" if wanted else ""
+        return None, f"{error}; {_WITHOUT_NETWORK}" if wanted else ""
     try:
         check_pace(path, _probed(name, path, path.stat().st_mtime_ns), microphones)
         return load_embedder(name, path), ""
     except ModelError as error:
-        return None, f"{error}; {_GOES_ON}"
+        return None, f"{error}; {_WITHOUT_NETWORK}"
     except Exception as error:  # noqa: BLE001  no runtime may prevent the start of a recorder
-        return None, f"{path}: cannot be used ({printable(repr(error))[:200]}); {_GOES_ON}"
+        return None, f"{path}: cannot be used ({printable(repr(error))[:200]}); {_WITHOUT_NETWORK}"
 
 
 def likely_network(wanted: str = "") -> str:

@@ -323,7 +323,7 @@ def rollback(folder: _Folder = None) -> None:
 def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) -> None:
     """Raise ModelError if a model was judged harmful; judge a model without a verdict first."""
     from hearthlog.analyzer.promotion.promotion_check import judge, judged_against
-    from hearthlog.models.registry import first_starter, insist, is_starter, load
+    from hearthlog.models.registry import first_starter, is_starter, load, override_judgement
     from hearthlog.models.starter import BY_FEATURES, with_network
     from hearthlog.schemas.errors import ModelError
     from hearthlog.tools.cli.promotion import print_verdict, refusal
@@ -333,7 +333,7 @@ def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) 
     is_first = any(first in pair and model.name in pair for pair in pairs)
     is_first = is_first and is_starter(model.name, model.sha256)
     if anyway or is_first:
-        insist(folder, model.sha256)
+        override_judgement(folder, model.sha256)
         return
     judgement = judged_against(folder, model, home)
     if judgement is None:

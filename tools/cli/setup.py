@@ -143,7 +143,7 @@ def _installation(config: Path | None, *, service: bool) -> Installation:
         for name, verb in ((unit.NAME, "record"), (unit.BRIDGE_NAME, "bridge")):
             there = installation.unit(name)
             if not (is_system and unit.is_packaged(name)):
-                unit.place_of(there.parent, name)
+                unit.unit_path(there.parent, name)
             own = None if is_system or verb == "bridge" else folder
             unit.check_unit(there, verb, installation.config, own)
         if is_system:

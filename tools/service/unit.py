@@ -171,7 +171,7 @@ def is_user_manager_running() -> bool:
     return bool(runtime) and Path(runtime, "systemd").is_dir()
 
 
-def place_of(folder: Path, name: str) -> Path:
+def unit_path(folder: Path, name: str) -> Path:
     """Return the path for a unit, after checking that it may be written.
 
     Raise `ServiceError` if a foreign unit exists there, or there is no systemd.
@@ -362,7 +362,7 @@ def install_for_system(account: str, config: Path | None) -> Installed:
     failures. Nothing is written on failure, unless only the start failed.
     """
     check_root()
-    unit = place_of(SYSTEM_UNITS, NAME)
+    unit = unit_path(SYSTEM_UNITS, NAME)
     person = _person(account)
     config = None if config is None else config.absolute()
     check_program_seen()
@@ -381,7 +381,7 @@ def install_for_user(config: Path | None) -> Installed:
     Raise `ConfigurationError` and `ServiceError` as `install_for_system`.
     """
     check_no_other_recorder()
-    unit = place_of(user_units(), NAME)
+    unit = unit_path(user_units(), NAME)
     config = None if config is None else config.absolute()
     needs = _rehearse(Path.cwd(), config, None)
     write_unit(unit, user_unit(verb_command("record", config), Path.cwd(), needs))
@@ -448,7 +448,7 @@ def install_bridge(config: Path, account: str | None) -> Installed:
     failures. Nothing is written on failure, unless only the start failed.
     """
     check_root()
-    unit = place_of(SYSTEM_UNITS, BRIDGE_NAME)
+    unit = unit_path(SYSTEM_UNITS, BRIDGE_NAME)
     write_unit(unit, checked_bridge(config.absolute(), account))
     return Installed(unit, start_unit(BRIDGE_NAME, is_running=is_systemd_running()))
 

@@ -426,15 +426,15 @@ def notifications(  # noqa: PLR0913, PLR0917
     for condition in _conditions(rule, activity, start, end, zone, state.since):
         if condition.end <= start or condition.start >= end:
             continue
-        goes_on = condition.start < start
-        rung = goes_on and state.has_rung
+        continues = condition.start < start
+        notified = continues and state.has_rung
         time = max(condition.start, start, last + rule.cooldown)
-        if not rung and time < min(condition.end, end):
+        if not notified and time < min(condition.end, end):
             due = end_of_quiet(rule.hours(), time, zone)
             text, is_known = condition.text(time), condition.is_known
             found.append(Notification(rule.name, time, text, is_known, due))
-            last, rung = time, True
-        has_rung = rung and condition.end >= end
+            last, notified = time, True
+        has_rung = notified and condition.end >= end
     return found, RuleState(last, has_rung, state.since, end)
 
 

@@ -90,9 +90,9 @@ class RuleWatch:
         self._progress = memory.load(rules)
         self._saved = now
         self.never_tell: frozenset[str] = frozenset()  # classes whose rules never notify
-        self.set_right(now)
+        self.reset_stale_progress(now)
 
-    def set_right(self, now: int) -> None:
+    def reset_stale_progress(self, now: int) -> None:
         """Restart rules whose progress is in the future, or more than a day old."""
         is_ahead = any(own.until > now + AHEAD for own in self._progress.values())
         self._progress = {name: _as_of(own, now) for name, own in self._progress.items()}
@@ -120,7 +120,7 @@ class RuleWatch:
         `activity` returns the live activity, complete up to `until` (nanoseconds of UTC), if a rule
         needs it; `weeks` that between two times, read from the logs.
         """
-        self.set_right(now)
+        self.reset_stale_progress(now)
         found: list[Notification] = []
         activity_once = cache(activity)
         for rule in self._rules:
@@ -137,9 +137,9 @@ class RuleWatch:
                 what = weeks(until - history(rule), until)
             else:
                 what = activity_once()
-            rang, state = notifications(rule, what, own.until, until, self._zone, own)
+            new, state = notifications(rule, what, own.until, until, self._zone, own)
             self._progress[rule.name] = state
-            found += rang
+            found += new
         self._outbox.put(found)
         if found or now - self._saved >= _SAVE_EVERY:
             self.save(now)
@@ -300,7 +300,7 @@ class AlertsOutput:
         """
         home, looked, forgot = self._followed, -math.inf, time.monotonic()
         now = self._latest = time.time_ns()
-        self._watch.set_right(now)
+        self._watch.reset_stale_progress(now)
         self._activity = LiveActivity(self._watch.needed_from(now), _PATIENCE)
         with suppress(LogError):  # no log yet
             logs = find_home_logs([home.folder])

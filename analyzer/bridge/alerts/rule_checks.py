@@ -1,4 +1,4 @@
-"""Checks of rules against the configuration and models: rules that can never ring."""
+"""Checks of rules against the configuration and models: rules that can never notify."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -89,7 +89,7 @@ _JUDGED_AND_TODAY = 2  # days, in addition to the baseline
 def rule_doubts(
     rules: Sequence[AlertRule], settings: Settings, microphones: Sequence[str]
 ) -> Iterator[str]:
-    """Report the rules that can never ring with the configuration of the recorder.
+    """Report the rules that can never notify with the configuration of the recorder.
 
     Names are not checked if no configured microphones are given.
     """

@@ -61,7 +61,7 @@ class Connection:
         self._subscriptions = subscriptions
         self._received = received
         self._client_id = client_id
-        self._place = place_of(settings)
+        self._broker = broker_address(settings)
         self._hint = ""
         self._connected: float | None = None  # time of connection, by CLOCK_MONOTONIC
         self._is_refused = False  # by the broker, which then closes the connection
@@ -203,7 +203,9 @@ class Connection:
         self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
     ) -> None:
         if reason.is_failure:
-            self._report(f"{self._place}: refused: {reason}; see user, password_file and client_id")
+            self._report(
+                f"{self._broker}: refused: {reason}; see user, password_file and client_id"
+            )
             self._is_refused = True
             return
         self._is_refused = False
@@ -225,7 +227,7 @@ class Connection:
             what = f"its certificate is refused: {error.verify_message}; see ca_file"
         else:
             what = str(getattr(error, "strerror", None) or error)
-        self._report(f"{self._place}: no broker ({what}); trying again")
+        self._report(f"{self._broker}: no broker ({what}); trying again")
 
     def _on_disconnect(
         self, client: mqtt.Client, _data: Any, _flags: Any, reason: ReasonCode, _more: Any
@@ -234,7 +236,7 @@ class Connection:
         self._ready_at = math.inf
         if since is None:
             if reason.is_failure and not self._is_refused:  # a refusal is reported already
-                self._report(f"{self._place}: no connection: {reason}{self._hint}; trying again")
+                self._report(f"{self._broker}: no connection: {reason}{self._hint}; trying again")
             self._is_refused = False
             return
         is_short = reason.is_failure and time.monotonic() - since < _SHORT_SECONDS
@@ -244,18 +246,18 @@ class Connection:
         client.reconnect_delay_set(pause, max(pause, _LONGEST_PAUSE))
         if reason.value == _TAKEN_OVER or self._short > 1:
             self._report(
-                f"{self._place}: the broker ends each connection at once: is another client named "
+                f"{self._broker}: the broker ends each connection at once: is another client named "
                 f"{self._client_id} running, a second bridge? give one of them another client_id"
             )
         elif reason.is_failure:
-            self._report(f"{self._place}: the connection ended: {reason}; trying again")
+            self._report(f"{self._broker}: the connection ended: {reason}; trying again")
 
     def _on_publish(
         self, _client: mqtt.Client, _data: Any, _number: int, reason: ReasonCode, _more: Any
     ) -> None:
         if reason.is_failure:
             self._report(
-                f"{self._place}: a message was refused: {reason}; the broker must let this client "
+                f"{self._broker}: a message was refused: {reason}; the broker must let this client "
                 f"write below {self._alive.rpartition('/')[0]}, and for Home Assistant below "
                 "its discovery topic"
             )
@@ -268,7 +270,7 @@ class Connection:
             self._wait_for_kept()
         for topic, reason in zip(self._subscriptions, reasons, strict=False):
             if reason.is_failure:
-                self._report(f"{self._place}: may not read {topic}: {reason}")
+                self._report(f"{self._broker}: may not read {topic}: {reason}")
 
     def _on_message(self, _client: mqtt.Client, _data: Any, message: mqtt.MQTTMessage) -> None:
         if message.topic == self._alive:
@@ -285,7 +287,7 @@ class Connection:
             self._ready_at = min(time.monotonic() + _KEPT_SECONDS, since + _MOST_KEPT_SECONDS)
 
 
-def place_of(settings: MqttSettings) -> str:
+def broker_address(settings: MqttSettings) -> str:
     """Return the host and port of a broker as text."""
     return f"{settings.host}:{_port(settings)}"
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from hearthlog._version import __version__
-from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, Topics, identifier
+from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, PUBLISHED, TopicKey, Topics, identifier
 from hearthlog.models.classes import SILENCE, in_words
 
 Component = dict[str, Any]  # of a discovery payload, as Home Assistant defines it
@@ -80,7 +80,7 @@ def command_discovery(
             "switch",
             f"Tell of {words}",
             entity_category="config",
-            state_topic=topics.at(TOLD, label=name),
+            state_topic=topics.at(PUBLISHED, label=name),
             state_on="ON",
             state_off="OFF",
             payload_on=_command(told=True, label=name),
@@ -97,8 +97,8 @@ def command_discovery(
     }
 
 
-def described(topics: Topics, payload: bytes) -> list[Place]:
-    """Return the places in a discovery payload of this recorder; empty for other payloads."""
+def topics_in_discovery(topics: Topics, payload: bytes) -> list[TopicKey]:
+    """Return the topics in a discovery payload of this recorder; empty for other payloads."""
     try:
         content = json.loads(payload)
         (own,) = content["device"]["identifiers"]
@@ -109,22 +109,22 @@ def described(topics: Topics, payload: bytes) -> list[Place]:
             for key in ("state_topic", "json_attributes_topic")
             if key in each
         ]
-        places = [topics.parse(topic) for topic in [*listening, *named]]
+        keys = [topics.parse(topic) for topic in [*listening, *named]]
     except (ValueError, RecursionError, KeyError, TypeError, AttributeError):
         return []
-    microphone = places[0].microphone if listening and places[0] is not None else ""
+    microphone = keys[0].microphone if listening and keys[0] is not None else ""
     device = device_id(topics.node, microphone) if microphone else home_id(topics.node)
     if (own, bridge) != (device, topics.at("bridge")):
         return []
-    more = [Place("last_event", microphone)] if microphone else []
-    found = [each for each in places if each is not None and each.microphone == microphone]
+    more = [TopicKey("last_event", microphone)] if microphone else []
+    found = [each for each in keys if each is not None and each.microphone == microphone]
     counted = dict.fromkeys(each.label for each in found if each.kind == "counts")
     more += [
-        Place(kind, microphone, label)
+        TopicKey(kind, microphone, label)
         for label in counted
         for kind in ("count_today", "count_night")
     ]
-    return [Place(CONFIG, microphone), *found, *more]
+    return [TopicKey(CONFIG, microphone), *found, *more]
 
 
 def _device(own: str, name: str) -> dict[str, Any]:

@@ -13,12 +13,18 @@ from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     command_discovery,
-    described,
     device_id,
     discovery,
     home_id,
+    topics_in_discovery,
 )
-from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, TOLD, Place, RetainedTopics, Topics
+from hearthlog.analyzer.bridge.mqtt.topics import (
+    CONFIG,
+    PUBLISHED,
+    RetainedTopics,
+    TopicKey,
+    Topics,
+)
 from hearthlog.analyzer.bridge.output import RECENT, OutputUpdate
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState, Report
@@ -77,7 +83,7 @@ class MqttPublisher:
         if settings.commands:
             subscriptions.append(self._command_topic)
             if self._reads_back:
-                subscriptions.append(topics.at(TOLD) + "+")
+                subscriptions.append(topics.at(PUBLISHED) + "+")
         if self._is_new:
             subscriptions.append(self._discovery_topic("+"))
         self._connection = Connection(
@@ -88,12 +94,12 @@ class MqttPublisher:
             subscriptions=subscriptions,
             received=self._take,
         )
-        self._announced.add(topics.at("bridge"), Place("bridge"))
+        self._announced.add(topics.at("bridge"), TopicKey("bridge"))
         self._commands = self._take_commands() if settings.commands else None
 
     def update(self, update: OutputUpdate) -> None:
         """Publish an update."""
-        self._keep(Place("recorder"), _ONLINE[update.state.is_recording()])
+        self._keep(TopicKey("recorder"), _ONLINE[update.state.is_recording()])
         for each in update.state.every():
             if update.state.is_removed(each.name):
                 self._classes.pop(each.name, None)
@@ -129,8 +135,8 @@ class MqttPublisher:
         for event in events:
             self._announced.note_event(event)
             if self._announced.is_published(event.label):
-                place = Place("last_event", event.microphone)
-                self._keep(place, json.dumps(event_fields(event, update)))
+                key = TopicKey("last_event", event.microphone)
+                self._keep(key, json.dumps(event_fields(event, update)))
 
     def _recent(self, waiting: deque[SoundEvent], update: OutputUpdate) -> list[SoundEvent]:
         """Take the waiting events, without those that are too old."""
@@ -179,22 +185,22 @@ class MqttPublisher:
             if not message.retain:  # a retained command was meant for an earlier time
                 self._received.append(bytes(message.payload))
         elif self._reads_back and message.retain and message.payload == b"OFF":
-            place = self._topics.parse(message.topic)
-            if place is not None and place.kind == TOLD and len(self._off) < _MOST_OFF:
-                self._off.add(place.label)
+            key = self._topics.parse(message.topic)
+            if key is not None and key.kind == PUBLISHED and len(self._off) < _MOST_OFF:
+                self._off.add(key.label)
         elif self._is_new and message.retain and not self._was_ready:
             self._take_found(bytes(message.payload))
 
     def _take_found(self, payload: bytes) -> None:
         """Adopt topics from the discovery payload of an earlier bridge, up to a limit."""
-        places = described(self._topics, payload) if len(payload) <= _LARGEST_FOUND else []
-        for place in places:
-            topic = self._topic(place)
+        keys = topics_in_discovery(self._topics, payload) if len(payload) <= _LARGEST_FOUND else []
+        for key in keys:
+            topic = self._topic(key)
             size = self._found_size + len(topic)
             if size > _MOST_FOUND_SIZE or self._found >= _MOST_FOUND:
                 return
             self._found, self._found_size = self._found + 1, size
-            self._announced.add(topic, place)
+            self._announced.add(topic, key)
 
     def _leave_out_again(self, classes: Iterable[str]) -> None:
         """Mute the classes that an earlier bridge had muted."""
@@ -219,16 +225,16 @@ class MqttPublisher:
             self._report(f"mqtt: not published: {', '.join(muted)}; {remedy}")
         self._has_published_muted = True
 
-    def _topic(self, place: Place) -> str:
-        if place.kind != CONFIG:
-            return self._topics.at(*place)
-        node, microphone = self._topics.node, place.microphone
+    def _topic(self, key: TopicKey) -> str:
+        if key.kind != CONFIG:
+            return self._topics.at(*key)
+        node, microphone = self._topics.node, key.microphone
         return self._discovery_topic(device_id(node, microphone) if microphone else home_id(node))
 
-    def _keep(self, place: Place, value: str) -> None:
+    def _keep(self, key: TopicKey, value: str) -> None:
         """Publish a retained value, and record its topic."""
-        topic = self._topic(place)
-        self._announced.add(topic, place)
+        topic = self._topic(key)
+        self._announced.add(topic, key)
         self._forgotten.discard(topic)
         self._connection.keep(topic, value)
 
@@ -239,7 +245,7 @@ class MqttPublisher:
         if self._settings.home_assistant:
             gone = sorted(self._announced.labels(name).difference(classes))
             config = discovery(self._topics, name, classes, gone)
-            self._keep(Place(CONFIG, name), json.dumps(config))
+            self._keep(TopicKey(CONFIG, name), json.dumps(config))
 
     def _describe_switches(self) -> None:
         """Announce the commands to Home Assistant, if both are enabled."""
@@ -250,7 +256,7 @@ class MqttPublisher:
         if switches != self._switches:
             self._switches = switches
             config = command_discovery(self._topics, *switches)
-            self._keep(Place(CONFIG), json.dumps(config))
+            self._keep(TopicKey(CONFIG), json.dumps(config))
 
     def _clear_gone(self, state: HomeState) -> None:
         """Clear retained topics of this or an earlier bridge that are obsolete."""
@@ -258,21 +264,21 @@ class MqttPublisher:
             self._announced.remove(self._forgotten)
             self._forgotten.clear()
         known = {each.name for each in state.every()}
-        for topic, place in list(self._announced.topics.items()):
-            if self._is_gone(topic, place, state):
+        for topic, key in list(self._announced.topics.items()):
+            if self._is_gone(topic, key, state):
                 self._connection.forget(topic)
                 self._forgotten.add(topic)
-            elif place.kind == "listening" and place.microphone not in known:
+            elif key.kind == "listening" and key.microphone not in known:
                 self._connection.keep(topic, _ONLINE[False])  # no recent messages
 
-    def _is_gone(self, topic: str, place: Place, state: HomeState) -> bool:
-        kind, microphone, label = place
-        if topic != self._topic(place):  # the recorder or the topic was renamed
+    def _is_gone(self, topic: str, key: TopicKey, state: HomeState) -> bool:
+        kind, microphone, label = key
+        if topic != self._topic(key):  # the recorder or the topic was renamed
             return True
         if kind == CONFIG and not self._settings.home_assistant:
             return True
         if not microphone:
-            return kind in {CONFIG, TOLD} and not self._settings.commands
+            return kind in {CONFIG, PUBLISHED} and not self._settings.commands
         if state.is_removed(microphone):
             return True
         classes = self._classes.get(microphone)
@@ -280,7 +286,7 @@ class MqttPublisher:
 
     def _publish_state(self, microphone: LiveMicrophone, update: OutputUpdate) -> None:
         def keep(kind: str, value: str) -> None:
-            self._keep(Place(kind, microphone.name), value)
+            self._keep(TopicKey(kind, microphone.name), value)
 
         keep("listening", _ONLINE[microphone.is_listening()])
         if not microphone.label:
@@ -300,7 +306,7 @@ class MqttPublisher:
         for label in (each for each in microphone.classes if each != SILENCE):
             is_published = self._announced.is_published(label)
             if self._settings.commands:
-                self._keep(Place(TOLD, label=label), _ON[is_published])
+                self._keep(TopicKey(PUBLISHED, label=label), _ON[is_published])
             of_day, of_night = counts[label]
             values = {
                 "on": _ON[microphone.active.is_active(label) and is_published],
@@ -312,7 +318,7 @@ class MqttPublisher:
             if last is not None:  # otherwise the retained value of an earlier bridge is right
                 values["last_heard"] = iso_time(last.end, update.zone)
             for kind, value in values.items():
-                self._keep(Place(kind, microphone.name, label), value)
+                self._keep(TopicKey(kind, microphone.name, label), value)
 
     def _publish_problem(self, microphone: LiveMicrophone, state: HomeState) -> None:
         others = state.microphones.keys() - {microphone.name}
@@ -322,7 +328,7 @@ class MqttPublisher:
             if health.level and subject.partition(" ")[0] not in others
         ]
         value = {"state": _ON[bool(bad)], "text": shortened("; ".join(bad), _LONGEST)}
-        self._keep(Place("problem", microphone.name), json.dumps(value))
+        self._keep(TopicKey("problem", microphone.name), json.dumps(value))
 
 
 def event_fields(event: SoundEvent, update: OutputUpdate) -> dict[str, str | float]:

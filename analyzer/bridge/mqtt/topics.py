@@ -14,10 +14,10 @@ from hearthlog.analyzer.bridge.state import RETAINED, BridgeState, Report, State
 _KEPT = "".join(chr(code) for code in range(33, 127) if chr(code) not in "%+#/$")
 
 
-CONFIG, TOLD = "config", "told"  # kinds of places
+CONFIG, PUBLISHED = "config", "told"  # kinds of topics
 
 
-class Place(NamedTuple):
+class TopicKey(NamedTuple):
     """The subject of a topic; parts that do not apply are empty."""
 
     kind: str
@@ -37,34 +37,34 @@ class Topics(NamedTuple):
         return f"{self.base}/{self.node}"
 
     def at(self, kind: str, microphone: str = "", label: str = "") -> str:
-        """Return the topic of a place of any kind but `config`, which uses discovery topics.
+        """Return the topic of a key of any kind but `config`, which uses discovery topics.
 
         A kind is of the recorder, such as `bridge`; of a microphone, such as `heard`; or of a
         class, such as `on`, or `told`, which shows whether its events are published. Characters of
         a label that are invalid in topics or not ASCII are percent-encoded, such as `%2B`.
         """
         part = quote(label, safe=_KEPT)
-        if kind == TOLD:
+        if kind == PUBLISHED:
             return f"{self.root}/told/{part}"
         if label:
             return f"{self.root}/{microphone}/class/{part}/{kind}"
         return f"{self.root}/{microphone}/{kind}" if microphone else f"{self.root}/{kind}"
 
-    def parse(self, topic: str) -> Place | None:
-        """Return the place of a topic, the inverse of `at`; None for other topics."""
+    def parse(self, topic: str) -> TopicKey | None:
+        """Return the key of a topic, the inverse of `at`; None for other topics."""
         parts = topic.removeprefix(f"{self.root}/").split("/")
         match parts:
             case [kind]:
-                place = Place(kind)
+                key = TopicKey(kind)
             case ["told", label]:
-                place = Place(TOLD, label=unquote(label))
+                key = TopicKey(PUBLISHED, label=unquote(label))
             case [microphone, kind]:
-                place = Place(kind, microphone)
+                key = TopicKey(kind, microphone)
             case [microphone, "class", label, kind]:
-                place = Place(kind, microphone, unquote(label))
+                key = TopicKey(kind, microphone, unquote(label))
             case _:
                 return None
-        return place if self.at(*place) == topic else None
+        return key if self.at(*key) == topic else None
 
 
 def identifier(text: str) -> str:
@@ -79,7 +79,7 @@ _UNSAVED = "topics that go are not cleared after the next start"
 
 class _Content(BaseModel, extra="forbid"):
     broker: str = ""  # of earlier versions
-    topics: dict[str, Place] = {}
+    topics: dict[str, TopicKey] = {}
     muted: list[str] = []
     last_events: dict[str, str] = {}  # id of the last published event, by microphone
 
@@ -102,7 +102,7 @@ class RetainedTopics:
         self._former = [name for name in names if name != RETAINED]  # of other recorder names
         self.is_new = not names
         self._is_changed = bool(self._former)
-        self.topics: dict[str, Place] = {}
+        self.topics: dict[str, TopicKey] = {}
         # Of any broker: another address may be the same broker; a new one has no topics.
         self._muted: set[str] = set()
         self._last_events: dict[str, str] = {}
@@ -113,11 +113,11 @@ class RetainedTopics:
                 self._muted.update(each.muted)
                 self._last_events |= each.last_events
 
-    def add(self, topic: str, place: Place) -> None:
+    def add(self, topic: str, key: TopicKey) -> None:
         """Record a topic with a retained value."""
         with self._lock:
-            if self.topics.get(topic) != place:
-                self.topics[topic] = place
+            if self.topics.get(topic) != key:
+                self.topics[topic] = key
                 self._is_changed = True
 
     def remove(self, topics: Iterable[str]) -> None:
@@ -128,12 +128,12 @@ class RetainedTopics:
 
     def microphones(self) -> set[str]:
         """Return the microphones with recorded topics."""
-        return {place.microphone for place in self.topics.values() if place.microphone}
+        return {key.microphone for key in self.topics.values() if key.microphone}
 
     def labels(self, microphone: str) -> set[str]:
         """Return the recorded classes of a microphone, or of the switches for an empty name."""
-        places = list(self.topics.values())
-        return {each.label for each in places if each.label and each.microphone == microphone}
+        keys = list(self.topics.values())
+        return {each.label for each in keys if each.label and each.microphone == microphone}
 
     def muted(self) -> list[str]:
         """Return the muted classes, sorted."""

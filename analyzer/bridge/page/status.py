@@ -14,7 +14,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
 
 _QUIETEST = -80.0  # dBFS at the left end of the bar
-_GOES_ON = (HOLD_SECONDS + 5) * NANOSECONDS  # after the end of a segment
+_HELD = (HOLD_SECONDS + 5) * NANOSECONDS  # after the end of a segment
 
 
 class _Current(NamedTuple):
@@ -94,7 +94,7 @@ def _active_since(microphone: LiveMicrophone) -> int:
     active = active_classes(microphone)
     if active:
         last = [microphone.last_event(label) for label in active]
-        end = microphone.active.time - _GOES_ON
+        end = microphone.active.time - _HELD
         going = [event.start for event in last if event is not None and event.end >= end]
         return max(going) if len(going) == len(active) else 0
     last = [microphone.last_event(label) for label in microphone.labels()]
