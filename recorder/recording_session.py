@@ -32,7 +32,7 @@ from hearthlog.recorder.labelling.labelling_models import LabellingModels, Model
 from hearthlog.recorder.log.clips import ClipRecorder
 from hearthlog.recorder.log.description import LogDescription, describe_log, join_descriptions
 from hearthlog.recorder.log.folder_lock import FolderLock
-from hearthlog.recorder.log.recovery import LogFinisher, Recovered
+from hearthlog.recorder.log.recovery import LogFinisher, RecoveredLog
 from hearthlog.recorder.log.rolling_log import RollingLog
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.stream import EncodedMessage, diagnostics, stream_info
@@ -174,7 +174,7 @@ class RecordingSummary:
     """Summary of a recording."""
 
     logs: list[Path]  # finished ones
-    recovered: Sequence[Recovered] = ()  # logs of an earlier recorder, completed first
+    recovered: Sequence[RecoveredLog] = ()  # logs of an earlier recorder, completed first
     frames_lost: int = 0
     gaps: int = 0  # while the recorder was running
     models_refused: int = 0  # files that could not be used

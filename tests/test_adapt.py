@@ -19,7 +19,7 @@ from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_
 from hearthlog.analyzer.training.home_recordings import (
     HOME_WEIGHT,
     home_recordings,
-    lesson_recordings,
+    training_recordings,
 )
 from hearthlog.analyzer.training.manifest import (
     BUILTIN,
@@ -385,7 +385,7 @@ def test_the_commands_lead_from_a_label_file_to_an_adapted_model(
     try:
         output = tmp_path / "home.safetensors"
         done = hearthlog("train", "--base", model_file, "--home", recorded, "-o", output, "--json")
-        marked = list(lesson_recordings(recorded))
+        marked = list(training_recordings(recorded))
     finally:
         layer.unlink()
     assert done.returncode == 0, done.stderr

@@ -32,7 +32,7 @@ from hearthlog.analyzer.training.direction_samples import (
     with_directions,
 )
 from hearthlog.analyzer.training.home_recordings import read_reviewed_sound
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.analyzer.training.pseudo_labels import chosen, confirmed_segments
 from hearthlog.analyzer.workers import open_workers
 from hearthlog.models.classifiers.classifier import Classifier
@@ -341,7 +341,7 @@ def test_marks_in_logs_of_an_array_teach_directions_and_others_do_not(recorded, 
             label = "music" if abs(one.azimuth - CORNER) < 0.3 else "speech"
             marks.append(Mark("mic", at, at + NANOSECONDS, label))
         write_marks(log, marks)
-    adapted = adapt_model(before, home_lessons([logs], before).segments)
+    adapted = adapt_model(before, read_home_training_set([logs], before).segments)
     assert adapted.description.direction_microphones == ["mic"]
     music = adapted.direction_weights[0][before.classes.index("music")]
     near = sectors_of(np.array([CORNER, DOOR], np.float32))
@@ -360,7 +360,7 @@ def test_nothing_is_learned_from_directions_that_no_array_has(recorded, tmp_path
     changed.write(path := tmp_path / "home_20260301T070000Z.mcap")
     write_marks(path, [Mark("mic", one.log_time, one.log_time + NANOSECONDS, "music")])
     with pytest.raises(LogError, match=f"{path.name}: /mic/direction: holds directions that no"):
-        home_lessons([tmp_path], load_model(starter_file(GENERAL)))
+        read_home_training_set([tmp_path], load_model(starter_file(GENERAL)))
 
 
 @pytest.mark.parametrize(

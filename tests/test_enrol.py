@@ -17,7 +17,7 @@ from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.enrol import enrol_file
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.training.home_recordings import home_recordings
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
@@ -196,9 +196,9 @@ def test_two_recordings_enrolled_on_one_day_make_a_class_and_one_of_them_twice_d
     first, second = sorted((household / "crying").glob("*.flac"))[:2]
     for path in (first, first):
         enrol_file(home, "crying", path)
-    assert home_lessons([home], base).segments.classes == base.classes
+    assert read_home_training_set([home], base).segments.classes == base.classes
     enrol_file(home, "crying", second)
-    lessons = home_lessons([home], base)
+    lessons = read_home_training_set([home], base)
     assert lessons.segments.classes == (*base.classes, "crying")
     assert lessons.segments.amounts["crying"].sources == 2
 

@@ -19,10 +19,10 @@ from hearthlog.analyzer.training.home_recordings import (
     HOME,
     HOME_WEIGHT,
     MOST_OF_MARK,
-    lesson_recordings,
     read_reviewed_sound,
+    training_recordings,
 )
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.analyzer.training.manifest import scenario_of
 from hearthlog.analyzer.training.pseudo_labels import (
     chosen,
@@ -117,7 +117,7 @@ def test_what_a_review_left_alone_is_to_stay_as_it_was_labelled(home, model_file
 def test_what_a_review_left_alone_weighs_as_much_as_the_sounds_of_others(home, model_file):
     model = load_model(model_file)
     write(home, [next(one for one in segments(home) if one[2] != "silence")], [full(home)])
-    lessons = home_lessons([home], model).segments
+    lessons = read_home_training_set([home], model).segments
     confirmed = lessons.collection == lessons.collection_names.index(CONFIRMED)
     assert set(lessons.weight[confirmed]) == {1.0}
     assert set(lessons.weight[~confirmed]) == {HOME_WEIGHT}
@@ -147,7 +147,7 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
     middle = (longest[0] + longest[1]) // 2
     halves = (longest[0], middle, "speech"), (middle, longest[1], "music")
     write(home, halves, [drawn, full(home)])
-    assert not list(lesson_recordings(home))
+    assert not list(training_recordings(home))
     for found in (
         confirmed_segments(sound(home), model.classes),
         labelled_segments(sound(home), model.classes, model.classes),
@@ -155,7 +155,7 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
         spans = [one.span for one in found.recordings]
         assert spans
         assert all(end <= drawn.start or start >= drawn.end for start, end in spans)
-    lessons = home_lessons([home], model)
+    lessons = read_home_training_set([home], model)
     assert not len(lessons.segments)
     assert lessons.nothing == "none of the marks can be learned from"
     assert "2 of 2 marks are not learned from" in lessons.notes[0]
@@ -164,7 +164,7 @@ def test_nothing_drawn_at_random_teaches_neither_a_mark_nor_a_confirmation(home,
 def test_time_without_a_review_teaches_silence_and_what_a_model_is_very_sure_of(home, model_file):
     model = load_model(model_file)
     write(home, [next(one for one in segments(home) if one[2] != "silence")])
-    segments_, notes, nothing = home_lessons([home], model)
+    segments_, notes, nothing = read_home_training_set([home], model)
     assert not nothing
     assert any(note.startswith("no time of this home was looked at") for note in notes)
     kept = segments_.collection == segments_.collection_names.index(CONFIRMED)
@@ -218,10 +218,10 @@ def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(
 ):
     one, other = [each for each in segments(home) if each[2] != "silence"][:2]
     write(home, [(*one[:2], answer), other], [full(home)])
-    assert [each.label for each in lesson_recordings(home)] == [other[2]]
+    assert [each.label for each in training_recordings(home)] == [other[2]]
     found = confirmed_segments(sound(home), load_model(model_file).classes)
     assert all(b <= one[0] or a >= one[1] for a, b in (each.span for each in found.recordings))
-    spans = home_lessons([home], load_model(model_file)).segments.spans
+    spans = read_home_training_set([home], load_model(model_file)).segments.spans
     assert len(spans) > 1
     assert all(b <= one[0] or a >= one[1] for a, b in spans.tolist())
 
@@ -229,7 +229,7 @@ def test_a_mark_of_what_nobody_can_tell_teaches_nothing_and_confirms_nothing(
 def test_a_long_mark_is_not_more_than_a_few_short_ones(home, model_file):
     begin = min(one[0] for one in segments(home))
     write(home, [(begin + 10 * SECOND, begin + 70 * SECOND, "speech")], [full(home)])
-    segments_ = home_lessons([home], load_model(model_file)).segments
+    segments_ = read_home_training_set([home], load_model(model_file)).segments
     marked = segments_.collection == segments_.collection_names.index(HOME)
     assert 0 < marked.sum() <= MOST_OF_MARK
 
@@ -237,9 +237,9 @@ def test_a_long_mark_is_not_more_than_a_few_short_ones(home, model_file):
 def test_a_pause_that_is_marked_as_silence_does_not_teach_the_sounds_around_it(home):
     begin, end, _ = segments(home)[0]
     write(home, [(begin, begin + SECOND // 2, "silence")])
-    assert list(lesson_recordings(home)) == []
+    assert list(training_recordings(home)) == []
     write(home, [(begin, end, "silence")])
-    (one,) = lesson_recordings(home)
+    (one,) = training_recordings(home)
     assert one.label == "silence"
 
 
@@ -247,7 +247,7 @@ def test_pauses_that_are_marked_as_silence_and_teach_nothing_are_counted(home, m
     begin = segments(home)[0][0]
     loud = next(one for one in segments(home) if one[2] != "silence" and one[0] > begin)
     write(home, [(begin, begin + SECOND // 2, "silence"), loud])
-    _, notes, _ = home_lessons([home], load_model(model_file))
+    _, notes, _ = read_home_training_set([home], load_model(model_file))
     pauses = "1 of 2 marks are of silence for less than a second: not learned from"
     assert any(note.startswith(pauses) for note in notes)
 
@@ -257,7 +257,7 @@ def test_a_mark_of_time_that_was_not_recorded_is_left_out_and_counted(home):
     end = max(one[1] for one in segments(home))
     write(home, [loud, (end + 10 * SECOND, end + 12 * SECOND, "speech")])
     with pytest.warns(HearthlogWarning, match="^1 marks lie where nothing was recorded"):
-        (found,) = lesson_recordings(home)
+        (found,) = training_recordings(home)
     assert found.label == loud[2]
 
 
@@ -271,16 +271,16 @@ def test_a_home_that_is_never_silent_is_refused_and_a_mark_of_silence_helps(
     monkeypatch.setattr(nowhere, lambda *_: [])
     write(home, [loud])
     with pytest.raises(DataError, match="mark some seconds in which nothing sounds as silence"):
-        home_lessons([home], model)
+        read_home_training_set([home], model)
     (log,) = logs_in(home)
     write_marks(log, [Mark("mic", *quiet)])
-    assert len(home_lessons([home], model).segments)
+    assert len(read_home_training_set([home], model).segments)
 
 
 def test_a_model_says_from_which_time_of_the_home_it_has_learned(home, model_file):
     model = load_model(model_file)
     write(home, [next(one for one in segments(home) if one[2] != "silence")], [full(home)])
-    lessons = home_lessons([home], model)
+    lessons = read_home_training_set([home], model)
     training = adapt_model(model, lessons.segments).description.training_data
     spans = np.array(training.home_spans)
     for begin, end in lessons.segments.spans:
@@ -323,7 +323,7 @@ def test_a_mark_makes_its_class_though_the_model_counts_that_sound_as_unknown(
     before, after = scenario
     base = with_unknown(model_file, *before)
     kettle(two_days, (5, 5), label)
-    lessons = home_lessons([two_days], base)
+    lessons = read_home_training_set([two_days], base)
     assert lessons.notes[:-1] == []
     assert lessons.segments.classes == (*base.classes, name)
     number = base.classes.index("unknown")
@@ -333,13 +333,13 @@ def test_a_mark_makes_its_class_though_the_model_counts_that_sound_as_unknown(
     assert adapted.description.scenario["unknown"] == after
     assert adapted.description.scenario[name] == [name]
     assert scenario_of(adapted).find(label) == name
-    again = home_lessons([two_days], adapted).segments
+    again = read_home_training_set([two_days], adapted).segments
     assert again.classes == adapted.classes
     assert number not in again.target[again.collection == again.collection_names.index(HOME)]
     for log in logs_in(two_days):
         review_path(log).unlink(missing_ok=True)
     write_marks(logs_in(two_days)[0], [Mark("mic", *segments(two_days)[5])])
-    without = adapt_model(adapted, home_lessons([two_days], adapted).segments)
+    without = adapt_model(adapted, read_home_training_set([two_days], adapted).segments)
     assert without.classes == base.classes
     assert set(without.description.scenario["unknown"]) == {*before, *after}
 
@@ -347,7 +347,7 @@ def test_a_mark_makes_its_class_though_the_model_counts_that_sound_as_unknown(
 def test_too_few_marks_of_what_counts_as_unknown_teach_that_and_it_is_said(two_days, model_file):
     base = with_unknown(model_file, "kettle", "other_negative")
     kettle(two_days, (5, 0))
-    lessons = home_lessons([two_days], base)
+    lessons = read_home_training_set([two_days], base)
     assert lessons.notes[0] == (
         "1 mark of kettle: 5 more seconds, from another day, make it a class; until then they "
         "count as unknown"
@@ -355,7 +355,7 @@ def test_too_few_marks_of_what_counts_as_unknown_teach_that_and_it_is_said(two_d
     of_home = lessons.segments.collection == lessons.segments.collection_names.index(HOME)
     assert set(lessons.segments.target[of_home]) == {base.classes.index("unknown")}
     kettle(two_days, (5, 5), "other_negative")
-    lessons = home_lessons([two_days], base)
+    lessons = read_home_training_set([two_days], base)
     assert lessons.segments.classes == base.classes
     assert "2 marks of other_negative: learned as unknown, to which the model counts them" in (
         lessons.notes
@@ -367,18 +367,18 @@ def test_a_class_of_two_days_and_ten_seconds_is_learned_and_stays_as_long_as_its
 ):
     base = load_model(model_file)
     kettle(two_days, (5, 5))
-    lessons = home_lessons([two_days], base)
+    lessons = read_home_training_set([two_days], base)
     assert lessons.segments.classes == (*base.classes, "kettle")
     save_model(adapt_model(base, lessons.segments), tmp_path / "home.safetensors")
     adapted = load_model(tmp_path / "home.safetensors")
     assert adapted.classes[-1] == "kettle"
-    again = adapt_model(adapted, home_lessons([two_days], adapted).segments)
+    again = adapt_model(adapted, read_home_training_set([two_days], adapted).segments)
     assert again.classes == adapted.classes
     logs = logs_in(two_days)
     for log in logs:
         review_path(log).unlink()
     write_marks(logs[0], [Mark("mic", *segments(two_days)[5])])
-    without = adapt_model(adapted, home_lessons([two_days], adapted).segments)
+    without = adapt_model(adapted, read_home_training_set([two_days], adapted).segments)
     assert without.classes == base.classes
     save_model(without, tmp_path / "without.safetensors")
 

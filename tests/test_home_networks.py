@@ -25,8 +25,8 @@ from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.spans import JudgeableSpans, span_sounds
-from hearthlog.analyzer.training.home_recordings import lesson_recordings, read_reviewed_sound
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_recordings import read_reviewed_sound, training_recordings
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
@@ -162,7 +162,7 @@ def test_marks_teach_only_by_the_embeddings_that_a_model_takes(home):
         assert [one.embedding for one in found] == [e and e.source.space for e in EARS]
         recorded = [len(one.embeddings.frames) > 0 for one in found]
         assert recorded == [each is ear for each in EARS]
-        lessons = list(lesson_recordings(home, space=ear.source.space))
+        lessons = list(training_recordings(home, space=ear.source.space))
         assert [one.embedded is not None for one in lessons] == recorded
         assert [one.weight for one in lessons] == [1.0 if each else 3.0 for each in recorded]
     wider = EmbeddingSpace("one", "a" * 64, WIDTH)
@@ -174,7 +174,7 @@ def test_a_model_that_takes_no_embeddings_says_so_where_logs_have_them(home):
     (*_, log) = find_logs(home)
     (one,) = read_log_sounds(log, "all")
     write_marks(log, [Mark("mic", int(one.spans.starts[0]), int(one.spans.ends[0]), "yelling")])
-    notes = home_lessons([home], load_model(starter_file(GENERAL))).notes
+    notes = read_home_training_set([home], load_model(starter_file(GENERAL))).notes
     assert any("the logs have embeddings of one, which general does not take" in n for n in notes)
 
 

@@ -33,7 +33,7 @@ from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_queue import queue_spans
 from hearthlog.analyzer.review.session import ReviewSession
 from hearthlog.analyzer.review.timeline_reader import read_timeline
-from hearthlog.analyzer.training.home_recordings import lesson_recordings
+from hearthlog.analyzer.training.home_recordings import training_recordings
 from hearthlog.analyzer.training.speakers import SPEAKERS, speaker_recordings
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.starter import BATHROOM
@@ -214,7 +214,7 @@ def test_who_is_marked_as_a_speaker_is_learned_like_who_is_enrolled(home, tmp_pa
     write_marks(home, [mark(2.5, 4.5, "anna")], scenario=SPEAKERS)
     (one,) = speaker_recordings([tmp_path / "logs"], DEFAULT)
     assert one.label == "anna", "that somebody speaks says nothing of a guest"
-    assert [one.label for one in lesson_recordings(tmp_path / "logs")] == ["speech"]
+    assert [one.label for one in training_recordings(tmp_path / "logs")] == ["speech"]
 
 
 def test_the_model_of_a_scenario_learns_from_its_marks_and_no_other_does(

@@ -21,8 +21,8 @@ from hearthlog.analyzer.discover.speech import (
     HomeSpeech,
     SpeechFrames,
     find_voices,
-    is_doubtful,
     louder_elsewhere,
+    may_be_speech,
     read_speech,
     speech_spans,
     speech_voices,
@@ -191,7 +191,7 @@ def test_what_may_well_be_speech_is_speech_whatever_its_label():
     order = np.roll(np.arange(80), 30)  # as of a clock that was set back
     fields = {"header.stamp": stamps[order], "probabilities": probabilities[order]}
     labels = columns_of("label", names, **fields)
-    assert is_doubtful(segments).tolist() == [True, False, True, False]
+    assert may_be_speech(segments).tolist() == [True, False, True, False]
     assert speech_spans(segments, labels).starts.tolist() == [0, 3 * NANOSECONDS]
     assert speech_spans(segments).starts.tolist() == [3 * NANOSECONDS]
     for others in (names[:2], ["a", "b", "c"]):

@@ -363,7 +363,7 @@ def _sounding(logs: HomeLogs, start: int, microphone: str) -> Iterator[Bool]:
 
 SURE, NOT_SURE = "sure", "not sure"
 _RIGHT = 0.9  # of the labels
-DOUBTFUL = 0.7  # probability below which a model itself is in doubt
+UNSURE_BELOW = 0.7  # probability below which a model itself is in doubt
 _FEWEST = 10  # labelled events
 _LOWER = 0.25  # quantile of the share that is right
 _NO_SOUNDS = {SILENCE, TELEVISION, UNKNOWN}
@@ -378,7 +378,7 @@ class Sureness(NamedTuple):
         """Return a word for a confidence; empty if none can be justified."""
         if confidence >= self.sure:
             return SURE
-        return NOT_SURE if confidence < DOUBTFUL else ""
+        return NOT_SURE if confidence < UNSURE_BELOW else ""
 
     def is_unsure(self, confidence: float) -> bool:
         """Whether a confidence is shown as not sure."""

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.activity.checked_minutes import DOUBTFUL, CheckedMinutes
+from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW, CheckedMinutes
 from hearthlog.analyzer.activity.day_profile import HomeSegments, longest_quiet, stretches
 from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
@@ -133,7 +133,7 @@ def home_minutes(
     for name, (starts, confidences) in events.items():
         labelled, certain = events_of(labels, name).starts, rows_at(reviewed, starts) >= 0
         unreviewed = labelled[rows_at(reviewed, labelled) < 0]
-        unsure = starts[~certain & (confidences < DOUBTFUL)]
+        unsure = starts[~certain & (confidences < UNSURE_BELOW)]
         kinds = unreviewed, starts, starts[certain], unsure
         begun[name] = np.array([np.diff(np.searchsorted(kind, edges)) for kind in kinds])
     minutes = HomeMinutes(
@@ -435,7 +435,7 @@ class HomeEvent(NamedTuple):
     @property
     def is_unsure(self) -> bool:
         """Whether the model is not sure of it, and nobody reviewed it."""
-        return self.confidence < DOUBTFUL and not self.reviewed
+        return self.confidence < UNSURE_BELOW and not self.reviewed
 
 
 class EventTotal(NamedTuple):

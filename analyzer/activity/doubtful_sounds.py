@@ -23,7 +23,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
 
 _LISTED = frozenset({*IMPORTANT, SILENCE, TELEVISION})  # labels that need no doubt
-_DOUBTFUL = 0.5  # confidence below which no class has most of the probability
+_NO_MAJORITY_BELOW = 0.5  # confidence
 _LOUD_DB = 30.0  # above the quiet around: household sounds reach 25, a scream in the room 45
 _NAMED, _LIKELY = 0.1, 0.25  # probability to name a class; to list a sound that is not loud
 _MOST = 100  # events of which frames are read, the least sure first
@@ -42,7 +42,7 @@ class DoubtfulSound(NamedTuple):
     start: int
     end: int
     level_db: float  # of its loudest second above the quiet around; -inf if unknown
-    shares: Mapping[str, float]  # mean probability of each of `WORRYING` that the model has
+    probabilities: Mapping[str, float]  # mean probability of each of `WORRYING` that the model has
 
     @property
     def is_loud(self) -> bool:
@@ -51,7 +51,9 @@ class DoubtfulSound(NamedTuple):
 
     def needs_review(self, hidden: Collection[str] = ()) -> bool:
         """Whether a person should review it: it was loud, or is likely coughing or crying."""
-        likely = (share >= _LIKELY for name, share in self.shares.items() if name not in hidden)
+        likely = (
+            share >= _LIKELY for name, share in self.probabilities.items() if name not in hidden
+        )
         return self.label not in hidden and (self.is_loud or any(likely))
 
 
@@ -60,27 +62,31 @@ def perhaps(sounds: Collection[DoubtfulSound], hidden: Collection[str] = ()) -> 
 
     A model that lacks one of them gives its probability to the others, so these must be likely.
     """
-    has_all = all(name in sound.shares for sound in sounds for name in WORRYING)
+    has_all = all(name in sound.probabilities for sound in sounds for name in WORRYING)
     least = _NAMED if has_all else _LIKELY
-    shares = {
-        name: max(sound.shares.get(name, 0.0) for sound in sounds)
+    probabilities = {
+        name: max(sound.probabilities.get(name, 0.0) for sound in sounds)
         for name in WORRYING
         if name not in hidden
     }
-    return [name for name in sorted(shares, key=lambda n: -shares[n]) if shares[name] >= least]
+    return [
+        name
+        for name in sorted(probabilities, key=lambda n: -probabilities[n])
+        if probabilities[name] >= least
+    ]
 
 
-def is_doubtful(label: str, confidence: float) -> bool:
-    """Whether an event is in doubt, by its label and the highest confidence of its segments."""
-    return confidence < _DOUBTFUL and class_name(label) not in _LISTED
+def has_no_majority(label: str, confidence: float) -> bool:
+    """Whether no class has most of the probability of an event, unless it is listed anyway."""
+    return confidence < _NO_MAJORITY_BELOW and class_name(label) not in _LISTED
 
 
 def doubtful_events(labels: Labelling) -> Labelling:
     """Return the events that are in doubt, with the highest confidence of their segments."""
     parts = []
-    for name in sorted(set(labels.labels[labels.confidences < _DOUBTFUL])):
+    for name in sorted(set(labels.labels[labels.confidences < _NO_MAJORITY_BELOW])):
         events, highest = events_and_confidences(labels, name)
-        rows = [is_doubtful(name, confidence) for confidence in highest.tolist()]
+        rows = [has_no_majority(name, confidence) for confidence in highest.tolist()]
         names = np.full(sum(rows), name, object)
         parts.append(Labelling(events.starts[rows], events.ends[rows], names, highest[rows]))
     return in_order([labels.rows(np.zeros(len(labels), bool)), *parts])
@@ -104,14 +110,14 @@ def read_doubtful_sounds(
         except LogError:
             continue  # as without labels
         labels, features = map(columns.get, topics)
-        shares = None if labels is None else _shares(labels, start, end)
-        if shares is not None:
+        probabilities = None if labels is None else _probabilities(labels, start, end)
+        if probabilities is not None:
             level = -inf if features is None else _level(features, start, end)
-            found.append(DoubtfulSound(str(events.labels[row]), start, end, level, shares))
+            found.append(DoubtfulSound(str(events.labels[row]), start, end, level, probabilities))
     return found
 
 
-def _shares(labels: Columns, start: int, end: int) -> dict[str, float] | None:
+def _probabilities(labels: Columns, start: int, end: int) -> dict[str, float] | None:
     """Return the mean probabilities of `WORRYING` in the frames with sound; None without any."""
     names = [class_name(name) for name in array_names(labels.metadata, "probabilities")]
     own = labels.take(np.flatnonzero(_inside(labels, start, end) & (labels["label"] != SILENCE)))

@@ -398,7 +398,7 @@ def group_spans(
         return sounds.spans(of, groups.texts(GROUPS)), sounds.losses
 
 
-class Looked(NamedTuple):
+class SoundSelection(NamedTuple):
     """Selection of sounds to search for named groups."""
 
     choice: str
@@ -406,7 +406,7 @@ class Looked(NamedTuple):
     end: int | None = None
 
 
-class Marked(NamedTuple):
+class MarkCounts(NamedTuple):
     """Changes made by naming a group."""
 
     made: int = 0
@@ -417,40 +417,40 @@ def name_groups(  # noqa: PLR0913, PLR0917
     home: HomeLogs,
     groups: Groups,
     names: Mapping[int, str],
-    looked: Looked,
+    selection: SoundSelection,
     reviewer: str,
     progress: Progress = ignore_progress,
-) -> tuple[dict[int, Marked], list[str]]:
+) -> tuple[dict[int, MarkCounts], list[str]]:
     """Mark the sounds of groups; existing marks of a group get its new name.
 
     Logs are read one at a time, so a box with little memory can name groups found by another.
     `progress` receives the share of the logs read, 0 to 1. Raise `LogError` if a review layer
     cannot be read or written.
     """
-    marked, losses = dict.fromkeys(names, Marked()), list(home.losses)
+    marked, losses = dict.fromkeys(names, MarkCounts()), list(home.losses)
     logs = home.between()
-    inside = {entry.path for entry in home.between(looked.start, looked.end)}
+    inside = {entry.path for entry in home.between(selection.start, selection.end)}
     for count, (log, *_) in enumerate(logs, 1):
         spans: dict[int, list[MarkedSpan]] = {}
         if log in inside:
             with collect_errors(losses, LogError):
-                spans = _spans(log, groups, looked, losses)
+                spans = _spans(log, groups, selection, losses)
         for number, label in names.items():
             made, left = _mark(
                 log, spans.get(number, []), reason_of(groups, number), label, reviewer
             )
             before = marked[number]
-            marked[number] = Marked(before.made + made, before.left + left)
+            marked[number] = MarkCounts(before.made + made, before.left + left)
         progress(count / len(logs))
     return marked, losses
 
 
 def _spans(
-    log: Path, groups: Groups, looked: Looked, losses: list[str]
+    log: Path, groups: Groups, selection: SoundSelection, losses: list[str]
 ) -> dict[int, list[MarkedSpan]]:
     """Return the sounds of groups in a log, by group number."""
     found: dict[int, list[MarkedSpan]] = {}
-    for sounds in read_log_sounds(log, *looked):
+    for sounds in read_log_sounds(log, *selection):
         if sounds.features != groups.features:
             raise LogError(f"{log}: has other features than the groups; left out")
         if sounds.lost:
@@ -466,7 +466,7 @@ def _spans(
 
 def _mark(
     log: Path, wanted: Sequence[MarkedSpan], reason: str, label: str, reviewer: str
-) -> Marked:
+) -> MarkCounts:
     """Mark sounds of a log; marks with this reason get the label."""
     now, old, reviewed = time.time_ns(), read_marks(log), read_reviewed(log)
     own = [mark for mark in old if mark.reason == reason]
@@ -482,7 +482,7 @@ def _mark(
     ]
     if new:
         write_marks(log, new)
-    return Marked(len(new), len(spans) - len(free))
+    return MarkCounts(len(new), len(spans) - len(free))
 
 
 def unmark_group(logs: Iterable[Path], reason: str) -> int:

@@ -53,7 +53,7 @@ from hearthlog.schemas.messages.topics import LIVE, microphone_of, parse_topic, 
 _LIKELY = 0.3
 
 
-def is_doubtful(segments: Columns) -> Bool:
+def may_be_speech(segments: Columns) -> Bool:
     """Return which segments are not labelled speech but may be speech."""
     return ~_is_of(segments, SPEECH) & ~_is_of(segments, SILENCE)
 
@@ -68,7 +68,7 @@ def speech_spans(segments: Columns, labels: Columns | None = None) -> Spans:
     ends = starts + segments["duration"]
     rows = _is_of(segments, SPEECH)
     if labels is not None and len(labels):
-        rows |= is_doubtful(segments) & (_speech_likelihood(labels, starts, ends) >= _LIKELY)
+        rows |= may_be_speech(segments) & (_speech_likelihood(labels, starts, ends) >= _LIKELY)
     return joined(starts[rows], ends[rows])
 
 
@@ -260,7 +260,9 @@ class _Reader:
     def _spoken(self, log: Path, segments: dict[str, Columns]) -> dict[str, Spans]:
         """Return the spans of speech of each microphone."""
         named = {microphone_of(name): self._inside(each) for name, each in segments.items()}
-        doubtful = [topic(name, "label") for name, each in named.items() if is_doubtful(each).any()]
+        doubtful = [
+            topic(name, "label") for name, each in named.items() if may_be_speech(each).any()
+        ]
         labels = _columns(log, doubtful)
         spans = {
             name: speech_spans(each, labels.get(topic(name, "label")))

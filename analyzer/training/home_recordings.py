@@ -336,7 +336,7 @@ def is_short_silence(mark: Mark, features: FeatureSet) -> bool:
     return is_short and class_name(mark.label) == SILENCE
 
 
-def lesson_recordings(
+def training_recordings(
     folder: Path,
     features: FeatureSet = DEFAULT,
     gate: float = 0.0,
@@ -346,11 +346,14 @@ def lesson_recordings(
 
     Raise `LogError` or `DataError` as `home_recordings` does.
     """
-    sounds = (teaching(sound) for sound in read_reviewed_sound(folder, features, space=space))
+    sounds = (
+        without_excluded_marks(sound)
+        for sound in read_reviewed_sound(folder, features, space=space)
+    )
     yield from marked_recordings(sounds, folder, features, gate)
 
 
-def teaching(sound: HomeSound, classes: Collection[str] = ()) -> HomeSound:
+def without_excluded_marks(sound: HomeSound, classes: Collection[str] = ()) -> HomeSound:
     """Drop marks that are excluded from training.
 
     These are marks that a reviewer could not decide, marks that touch a span drawn at random, and

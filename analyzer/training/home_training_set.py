@@ -15,7 +15,7 @@ from hearthlog.analyzer.training.home_recordings import (
     is_short_silence,
     marked_recordings,
     read_reviewed_sound,
-    teaching,
+    without_excluded_marks,
 )
 from hearthlog.analyzer.training.manifest import Scenario, scenario_of
 from hearthlog.analyzer.training.pseudo_labels import (
@@ -62,7 +62,9 @@ class HomeTrainingSet(NamedTuple):
     nothing: str  # reason for an empty training set
 
 
-def home_lessons(folders: Sequence[Path], model: Model, scenario: str = "") -> HomeTrainingSet:
+def read_home_training_set(
+    folders: Sequence[Path], model: Model, scenario: str = ""
+) -> HomeTrainingSet:
     """Read the training marks of a home, and pseudo-labels that preserve the model.
 
     Only marks of the scenario are used; by default only marks without one. Raise `LogError` if
@@ -119,7 +121,7 @@ class _Counts:
 
     def add(self, sound: HomeSound, features: FeatureSet, classes: Collection[str]) -> HomeSound:
         """Count the marks of a sound; return it with those that are used for training."""
-        taught = teaching(sound, classes)
+        taught = without_excluded_marks(sound, classes)
         self.marks += len(sound.marks)
         self.by_embedding[sound.embedding] += len(sound.marks)
         self.left_out += len(sound.marks) - len(taught.marks)

@@ -14,7 +14,7 @@ from hearthlog.analyzer.training.home_recordings import (
     HomeSound,
     marked_recordings,
     read_reviewed_sound,
-    teaching,
+    without_excluded_marks,
 )
 from hearthlog.analyzer.training.manifest import LABELS, Scenario
 from hearthlog.analyzer.training.method import Method
@@ -44,7 +44,7 @@ def speaker_recordings(folders: Iterable[Path], features: FeatureSet) -> Iterato
             read_reviewed_sound(folder, features, scenario) for scenario in ("", SPEAKERS)
         )
         for sound in of_both:
-            taught = sound if sound.enrolled else _with_speaker(teaching(sound))
+            taught = sound if sound.enrolled else _with_speaker(without_excluded_marks(sound))
             for one in marked_recordings([taught], folder, features, 0.0):
                 # `unknown` means undecided in a review, but nobody enrolled in an enrolment.
                 label = OTHER if class_name(one.label) == UNKNOWN else one.label

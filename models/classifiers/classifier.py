@@ -183,7 +183,7 @@ class Classifier:
         if evidence is not None:
             decision += evidence[changed]
         probabilities = probabilities.copy()
-        probabilities[changed] = _shares(decision)
+        probabilities[changed] = _softmax(decision)
         return self._in_steps(probabilities)
 
     def probabilities(self, inputs: Float32) -> Float32:
@@ -238,7 +238,7 @@ class Classifier:
             decision *= self._inverse_temperature
             if evidence is not None:
                 decision += evidence[rows]
-            result[rows] = _shares(decision)
+            result[rows] = _softmax(decision)
         if self._doubts:  # models of hearthlog 0.1 keep their labels bit for bit
             return self._in_steps(result)
         return result, novelty
@@ -250,9 +250,9 @@ class Classifier:
         return probabilities, 1.0 - probabilities[:, self._is_named].max(axis=1, initial=0.0)
 
 
-def _shares(decision: Float64) -> Float64:
+def _softmax(decision: Float64) -> Float64:
     """Return the probabilities of decision values; overwrites its argument."""
     decision -= decision.max(axis=1, keepdims=True)
     np.exp(decision, out=decision)
-    shares: Float64 = decision / decision.sum(axis=1, keepdims=True)
-    return shares
+    probabilities: Float64 = decision / decision.sum(axis=1, keepdims=True)
+    return probabilities

@@ -26,13 +26,13 @@ from hearthlog.schemas.messages.topics import topic
 from hearthlog.schemas.new_files import sync_file, sync_folder
 
 if TYPE_CHECKING:
-    from hearthlog.schemas.salvage.recover import Recovery
+    from hearthlog.schemas.salvage.recover import RecoveryReport
 
 _CHUNK_SPAN = 10 * NANOSECONDS  # of a finished log, which is read completely, not followed
 
 
 @dataclass(frozen=True)
-class Recovered:
+class RecoveredLog:
     """A completed log."""
 
     path: Path
@@ -40,7 +40,7 @@ class Recovered:
     completed: bool = True  # False for a log that cannot be completed now, or was empty
 
 
-def recover_active(root: Path, node: str) -> list[Recovered]:
+def recover_active(root: Path, node: str) -> list[RecoveredLog]:
     """Complete all logs of a node that no recorder is writing; return those with messages, by name.
 
     Intact messages are copied to the final name, read again and counted; only then the original is
@@ -55,7 +55,7 @@ def recover_active(root: Path, node: str) -> list[Recovered]:
         except (LogError, OSError) as error:
             what = error if isinstance(error, LogError) else error.strerror or error
             text = f"{active}: cannot be completed ({what}); it is left as it is"
-            completed.append(Recovered(active, text, completed=False))
+            completed.append(RecoveredLog(active, text, completed=False))
     return completed
 
 
@@ -64,7 +64,7 @@ def active_logs(root: Path, node: str) -> list[Path]:
     return sorted(filter(is_log, root.rglob(f"{node}_*{ACTIVE_SUFFIX}")))
 
 
-def complete_log(active: Path) -> list[Recovered]:
+def complete_log(active: Path) -> list[RecoveredLog]:
     """Complete one log as `recover_active` does, unless it is gone, or another process uses it.
 
     Raise `LogError` or `OSError` if it cannot be read or completed.
@@ -79,7 +79,7 @@ def complete_log(active: Path) -> list[Recovered]:
             return []
         if not active.stat().st_size:
             active.unlink()
-            return [Recovered(active, f"{active}: was empty, and is deleted", completed=False)]
+            return [RecoveredLog(active, f"{active}: was empty, and is deleted", completed=False)]
         return _recover(active, active.with_name(stem(active) + SUFFIX))
 
 
@@ -117,7 +117,7 @@ def _end_in(file: LogFile, microphone: str) -> int:
     return 0
 
 
-def _recover(active: Path, path: Path) -> list[Recovered]:
+def _recover(active: Path, path: Path) -> list[RecoveredLog]:
     recovery = _complete(active, path)
     damages = [damage for damage in recovery.damages if not damage.cut]
     if not is_layer(active) and (damages or not recovery.messages):
@@ -128,19 +128,19 @@ def _recover(active: Path, path: Path) -> list[Recovered]:
     if not recovery.messages:
         return []
     if not damages:
-        return [Recovered(path, "")]
+        return [RecoveredLog(path, "")]
     if is_layer(active):
-        return [Recovered(path, f"{active}: {damages[0]}; this sound is deleted")]
+        return [RecoveredLog(path, f"{active}: {damages[0]}; this sound is deleted")]
     more = f", and in {len(damages) - 1} more places" if len(damages) > 1 else ""
     damage = f"{active}: {damages[0]}{more}; the original is kept as *.damaged"
-    return [Recovered(path, damage)]
+    return [RecoveredLog(path, damage)]
 
 
-def _complete(active: Path, path: Path) -> "Recovery":
+def _complete(active: Path, path: Path) -> "RecoveryReport":
     """Copy the intact part of a log to its final name, unless an earlier start has done so."""
     from hearthlog.schemas.salvage.recover import (  # noqa: PLC0415  as above
         NothingIntactError,
-        Recovery,
+        RecoveryReport,
         check_copy,
         lock_abandoned,
         recover_log,
@@ -162,7 +162,7 @@ def _complete(active: Path, path: Path) -> "Recovery":
         else:
             copy.rename(path)
     except NothingIntactError:
-        return Recovery({}, [], complete=False)
+        return RecoveryReport({}, [], complete=False)
     finally:
         copy.unlink(missing_ok=True)
     return recovery

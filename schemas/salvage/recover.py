@@ -70,7 +70,7 @@ class TopicRecovery:
 
 
 @dataclass(frozen=True)
-class Recovery:
+class RecoveryReport:
     """Recovery result of a log: saved messages and losses."""
 
     topics: dict[str, TopicRecovery]
@@ -181,7 +181,7 @@ class SalvagedCopy:
         channels = self._salvage.definitions.channels.values()
         return PROFILE if any(c.message_encoding == ENCODING for c in channels) else ""
 
-    def recovery(self) -> Recovery:
+    def recovery(self) -> RecoveryReport:
         """Count saved messages, and list losses."""
         topics: dict[str, TopicRecovery] = {}
         expected = self._salvage.expected
@@ -200,7 +200,7 @@ class SalvagedCopy:
         damages = self._salvage.damages()
         untraced = [] if self._salvage.unnamed else _untraced(topics, damages)
         escaped = list(self._salvage.escaped)
-        return Recovery(topics, [*damages, *untraced], self._salvage.complete, escaped)
+        return RecoveryReport(topics, [*damages, *untraced], self._salvage.complete, escaped)
 
     def _channel_types(self) -> Iterator[tuple[int, Channel, str]]:
         definitions = self._salvage.definitions
@@ -383,7 +383,7 @@ def recover_log(
     progress: Progress = ignore_progress,
     *,
     chunk_span: int = 0,
-) -> Recovery:
+) -> RecoveryReport:
     """Copy the undamaged parts of a log to a new log, and check the copy.
 
     Progress is the completed share, 0 to 1; it restarts at 0 for a second attempt. Chunks are
@@ -417,7 +417,9 @@ def recover_log(
     return recovery
 
 
-def recover_in_place(log: Path, progress: Progress = ignore_progress) -> tuple[Path, Recovery]:
+def recover_in_place(
+    log: Path, progress: Progress = ignore_progress
+) -> tuple[Path, RecoveryReport]:
     """Replace a damaged log by its recovered copy, and keep the original as `*.damaged`.
 
     Progress is the completed share, 0 to 1. Raise `NothingIntactError` if the log is not an MCAP

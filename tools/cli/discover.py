@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from hearthlog.analyzer.discover import ClusterKind, Clusters, NamedSpans
     from hearthlog.analyzer.discover.groups import Groups
-    from hearthlog.analyzer.discover.sounds import Looked
+    from hearthlog.analyzer.discover.sounds import SoundSelection
     from hearthlog.analyzer.discover.speech import HomeSpeech
     from hearthlog.analyzer.discover.summary import GroupsSummary, GroupSummary, VoiceSummary
     from hearthlog.analyzer.discover.voices import HomeVoices
@@ -87,7 +87,7 @@ def discover(
     """
     from hearthlog.analyzer.discover import locked_file
     from hearthlog.analyzer.discover.groups import GROUPS
-    from hearthlog.analyzer.discover.sounds import CHOICES, Looked
+    from hearthlog.analyzer.discover.sounds import CHOICES, SoundSelection
     from hearthlog.analyzer.errors import require
     from hearthlog.models.classes import SILENCE
 
@@ -95,15 +95,15 @@ def discover(
         wrong_use(f"--of {of}: it is one of {', '.join(CHOICES)}")
     if not (name or undo):
         require("sklearn", "scipy")
-    looked = Looked(of, *parse_span(start, end))
+    selection = SoundSelection(of, *parse_span(start, end))
     names, who = _names(GROUPS, name or [], "a class", {SILENCE}), reviewer_name(reviewer)
     home, zone = home_and_zone(logs, timezone)
     file = groups or _default_file(GROUPS, logs, "the groups")
     with locked_file(file):
         if names or undo:
-            summary, losses = _name(home, file, undo or [], names, looked, who)
+            summary, losses = _name(home, file, undo or [], names, selection, who)
         else:
-            summary, losses = _group(home, file, looked, least, zone)
+            summary, losses = _group(home, file, selection, least, zone)
     if as_json:
         print_json(summary.model_dump())
     else:
@@ -156,7 +156,7 @@ def _check_numbers(
 
 
 def _group(
-    home: "HomeLogs", file: Path, looked: "Looked", least: int, zone: "tzinfo"
+    home: "HomeLogs", file: Path, selection: "SoundSelection", least: int, zone: "tzinfo"
 ) -> tuple["GroupsSummary", list[str]]:
     """Group the sounds, and save the groups and their summary."""
     from hearthlog.analyzer.discover.groups import load_groups, save_groups
@@ -172,7 +172,7 @@ def _group(
     earlier = load_groups(file)
     with (
         share_done("reading the labels") as progress,
-        read_sounds(home, *looked, progress, earlier) as sounds,
+        read_sounds(home, *selection, progress, earlier) as sounds,
     ):
         groups, rows, points = find_groups(sounds, earlier, least)
         summary = GroupsSummary(
@@ -196,7 +196,7 @@ def _name(
     file: Path,
     undo: Sequence[int],
     names: Mapping[int, str],
-    looked: "Looked",
+    selection: "SoundSelection",
     reviewer: str,
 ) -> tuple["GroupsSummary", list[str]]:
     """Remove and assign names of existing groups, without new grouping."""
@@ -215,7 +215,7 @@ def _name(
     losses: list[str] = []
     if names:
         with share_done("reading the labels") as progress:
-            marked, losses = name_groups(home, groups, names, looked, reviewer, progress)
+            marked, losses = name_groups(home, groups, names, selection, reviewer, progress)
         for each, (made, left) in marked.items():
             more = f"; {left} are marked or looked at by a reviewer already" if left else ""
             print_notice(f"group {each}: {number(made, 'mark')} of {names[each]}{more}")

@@ -13,7 +13,7 @@ from hearthlog.tools.cli.terminal import number, print_lines, print_notice, shar
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.doctor import Findings
-    from hearthlog.schemas.salvage.recover import Recovery
+    from hearthlog.schemas.salvage.recover import RecoveryReport
 
 
 def doctor(
@@ -195,7 +195,7 @@ def recover(
         raise typer.Exit(1 if failed else 3)
 
 
-def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, Recovery]":
+def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, RecoveryReport]":
     from hearthlog.schemas.logs.files import SUFFIX, stem
     from hearthlog.schemas.salvage.recover import recover_in_place, recover_log
 
@@ -207,7 +207,7 @@ def _recover(log: Path, output: Path | None, *, in_place: bool) -> "tuple[Path, 
             return path, recover_log(log, temporary, path.name, progress)
 
 
-def _report_recovery(log: Path, recovery: "Recovery") -> None:
+def _report_recovery(log: Path, recovery: "RecoveryReport") -> None:
     expected = [topic.expected for topic in recovery.topics.values() if topic.expected is not None]
     of = f" of {sum(expected)}" if expected else ""
     end = "" if recovery.complete else "; the log had no end, or a damaged one"
@@ -219,7 +219,7 @@ def _report_recovery(log: Path, recovery: "Recovery") -> None:
     print_notice(*(f"{log}: {text}" for text in texts))
 
 
-def _recovery_as_json(log: Path, path: Path, recovery: "Recovery") -> dict[str, Any]:
+def _recovery_as_json(log: Path, path: Path, recovery: "RecoveryReport") -> dict[str, Any]:
     return {
         "log": str(log),
         "recovered": str(path),

@@ -284,7 +284,7 @@ def _cut_clips(
 ) -> "tuple[Dataset, Scenario]":
     """Cut the clips of a scenario, and the marks of homes, into segments."""
     from hearthlog.analyzer.training.dataset import build_dataset
-    from hearthlog.analyzer.training.home_recordings import lesson_recordings
+    from hearthlog.analyzer.training.home_recordings import training_recordings
     from hearthlog.analyzer.training.manifest import left_out_lines, load_scenario
     from hearthlog.analyzer.training.train import clip_embedder
     from hearthlog.models.classes import UNKNOWN
@@ -304,7 +304,7 @@ def _cut_clips(
     recordings = [
         one
         for folder in home
-        for one in lesson_recordings(folder, method.features, method.gate, space)
+        for one in training_recordings(folder, method.features, method.gate, space)
     ]
     without = sum(one.embedded is None for one in recordings)
     if space is not None and without:
@@ -352,11 +352,11 @@ def _cut_voices(
 def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dataset"]:
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.training.adaptation import adapt_model, is_moved
-    from hearthlog.analyzer.training.home_training_set import home_lessons
+    from hearthlog.analyzer.training.home_training_set import read_home_training_set
     from hearthlog.models.modelfile import load_model
 
     model = load_model(base)
-    segments, notes, nothing = home_lessons(home, model, scenario)
+    segments, notes, nothing = read_home_training_set(home, model, scenario)
     print_notice(*notes)
     if not len(segments):
         reasons = [f"{count} recordings: {why}" for why, count in segments.skipped.items()]

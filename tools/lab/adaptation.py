@@ -19,7 +19,7 @@ from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.promotion.recent_time import RecentLog, recent_logs
 from hearthlog.analyzer.training.adaptation import adapt_model
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.models.classes import SILENCE, UNKNOWN, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile import load_model
@@ -151,7 +151,7 @@ def _learned(base: Model, logs: Sequence[RecentLog], marks: Sequence[Mark]) -> M
             name = marks[0].microphone
             looked_at = ReviewedSpan(name, logs[0].start, marks[-1].end)
             write_review(find_coverage(folder)[name], marks, looked_at)
-        return adapt_model(base, home_lessons([folder], base).segments)
+        return adapt_model(base, read_home_training_set([folder], base).segments)
 
 
 def line_of(outcome: Outcome) -> str:

@@ -29,7 +29,7 @@ from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.clips import clip_frames
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.analyzer.training.manifest import LABELS, LabelledClip, read_manifest
 from hearthlog.models.classes import COUGHING, MUSIC, SILENCE, SPEECH
 from hearthlog.models.classifiers.evidence import SECTORS
@@ -192,12 +192,12 @@ def _models(logs: Path, marked: Sequence[tuple[Path, Sequence[Sound]]]) -> dict[
             for one, next_ in islice(pairwise(sounds), 0, None, 4)
         ]
         write_marks(log, [mark for mark in marks if mark.label != TELEVISION] + pauses)
-    of_resident = adapt_model(base, home_lessons([logs], base).segments)
+    of_resident = adapt_model(base, read_home_training_set([logs], base).segments)
     for log, sounds in marked:
         write_marks(
             log, [Mark("mic", s, e, label) for label, s, e in sounds if label == TELEVISION]
         )
-    home = adapt_model(base, home_lessons([logs], base).segments)
+    home = adapt_model(base, read_home_training_set([logs], base).segments)
     # Ninety degrees: what came from ahead comes from the left.
     turned = np.roll(home.direction_weights, SECTORS // 4, axis=2)
     return {

@@ -24,7 +24,7 @@ from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.promotion.promotion_check import judge
 from hearthlog.analyzer.promotion.recent_time import RecentLog, recent_logs
 from hearthlog.analyzer.training.adaptation import adapt_model
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest, scenario_of
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN
 from hearthlog.models.modelfile import load_model, save_model
@@ -242,7 +242,7 @@ def taught(home: Home, model: Path, marks: Sequence[int]) -> Iterator[Outcome]:
             for log in home.logs[:2]:
                 shutil.copy(log.path, logs)
             _write(logs, home.logs, own)
-            lessons = home_lessons([logs], base)
+            lessons = read_home_training_set([logs], base)
             shutil.copy(model, place)  # for the gate, which looks for it there
             path = Path(place) / "home-1.safetensors"
             save_model(adapt_model(base, lessons.segments), path)

@@ -31,7 +31,7 @@ from hearthlog.analyzer.promotion.recent_time import (
     unlearned_time,
 )
 from hearthlog.analyzer.training.adaptation import adapt_model
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.models.classes import OTHER_NEGATIVE, SILENCE, UNKNOWN
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.modelfile import load_model, save_model
@@ -227,7 +227,7 @@ def _learned(base: Model, marks: Sequence[Mark], logs: Path) -> Model:
                 copy = Path(place) / log.path.name
                 shutil.copy(log.path, copy)
                 write_marks(copy, own)
-        return adapt_model(base, home_lessons([Path(place)], base).segments)
+        return adapt_model(base, read_home_training_set([Path(place)], base).segments)
 
 
 def _microphone(log: RecentLog) -> str:

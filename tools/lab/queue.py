@@ -24,7 +24,7 @@ from hearthlog.analyzer.review.ranking import USEFUL, make_queue
 from hearthlog.analyzer.review.review_queue import ReviewItem
 from hearthlog.analyzer.review.spans import judgeable_spans
 from hearthlog.analyzer.training.adaptation import adapt_model
-from hearthlog.analyzer.training.home_training_set import home_lessons
+from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.analyzer.training.manifest import BUILTIN, LabelledClip, read_manifest
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.models.classifiers.classifier import Classifier
@@ -297,7 +297,7 @@ def _learned(
     for layer in asked.logs.rglob("*.review.mcap"):
         layer.unlink()
     Person(asked.truth).go_through(items, asked.logs, _START + 86_400 * NANOSECONDS)
-    segments = home_lessons([asked.logs], base)[0]
+    segments = read_home_training_set([asked.logs], base)[0]
     scores = _scores(adapt_model(base, segments), other)
     seconds = sum(item.end - item.start for item in items) / NANOSECONDS
     known = [score for name, score in scores.items() if name != UNKNOWN]

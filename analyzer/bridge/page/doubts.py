@@ -10,7 +10,7 @@ import numpy as np
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.doubtful_sounds import (
     DoubtfulSound,
-    is_doubtful,
+    has_no_majority,
     perhaps,
     read_doubtful_sounds,
 )
@@ -32,7 +32,7 @@ def doubtful(
     microphones: Iterable[LiveMicrophone], events: Iterable[SoundEvent]
 ) -> list[SoundEvent]:
     """Return the events that are in doubt, without those beside a television."""
-    unsure = [event for event in events if is_doubtful(event.label, event.confidence)]
+    unsure = [event for event in events if has_no_majority(event.label, event.confidence)]
     return [
         event
         for microphone in microphones
