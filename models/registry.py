@@ -188,7 +188,7 @@ def load(folder: Path, name: str) -> Model:
     return load_model(_path(folder, resolve(folder, name)))
 
 
-def find_model(folder: Path, sha256: str) -> Path | None:
+def find_model_by_sha256(folder: Path, sha256: str) -> Path | None:
     """Find a model by its SHA-256, in a folder or among the starter models."""
     for path in [*sorted(folder.glob("[!.]*" + SUFFIX)), *map(starter_file, STARTERS)]:
         if path.is_file() and not path.is_symlink() and _digest(path) == sha256:
@@ -219,7 +219,7 @@ def first_starter(folder: Path) -> str | None:
         for name in STARTERS:
             if is_starter(name, sha256):
                 return name
-        path = find_model(folder, sha256)
+        path = find_model_by_sha256(folder, sha256)
         if path is None:
             break
         with suppress(ModelError):

@@ -214,7 +214,7 @@ class DiskKeeper:
         self._rules = rules
         self._process: subprocess.Popen[bytes] | None = None
         self._began: int | None = None
-        self._looked = 0
+        self._checked = 0
         self._thinned: int | None = None
         self._reported: set[str] = set()
         self._helpless = False
@@ -255,9 +255,9 @@ class DiskKeeper:
     def _is_due(self, now: int) -> bool:
         if self._began is None or abs(now - self._began) >= _EVERY:
             return True
-        if self._helpless or min(abs(now - self._looked), abs(now - self._began)) < _LOOK:
+        if self._helpless or min(abs(now - self._checked), abs(now - self._began)) < _LOOK:
             return False
-        self._looked = now
+        self._checked = now
         with suppress(OSError):
             return disk_of(Path(self._rules.root)).free < self._rules.limits.free
         return False

@@ -49,14 +49,14 @@ class MachineWatch:
     def __init__(self, folder: Path, sys: Path = _SYS) -> None:
         self._folder = folder
         self._sys = sys
-        self._looked = -math.inf
+        self._checked = -math.inf
 
     def tick(self, stamp: int) -> SourceHealth | None:
         """Check the host if it is due; return the result, else None."""
         now = time.monotonic()
-        if now - self._looked < _SECONDS:
+        if now - self._checked < _SECONDS:
             return None
-        self._looked = now
+        self._checked = now
         return machine_health(stamp, self._folder, self._sys)
 
 

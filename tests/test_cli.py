@@ -16,7 +16,7 @@ from conftest import FRESH_HEARTHLOG, HEARTHLOG
 from homelife import at, write_day
 from mcap.writer import Writer as McapWriter
 
-from hearthlog.analyzer.logs.shown_classes import write_list
+from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
 from hearthlog.models.classes import SILENCE, in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
@@ -104,7 +104,7 @@ def test_info_tells_times_of_the_home_and_trouble_and_names_no_class_that_is_hid
     ]
     gap = (at("20:00"), 3600.0, "paused")
     write_day(tmp_path, DAY, events, gaps=[gap], timezone="Europe/Vienna")
-    write_list(tmp_path, ["music"])
+    write_hidden_classes(tmp_path, ["music"])
     result = hearthlog("info", tmp_path)
     assert result.returncode == 3
     what, recorded, state, _, *rest = result.stdout.splitlines()

@@ -25,8 +25,8 @@ from hearthlog.analyzer.review.review_list import (
     REASONS,
     ReviewSpan,
     queued,
-    read_list,
-    write_list,
+    read_spans,
+    write_spans,
 )
 from hearthlog.analyzer.review.spans import (
     border_pieces,
@@ -233,7 +233,7 @@ def test_what_the_recorder_said_is_compared_with_a_relabel_layer(logs, hearthlog
     apart = sum(read_time(end) - read_time(start) for start, end, *_ in spans_of(found))
     total = found["total"]
     assert apart / 60e9 == pytest.approx(total["minutes"] * (1 - total["agreement"]), rel=0.01)
-    assert [span.as_text() for span in read_list(listed)] == found["spans"]
+    assert [span.as_text() for span in read_spans(listed)] == found["spans"]
     text = hearthlog("diff", logs, "live", "two", "--spans", 3).stdout
     assert f"{total['agreement']:.1%}" in text
     assert f"{found['disagreements']} disagreements, longest first: 3 of them" in text
@@ -303,7 +303,7 @@ def test_a_queue_of_the_logs_here_needs_no_name_of_them(logs, hearthlog, monkeyp
 def test_what_was_reviewed_is_no_more_in_the_queue(logs, hearthlog, tmp_path):
     listed = tmp_path / "queue.csv"
     hearthlog("diff", logs, "live", "--queue", "--spans", 5, "--list", listed)
-    reviewed = read_list(listed)
+    reviewed = read_spans(listed)
     labels = tmp_path / "labels.csv"
     lines = [f"{time_text(s.start)},{time_text(s.end)},{s.label_a},mic\n" for s in reviewed]
     labels.write_text("start,end,label,microphone\n" + "".join(lines))
@@ -546,8 +546,8 @@ def spans():
 @given(st.lists(spans(), min_size=1, max_size=10))
 def test_a_list_comes_back_as_it_was(tmp_path_factory, found):
     path = tmp_path_factory.mktemp("list") / "list.csv"
-    write_list(path, found)
-    assert read_list(path) == found
+    write_spans(path, found)
+    assert read_spans(path) == found
 
 
 GOOD = "mic,2026-03-01T08:00:00Z,2026-03-01T08:00:01Z,live,speech,,,0.5,uncertainty"
@@ -578,7 +578,7 @@ def test_a_list_that_cannot_be_is_refused_with_its_line(tmp_path, line, output):
     path = tmp_path / "list.csv"
     path.write_text(",".join(ReviewSpan._fields) + f"\n{GOOD}\n{line}\n")
     with pytest.raises(DataError, match=rf"list\.csv:[34]: .*({output})") as error:
-        read_list(path)
+        read_spans(path)
     assert len(str(error.value)) < 400 + len(str(path))
 
 
@@ -587,7 +587,7 @@ def test_what_is_no_list_of_spans_is_refused(tmp_path, text):
     path = tmp_path / "list.csv"
     path.write_text(text)
     with pytest.raises(DataError, match=r"list of spans|must name the columns"):
-        read_list(path)
+        read_spans(path)
 
 
 def no_log(path):
@@ -717,6 +717,6 @@ def test_a_list_is_never_written_over_a_file(logs, hearthlog, tmp_path):
     result = hearthlog("diff", logs, "live", "two", "--list", path)
     assert (result.returncode, result.stdout) == (1, "")
     with pytest.raises(LogError, match="exists already"):
-        write_list(path, [])
+        write_spans(path, [])
     assert "exists already" in result.stderr
     assert path.read_text() == "precious"

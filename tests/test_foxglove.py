@@ -31,7 +31,7 @@ from hearthlog.analyzer.foxglove.publisher import RecordedSpan
 from hearthlog.analyzer.foxglove.server import Admission, RefusedError
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.selection import array_names
-from hearthlog.analyzer.logs.shown_classes import write_list
+from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
 from hearthlog.models.classes import in_words, ordered
 from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.logs.files import find_logs
@@ -693,7 +693,7 @@ def rooms(tmp_path_factory):
     """A home with two microphones, of which one class is hidden, and the columns of its log."""
     folder = tmp_path_factory.mktemp("rooms")
     names = ["living_room", "bath"]
-    write_list(folder, ["music"])
+    write_hidden_classes(folder, ["music"])
     home = LiveHome(folder, names, minutes_ago=0)
     home.write_status("recorder", 0, "listening")
     for name in names:

@@ -22,7 +22,7 @@ from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics, Topics
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
-from hearthlog.analyzer.logs.shown_classes import NEVER_TELL_FILE, write_list
+from hearthlog.analyzer.logs.shown_classes import NEVER_TELL_FILE, write_hidden_classes
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.pause_schedule import paused_until
@@ -475,7 +475,7 @@ def test_a_class_that_is_hidden_leaves_the_broker_until_it_is_shown_again(home, 
     home.hears("coughing")
     with Listener(broker.port) as listener, Bridged(home.folder, broker) as bridged:
         listener.wait_for(f"{COUGHING}/on", "ON")
-        write_list(home.folder, ["coughing"])
+        write_hidden_classes(home.folder, ["coughing"])
         listener.wait_for(f"{COUGHING}/on", "")
         (home.folder / NEVER_TELL_FILE).write_text("{")  # damaged: it stays hidden
         home.hears("coughing")
@@ -486,7 +486,7 @@ def test_a_class_that_is_hidden_leaves_the_broker_until_it_is_shown_again(home, 
         assert listener.values[f"{COUGHING}/on"] == ""
         removed = json.loads(listener.values[DISCOVERY])["components"]["on_coughing"]
         assert removed == {"p": "binary_sensor"}  # without more, Home Assistant removes it
-        write_list(home.folder, [])
+        write_hidden_classes(home.folder, [])
         home.hears("coughing")
         listener.wait_for(f"{COUGHING}/on", "ON")
 

@@ -20,7 +20,11 @@ from hearthlog.analyzer.bridge.output import Totals
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.logs.shown_classes import NEVER_TELL_FILE, read_list, write_list
+from hearthlog.analyzer.logs.shown_classes import (
+    NEVER_TELL_FILE,
+    read_hidden_classes,
+    write_hidden_classes,
+)
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
@@ -53,7 +57,7 @@ def test_a_list_beside_the_logs_hides_a_class_from_report_and_events(logs, heart
     page = tmp_path / "a.html"
     assert hearthlog("report", logs, "--day", DAY, "-o", page).returncode == 0
     assert "Music" in page.read_text()
-    write_list(logs, ["music"])
+    write_hidden_classes(logs, ["music"])
     assert hearthlog("report", logs, "--day", DAY, "-o", tmp_path / "b.html").returncode == 0
     page = (tmp_path / "b.html").read_text()
     assert "usic" not in re.sub(r"base64,[^\"]*", "", page)
@@ -64,7 +68,7 @@ def test_a_list_beside_the_logs_hides_a_class_from_report_and_events(logs, heart
     refused = hearthlog("events", logs, "--day", DAY, "--label", "music")
     assert refused.returncode == 1
     assert "music is hidden: never_tell, or the page of the home, says so" in refused.stderr
-    write_list(logs, [])
+    write_hidden_classes(logs, [])
     listed = json.loads(hearthlog("events", logs, "--day", DAY, "--json").stdout)
     assert {event["label"] for event in listed["events"]} == {"coughing", "music"}
 
@@ -73,7 +77,7 @@ def test_a_list_beside_the_logs_hides_a_class_from_report_and_events(logs, heart
 def test_a_list_that_is_damaged_is_said_and_hides_nothing(logs, hearthlog, content):
     (logs / NEVER_TELL_FILE).write_text(content)
     with pytest.raises(LogError, match=NEVER_TELL_FILE):
-        read_list(logs)
+        read_hidden_classes(logs)
     result = hearthlog("events", logs, "--day", DAY)
     assert result.returncode == 3
     assert NEVER_TELL_FILE in result.stderr
@@ -103,7 +107,7 @@ def test_a_rule_of_a_hidden_class_never_notifies(logs, tmp_path, hearthlog):
         watch.never_tell = frozenset(hidden)
         rang = watch.evaluate(lambda: recorded, pytest.fail, end - MINUTE, end - MINUTE)
         assert {each.rule for each in rang} == reported
-    write_list(logs, ["music"])
+    write_hidden_classes(logs, ["music"])
     config = tmp_path / "home.toml"
     config.write_text(
         f'output = "{logs}"\nnode = "home"\n'
@@ -127,7 +131,7 @@ def test_the_page_hides_a_class_for_all_and_shows_it_again(tmp_path):
         part("day", lambda day: {"music", "coughing"} <= labels(day))
         status, answer = served.post("/show", {"show": "no", "label": "music"})
         assert (status, json.loads(answer)) == (200, {"said": "Music is now hidden everywhere."})
-        assert read_list(served.home.folder) == {"music"}
+        assert read_hidden_classes(served.home.folder) == {"music"}
         part("now", lambda now: now["rooms"][0]["words"] == "A sound")
         last = part("events", lambda last: last["hidden"])
         assert last["hidden"] == [["music", "Music"]]

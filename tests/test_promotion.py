@@ -52,7 +52,7 @@ from hearthlog.analyzer.promotion.recent_time import (
     recent_logs,
     sample,
 )
-from hearthlog.analyzer.review.review_list import ReviewSpan, read_list
+from hearthlog.analyzer.review.review_list import ReviewSpan, read_spans
 from hearthlog.analyzer.review.review_queue import queue_spans, review_items
 from hearthlog.models.classifiers.model import Amount, Description
 from hearthlog.models.modelfile import load_model, save_model
@@ -794,7 +794,7 @@ def test_who_reads_what_would_change_is_told_how_to_hear_it(capfd, tmp_path):
     assert "listen to the changes: `hearthlog review logs --queue swapped`" in lines
     saved = run(capfd, "review", "logs", "--queue", "swapped", "--save", tmp_path / "ten.csv")
     assert saved.returncode == 0, saved.stderr
-    listed = read_list(tmp_path / "ten.queue.csv")
+    listed = read_spans(tmp_path / "ten.queue.csv")
     assert sorted(listed) == sorted(requested_of("swapped"))
     (again,) = review_items(listed[:1])
     assert re.fullmatch("swapped says (talking|music), the recorder (talking|music)", again.text)

@@ -30,7 +30,7 @@ from hearthlog.analyzer.review.candidates import (
 )
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.ranking import cover, sample, worth
-from hearthlog.analyzer.review.review_list import ReviewSpan, read_list
+from hearthlog.analyzer.review.review_list import ReviewSpan, read_spans
 from hearthlog.analyzer.review.review_queue import queue_spans, review_items
 from hearthlog.analyzer.review.spans import JudgeableSpans, labelling_model, span_sounds
 from hearthlog.analyzer.review.timeline import no_spans
@@ -368,7 +368,7 @@ def test_beside_the_label_file_of_a_queue_lies_the_sound_that_was_kept_line_by_l
         start = read_time(lines[first - 1][0])
         reported_of_it = cut(kept, start, start + MINUTE).length > 0
         assert bool(list(folder.glob(f"{first:02}-*.wav"))) == reported_of_it
-    spans = [line for line in read_list(Path("ten.queue.csv")) if line.reason != RANDOM]
+    spans = [line for line in read_spans(Path("ten.queue.csv")) if line.reason != RANDOM]
     requested = [cut(kept, span.start, span.end).length / (span.end - span.start) for span in spans]
     assert sum(share > 0.5 for share in requested) == len(spans)
     assert run(capfd, "annotate", "import", captured, "ten.txt").returncode == 0

@@ -11,7 +11,7 @@ from conftest import HEARTHLOG
 from viewers import patiently, pixels
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.review.lanes import SHARES
+from hearthlog.analyzer.review.lanes import PROBABILITIES
 from hearthlog.analyzer.review.timeline import Key, LabelledSpans, Question, SoundClip
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.drawing import placed_lanes
@@ -88,13 +88,13 @@ def rows_of_classes(picture, names):
 
 def right_columns(picture, timeline, first, last):
     """The share of columns whose brightest row is that of the most probable class."""
-    names = ordered(timeline.microphones["mic"].plots[SHARES, "live"].names)
+    names = ordered(timeline.microphones["mic"].plots[PROBABILITIES, "live"].names)
     every = rows_of_classes(picture, names)
     return max(right_in_rows(picture, timeline, first, last, rows) for rows in every)
 
 
 def right_in_rows(picture, timeline, first, last, rows):
-    shares = timeline.microphones["mic"].plots[SHARES, "live"]
+    shares = timeline.microphones["mic"].plots[PROBABILITIES, "live"]
     names = ordered(shares.names)
     colours = np.array([colour(name) for name in names])
     right = []

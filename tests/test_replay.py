@@ -26,7 +26,7 @@ from together import record_together
 from waiting import wait_for
 
 from hearthlog.analyzer.relabel.player import ReplayOptions
-from hearthlog.analyzer.relabel.replay import LogSet, find_model
+from hearthlog.analyzer.relabel.replay import LogSet, find_recorded_model
 from hearthlog.analyzer.relabel.replay import replay as replay_logs
 from hearthlog.analyzer.training.train import train_model
 from hearthlog.models.classifiers.classifier import Classifier, label_timing
@@ -701,8 +701,8 @@ def test_the_model_that_a_log_names_is_looked_for_nowhere_else(model_file, tmp_p
     shutil.copy(model_file, tmp_path / "outside.safetensors")
     (tmp_path / "logs").mkdir()
     for name in ("../outside", str(tmp_path / "outside"), "outside\0", "x" * 10_000):
-        assert find_model(name, digest, [tmp_path / "logs"]) is None
-    assert find_model("outside", digest, [tmp_path / "logs", tmp_path]) is not None
+        assert find_recorded_model(name, digest, [tmp_path / "logs"]) is None
+    assert find_recorded_model("outside", digest, [tmp_path / "logs", tmp_path]) is not None
 
 
 def test_layers_are_no_part_of_a_recording(folder, model_file, tmp_path):

@@ -32,7 +32,7 @@ from hearthlog.analyzer.activity.values import (
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
-from hearthlog.analyzer.logs.shown_classes import write_list
+from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
 from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
@@ -649,7 +649,7 @@ def test_times_of_up_to_five_sounds_are_written_and_of_more_the_first_and_the_la
 
 def test_a_hidden_class_is_not_among_those_that_a_model_does_not_know(tmp_path):
     write_day(tmp_path / "logs", DAY, [(at("10:00"), 5, "crying", 0.9)])
-    write_list(tmp_path / "logs", ["crying"])
+    write_hidden_classes(tmp_path / "logs", ["crying"])
     page = page_of(tmp_path / "logs", tmp_path)
     assert "says nothing about them: toilet flush, shower and water tap." in page
     assert "rying" not in page
@@ -1029,7 +1029,7 @@ def test_neither_a_television_nor_what_a_person_reviewed_or_hides_needs_a_look(t
     write_marks(log, [Mark("mic", start, start + 4 * 10**9, "yelling")])
     (line,) = needing_look_in(page_of(tmp_path, tmp_path))
     assert line.startswith("Needs a look, 17:00: loud")
-    write_list(tmp_path, frozenset({"music"}))
+    write_hidden_classes(tmp_path, frozenset({"music"}))
     other = tmp_path / "other"
     other.mkdir()
     assert not needing_look_in(page_of(tmp_path, other))

@@ -32,7 +32,7 @@ from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_list import ReviewSpan as Listed
-from hearthlog.analyzer.review.review_list import write_list
+from hearthlog.analyzer.review.review_list import write_spans
 from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
 from hearthlog.analyzer.review.session import ReviewSession, length_text, sound_file
 from hearthlog.analyzer.review.timeline import SoundClip, sound_of
@@ -849,7 +849,7 @@ def test_a_list_of_diff_is_gone_through_in_its_order(recorded_home, tmp_path):
         for k in (50, 20, 90)
     ]
     other = spans[0]._replace(microphone="bath")
-    write_list(tmp_path / "list.csv", [other, *spans])
+    write_spans(tmp_path / "list.csv", [other, *spans])
     arguments = (str(tmp_path / "list.csv"), find_labellings(recorded_home), ("mic", "live"))
     found = queue_items(*arguments, (None, None), 60)
     assert [item[:2] for item in found] == [span[1:3] for span in spans]
@@ -1154,7 +1154,7 @@ def test_the_page_plays_the_kept_sound_of_the_span_and_nobody_else_gets_it(home,
     spans = tmp_path / "spans.csv"
     row = "mic", START + 6 * SECOND, START + 8 * SECOND, "live", "speech", "", "", None, "novelty"
     other = (*row[:1], START + 60 * SECOND, START + 62 * SECOND, *row[3:])
-    write_list(spans, [Listed(*row), Listed(*other)])
+    write_spans(spans, [Listed(*row), Listed(*other)])
     port = free_port()
     options = ("--web", "--sound", "--port", port, "--queue", spans)
     with reviewing(home, *options, BROWSER="true") as review:

@@ -14,7 +14,7 @@ from conftest import HEARTHLOG
 from livehome import LiveHome
 from waiting import wait_for
 
-from hearthlog.analyzer.logs.shown_classes import write_list
+from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
 from hearthlog.analyzer.review.current_sounds import CurrentSound, lasting
 
 FRAME = 50_000_000
@@ -103,7 +103,7 @@ def test_where_nobody_listens_the_line_says_so(tmp_path):
 
 
 def test_a_class_that_is_hidden_is_a_sound(tmp_path):
-    write_list(tmp_path, ["music"])
+    write_hidden_classes(tmp_path, ["music"])
     home = LiveHome(tmp_path)
     with watching(tmp_path) as (_, lines):
         wait_for(lambda: home.hears("music") or lines)

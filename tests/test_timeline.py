@@ -34,9 +34,9 @@ from hearthlog.analyzer.review.lanes import (
     FLOOR,
     LEVEL,
     NOVELTY,
-    SHARES,
+    PROBABILITIES,
     class_precision,
-    disagreements,
+    differing_spans,
     reviewed_lane,
     timeline_lanes,
     timeline_plots,
@@ -175,7 +175,7 @@ def test_features_and_level_are_means_of_what_is_logged_and_nothing_in_gaps(time
 def test_probabilities_and_novelty_are_means_of_what_is_logged(timeline, folder, model_file):
     labels = read(folder, "label")
     assert timeline.microphones["mic"].labellings[0].name == "live"
-    shares = plot(timeline, SHARES, "live")
+    shares = plot(timeline, PROBABILITIES, "live")
     assert shares.names == load_model(model_file).classes
     values = np.array([m.probabilities for m in labels])
     expected = slow_means(timeline.grid, stamps_of(labels), values)
@@ -187,7 +187,7 @@ def test_probabilities_and_novelty_are_means_of_what_is_logged(timeline, folder,
 
 def test_every_frame_is_there_for_zooming_in(timeline, folder):
     labels = read(folder, "label")
-    times, values = frames_of(timeline, SHARES, "live")
+    times, values = frames_of(timeline, PROBABILITIES, "live")
     assert times.tolist() == stamps_of(labels).tolist()
     np.testing.assert_array_equal(values, np.array([m.probabilities for m in labels], np.float32))
     _, stamps, values = features(folder)
@@ -259,7 +259,7 @@ def test_a_span_of_time_is_cut_out_to_the_nanosecond(folder, timeline):
     ]
     assert as_list(cut) == expected
     stamps = stamps_of(read(folder, "label"))
-    times, _ = frames_of(part, SHARES, "live")
+    times, _ = frames_of(part, PROBABILITIES, "live")
     assert times.tolist() == stamps[(stamps >= start) & (stamps < end)].tolist()
     lines = timeline.lines
     inside = (lines.times >= start) & (lines.times < end)
@@ -270,7 +270,7 @@ def test_a_span_that_ends_with_a_log_has_labels_to_its_end(tmp_path, day, model_
     settings, hour = Settings(output=tmp_path, model=model_file), -(-START // HOUR) * HOUR
     logs = record(settings, FileSource([day], START), Flag()).logs
     timeline = read_timeline(logs, end=hour)
-    times, _ = frames_of(timeline, SHARES, "live")
+    times, _ = frames_of(timeline, PROBABILITIES, "live")
     assert hour - FRAME_NANOSECONDS <= times.max() < hour
     assert list(timeline.coverage["mic"].logs) == logs[:1]
 
@@ -308,7 +308,7 @@ def test_a_log_without_a_model_shows_its_features(tmp_path, day):
 def test_a_log_without_features_shows_its_labels(tmp_path):
     path = labels_log(tmp_path / "a.mcap", 1000)
     found = read_timeline([path]).microphones["mic"]
-    assert [kind for kind, _ in found.plots] == [SHARES]
+    assert [kind for kind, _ in found.plots] == [PROBABILITIES]
     assert as_list(found.labellings[0].spans) == [
         (START, START + 1000 * FRAME_NANOSECONDS, "speech")
     ]
@@ -323,8 +323,8 @@ def test_logs_of_models_with_other_classes_share_a_lane_and_keep_their_columns(
     later = record(settings, FileSource([day], START + HOUR), Flag()).logs
     joint = read_timeline([*later, folder])
     classes = (*load_model(model_file).classes, *scenario.classes)
-    assert plot(joint, SHARES, "live").names == classes
-    values = plot(joint, SHARES, "live").values
+    assert plot(joint, PROBABILITIES, "live").names == classes
+    values = plot(joint, PROBABILITIES, "live").values
     early = np.flatnonzero(~np.isnan(values[:, 0]))
     late = np.flatnonzero(~np.isnan(values[:, -1]))
     assert early.max() < late.min()
@@ -597,7 +597,7 @@ def labelled(draw, grid, names="abc"):
 @given(grids(), st.data())
 def test_labellings_differ_where_both_say_something_else(grid, data):
     one, other = data.draw(labelled(grid)), data.draw(labelled(grid))
-    found = as_list(disagreements(one, other))
+    found = as_list(differing_spans(one, other))
     edges = sorted(
         {t for spans in (one, other) for t in (*spans.starts.tolist(), *spans.ends.tolist())}
     )
@@ -615,7 +615,7 @@ def test_two_names_of_one_sound_are_no_difference():
     other = LabelledSpans(
         times[:-1], times[1:], np.array(["crying_sobbing", "shout", "music"], object)
     )
-    assert as_list(disagreements(one, other)) == [(10, 20, "shout")]
+    assert as_list(differing_spans(one, other)) == [(10, 20, "shout")]
 
 
 def spans_at(*rows):
@@ -845,7 +845,9 @@ def test_texts_of_one_length_are_drawn_in_the_same_order_in_every_process(tmp_pa
 
 
 def test_each_class_has_a_row_that_is_as_bright_as_it_was_probable(recording, timeline):
-    names, values = (getattr(plot(timeline, SHARES, "live"), name) for name in ("names", "values"))
+    names, values = (
+        getattr(plot(timeline, PROBABILITIES, "live"), name) for name in ("names", "values")
+    )
     rows = ordered(names)
     times, cells = column(recording, "/mic/live/shares", "SeriesLines:colors")
     heights = np.array(column(recording, "/mic/live/shares", "Scalars:scalars")[1])
@@ -900,10 +902,10 @@ def test_the_frames_of_a_long_time_are_read_when_they_are_needed(folder, timelin
         assert as_list(found.spans) == as_list(expected.spans)
     parts = [part.microphones["mic"] for part in reading.read_frames(long)]
     assert len(parts) > 3
-    frames = [each for part in parts for each in part.frames[SHARES, "live"]]
+    frames = [each for part in parts for each in part.frames[PROBABILITIES, "live"]]
     for name in ("times", "values"):
         found = np.concatenate([getattr(each, name) for each in frames])
-        expected = [getattr(each, name) for each in before.frames[SHARES, "live"]]
+        expected = [getattr(each, name) for each in before.frames[PROBABILITIES, "live"]]
         expected = np.concatenate(expected)
         np.testing.assert_array_equal(found, expected)
 

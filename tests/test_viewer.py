@@ -32,7 +32,7 @@ from viewers import (
 
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, write_marks
-from hearthlog.analyzer.review.lanes import SELECTED_COLOUR, SHARES
+from hearthlog.analyzer.review.lanes import PROBABILITIES, SELECTED_COLOUR
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.drawing import SHARED_AXIS
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
@@ -129,7 +129,7 @@ class Picture:
 
 def blocks_of(timeline):
     """Where a class was the most probable one for long: times, and the class."""
-    shares = timeline.microphones["mic"].plots[SHARES, "live"]
+    shares = timeline.microphones["mic"].plots[PROBABILITIES, "live"]
     names, values = shares.names, shares.values
     best = np.nan_to_num(values).argmax(axis=1)
     edges = np.flatnonzero(np.diff(best, prepend=-1, append=-1))
@@ -160,7 +160,7 @@ def lanes_are_right(png, timeline):
 
 def check_rows(png, timeline):
     """Check that the row of a class is as bright as it was probable, where it was for long."""
-    shares = timeline.microphones["mic"].plots[SHARES, "live"]
+    shares = timeline.microphones["mic"].plots[PROBABILITIES, "live"]
     names, values = shares.names, shares.values
     rows = ordered(names)
     picture = Picture(png, timeline)

@@ -24,7 +24,7 @@ from waiting import wait_for
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
-from hearthlog.analyzer.logs.shown_classes import write_list
+from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
 from hearthlog.analyzer.review.current_sounds import AWAY_SECONDS, CurrentSound, CurrentSounds
 from hearthlog.analyzer.review.lanes import (
     FEATURES,
@@ -33,8 +33,8 @@ from hearthlog.analyzer.review.lanes import (
     GAPS,
     LEVEL,
     NOVELTY,
+    PROBABILITIES,
     RECORDER,
-    SHARES,
     StateLane,
 )
 from hearthlog.analyzer.review.live_timeline import LiveTimeline, last_time
@@ -219,7 +219,7 @@ def test_a_viewer_that_comes_when_the_first_was_dropped_still_knows_names_and_co
     with LiveServer(port, "127.0.0.1", MINUTES, memory="5MB") as server:
         for number in range(1200):  # six days
             times = seconds + number * 500 * SECOND
-            shares = Plot(SHARES, "mic", "live", names, times, values)
+            shares = Plot(PROBABILITIES, "mic", "live", names, times, values)
             server.show([shares, StateLane(RECORDER, "mic", times, ["phone_ring"] * 500)])
             taken.append(psutil.Process().memory_info().rss)
         assert taken[-1] - taken[100] < 120_000_000, "200 MB if all of it is kept"
@@ -283,7 +283,7 @@ def test_large_letters_say_what_is_heard_now_how_sure_and_since_when(tmp_path, m
         other = recorded_now(sounds, "music", begin, 1, microphone="living_room [](x:/y)")
         other.seen -= AWAY_SECONDS + 1
         server.show_current(sounds, UTC)
-        write_list(tmp_path, ["coughing"])
+        write_hidden_classes(tmp_path, ["coughing"])
         sounds.hide()
         server.show_current(sounds, UTC)
     assert letters[0] == "# Coughing · 87 % · for 2 s"
@@ -364,7 +364,7 @@ def test_means_are_those_of_the_frames_of_a_second(logs, model_file):
     found = [each for each in news(logs) if isinstance(each, Plot)]
     columns = read_columns(find_logs(logs))
     stamps, values = (columns["/mic/label"][name] for name in ("header.stamp", "probabilities"))
-    shares = [each for each in found if each.kind is SHARES]
+    shares = [each for each in found if each.kind is PROBABILITIES]
     times = np.concatenate([each.times for each in shares])
     means = np.concatenate([each.values for each in shares])
     names = load_model(model_file).classes
@@ -373,7 +373,7 @@ def test_means_are_those_of_the_frames_of_a_second(logs, model_file):
     second = times[40] // SECOND
     assert np.allclose(means[40], values[stamps // SECOND == second].mean(axis=0), atol=1e-6)
     assert len(times) < len(stamps) / 15
-    assert {each.kind for each in found} == {SHARES, LEVEL, FLOOR, NOVELTY, FEATURES}
+    assert {each.kind for each in found} == {PROBABILITIES, LEVEL, FLOOR, NOVELTY, FEATURES}
     floor = np.concatenate([each.values for each in found if each.kind is FLOOR])[:, 0]
     assert -65 < floor[-1] < -55  # the noise between the sounds of the day
     heat = np.concatenate([each.values for each in found if each.kind is FEATURES])
@@ -409,7 +409,9 @@ def test_another_model_and_none_are_drawn_too(day, model_file, other_model, tmp_
             [*HEARTHLOG, "record", day, "-o", tmp_path, "--start", start, *model], check=True
         )
     found = news(tmp_path)
-    shares = dict.fromkeys(e.names for e in found if isinstance(e, Plot) and e.kind is SHARES)
+    shares = dict.fromkeys(
+        e.names for e in found if isinstance(e, Plot) and e.kind is PROBABILITIES
+    )
     assert len(shares) == 2
     levels = [each.times for each in found if isinstance(each, Plot) and each.kind is LEVEL]
     assert np.concatenate(levels)[-1] > lane_states(found, RECORDER)[0][-1] + 3_000 * SECOND
@@ -426,7 +428,7 @@ def test_a_class_that_no_output_shows_is_in_no_lane_and_no_plot(logs):
     found = news(logs, live)
     assert hidden not in lane_states(found, RECORDER)[1]
     assert len(lane_states(found, RECORDER)[1]) == len(states)
-    shares = [each for each in found if isinstance(each, Plot) and each.kind is SHARES]
+    shares = [each for each in found if isinstance(each, Plot) and each.kind is PROBABILITIES]
     assert all(hidden not in each.names for each in shares)
     assert all(each.values.shape[1] == len(each.names) for each in shares)
 

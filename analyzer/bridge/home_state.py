@@ -26,7 +26,7 @@ from hearthlog.analyzer.bridge.state import Report
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.recorder_info import status_value
-from hearthlog.analyzer.logs.shown_classes import common_names_of, read_list
+from hearthlog.analyzer.logs.shown_classes import common_names_of, read_hidden_classes
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
 from hearthlog.models.classes import (
     OF_EVERY_SCENARIO,
@@ -549,7 +549,7 @@ def _hide(state: HomeState, home: RecorderAddress, report: Report) -> None:
     While the list cannot be read, what it hid last stays hidden.
     """
     try:
-        state.never_tell = home.never_tell | read_list(home.folder)
+        state.never_tell = home.never_tell | read_hidden_classes(home.folder)
     except (LogError, OSError) as error:
         report(f"{error}; until then, classes hidden since the start of the bridge stay hidden")
 

@@ -212,7 +212,7 @@ class _Reader:
         embedded: IO[bytes],
     ) -> None:
         self.losses: list[str] = []
-        self._looked = choice, *span
+        self._selection = choice, *span
         self._store, self._embedded = store, embedded
         self._features: tuple[str, ...] = ()
         self._any_embedding = groups is None
@@ -224,7 +224,7 @@ class _Reader:
 
     def read(self, entry: HomeLog) -> None:
         log, count = entry.path, len(self._parts)
-        for sounds in read_log_sounds(log, *self._looked):
+        for sounds in read_log_sounds(log, *self._selection):
             self._features = self._features or sounds.features
             if sounds.features != self._features:
                 raise LogError(f"{log}: has other features than the later logs; left out")

@@ -18,7 +18,7 @@ from hearthlog.analyzer.logs.recorder_info import (
     microphones_of,
     models_of,
 )
-from hearthlog.analyzer.logs.shown_classes import list_of_log, recorded_list
+from hearthlog.analyzer.logs.shown_classes import hidden_classes_of_log, recorded_hidden_classes
 from hearthlog.analyzer.logs.spans import NEVER
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -114,7 +114,9 @@ class HomeLogs:
         """
         logs = self.between()
         last = next(self.records(), {})
-        return recorded_list(last) | (list_of_log(logs[-1].path) if logs else frozenset())
+        return recorded_hidden_classes(last) | (
+            hidden_classes_of_log(logs[-1].path) if logs else frozenset()
+        )
 
     def records(self) -> Iterator[Mapping[str, str]]:
         """Yield the `hearthlog` records of the logs, latest log first."""

@@ -1,4 +1,4 @@
-"""Classes as people are shown them: those never told of, and common names of confused ones."""
+"""Classes hidden from people, and common names of classes that a model confuses."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -28,7 +28,7 @@ _NAMES = TypeAdapter(list[str])
 _LEVELS = 4  # folders between a log and the folder of logs: year, month and day
 
 
-def read_list(folder: Path) -> frozenset[str]:
+def read_hidden_classes(folder: Path) -> frozenset[str]:
     """Return the classes of the list in a folder of logs; empty without a list.
 
     Raise `LogError` if the list is damaged.
@@ -43,25 +43,25 @@ def read_list(folder: Path) -> frozenset[str]:
     return frozenset(map(class_name, names[:_MOST]))
 
 
-def write_list(folder: Path, names: Iterable[str]) -> None:
+def write_hidden_classes(folder: Path, names: Iterable[str]) -> None:
     """Replace the list in a folder of logs; raise `LogError` or `OSError` on a failure."""
     with replaced_file(folder / NEVER_TELL_FILE) as temporary, create_file(temporary) as stream:
         stream.write(json.dumps(sorted(set(names))).encode())
 
 
-def recorded_list(record: Mapping[str, str]) -> frozenset[str]:
+def recorded_hidden_classes(record: Mapping[str, str]) -> frozenset[str]:
     """Return the classes of the configuration that a log was recorded with."""
     return frozenset(map(class_name, filter(None, record.get(NEVER_TELL, "").split(","))))
 
 
-def list_of_log(log: Path) -> frozenset[str]:
+def hidden_classes_of_log(log: Path) -> frozenset[str]:
     """Return the classes of the list in the folder of logs that a log is in.
 
     Raise `LogError` if the list is damaged.
     """
     for folder in list(log.parents)[:_LEVELS]:
         if (folder / NEVER_TELL_FILE).exists():
-            return read_list(folder)
+            return read_hidden_classes(folder)
     return frozenset()
 
 

@@ -279,7 +279,7 @@ def write_marks(  # noqa: PLR0913
     `LogError` if there is no such log, if its layer cannot be read or is damaged, if the name of a
     microphone or the scenario is invalid, or if the layer cannot be written.
     """
-    new, looked_at = _checked(marks), _checked_reviewed(reviewed)
+    new, all_reviewed = _checked(marks), _checked_reviewed(reviewed)
     if scenario:
         check_scenario_name(scenario)
     path = review_path(log)
@@ -293,8 +293,8 @@ def write_marks(  # noqa: PLR0913
         for span in deleted:
             kept = list(_subtract(kept, [span]))
         kept = _checked([*_subtract(kept, new), *new])
-        looked_at = sorted(set(before).difference(not_reviewed).union(looked_at))
-        spans = _by_topic(layer | {scenario: Reviewed(kept, looked_at)})
+        all_reviewed = sorted(set(before).difference(not_reviewed).union(all_reviewed))
+        spans = _by_topic(layer | {scenario: Reviewed(kept, all_reviewed)})
         if not any(spans.values()):
             path.unlink(missing_ok=True)
             return path

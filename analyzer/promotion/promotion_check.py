@@ -26,7 +26,7 @@ from hearthlog.models.modelfile import load_model
 from hearthlog.models.registry import (
     CHAMPION,
     Judgement,
-    find_model,
+    find_model_by_sha256,
     load,
     read_judgement,
     write_judgement,
@@ -320,7 +320,7 @@ def find_champion(folder: Path, home: Sequence[Path], model: Model) -> Model | N
         named = [one for one in find_home_logs(home).latest_models() if one.model]
         base = model.description.training_data.base_sha256
         for name, labelled_by in sorted(named, key=lambda one: one.model_sha256 != base)[:1]:
-            path = find_model(folder, labelled_by)
+            path = find_model_by_sha256(folder, labelled_by)
             if path is None:
                 raise ModelError(
                     f"{name} ({labelled_by[:12]}), which labels now, is neither in {folder} "
@@ -347,7 +347,7 @@ def _worse_than_at_first(
 def _first_model(folder: Path, home: Sequence[Path]) -> Model | None:
     """Return the model that labelled the first log of a home; None if missing."""
     with suppress(LogError, ModelError):
-        path = find_model(folder, find_home_logs(home).first_model())
+        path = find_model_by_sha256(folder, find_home_logs(home).first_model())
         return None if path is None else load_model(path)
     return None
 

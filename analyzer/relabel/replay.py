@@ -181,7 +181,7 @@ _WARM_UP = 60 * NANOSECONDS
 _LONGEST_NAME = 200
 
 
-def find_model(name: str, sha256: str, folders: Sequence[Path]) -> Model | None:
+def find_recorded_model(name: str, sha256: str, folders: Sequence[Path]) -> Model | None:
     """Search folders for the model of a recording by its name: a file name without the suffix.
 
     None if no folder has it; unreadable files are skipped.

@@ -222,8 +222,8 @@ def reviewed_time(sources: Labellings, microphone: str, scenario: str = "") -> R
         except LogError as error:
             sources.lose(error)
             continue
-        marks, looked_at = review.get(scenario, ((), ()))
-        own = [span for span in looked_at if span.microphone == microphone]
+        marks, reviewed = review.get(scenario, ((), ()))
+        own = [span for span in reviewed if span.microphone == microphone]
         random |= {span.start for span in own if span.chosen == RANDOM}
         times += [(span.start, span.end) for span in own]
         times += [(mark.start, mark.end) for mark in marks if mark.microphone == microphone]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.selection import checked_array_names, decode_types
-from hearthlog.analyzer.logs.shown_classes import read_list, recorded_list
+from hearthlog.analyzer.logs.shown_classes import read_hidden_classes, recorded_hidden_classes
 from hearthlog.analyzer.review.lanes import decibel
 from hearthlog.models.classes import class_name, in_words
 from hearthlog.schemas.arrays import Float32, Int64
@@ -119,7 +119,7 @@ class CurrentSounds:
             return
         if path != self._log:
             self._log = path
-            self._recorded = recorded_list(next(latest_records([path]), {}))
+            self._recorded = recorded_hidden_classes(next(latest_records([path]), {}))
         for columns in decode_types(path, batch, _FIELDS):
             topic = parse_topic(columns.topic)
             if topic is None or topic.labelling != LIVE or not len(columns):
@@ -136,7 +136,7 @@ class CurrentSounds:
     def hide(self) -> None:
         """Read which classes no output shows; a damaged list hides what it hid before."""
         try:
-            self._listed = read_list(self._folder)
+            self._listed = read_hidden_classes(self._folder)
         except (LogError, OSError) as error:
             self._lose(error)
 

@@ -115,7 +115,7 @@ def state_lane(kind: LaneKind, microphone: str, spans: LabelledSpans) -> StateLa
     return StateLane(kind, microphone, times[order], [states[i] for i in order])
 
 
-def disagreements(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
+def differing_spans(one: LabelledSpans, other: LabelledSpans) -> LabelledSpans:
     """Find the spans in which two labellings differ, with the labels of `other`.
 
     Two names of one class (see `hearthlog.models.classes`) are no difference, nor is a label of
@@ -144,7 +144,7 @@ UNRECORDED = "Not heard"
 _TROUBLE = "Trouble"
 _RECURRING = "Recurs"
 _VOICES = "Voices"
-_LOOKED_AT: Colour = (58, 70, 92)
+_REVIEWED_COLOUR: Colour = (58, 70, 92)
 SELECTED_COLOUR: Colour = (206, 196, 170)
 _MOST_LANES = 12  # of classes, if some were not heard at all
 
@@ -222,7 +222,10 @@ def reviewed_lane(
     texts = np.concatenate([np.full(len(reviewed), REVIEWED, object), marked.spans.texts])
     starts = np.concatenate([reviewed.starts, marks.starts])
     ends = np.concatenate([reviewed.ends, marks.ends])
-    spans, colours = LabelledSpans(starts, ends, texts), {REVIEWED: _LOOKED_AT, **marked.colours}
+    spans, colours = (
+        LabelledSpans(starts, ends, texts),
+        {REVIEWED: _REVIEWED_COLOUR, **marked.colours},
+    )
     return marked._replace(spans=spans, colours=colours)
 
 
@@ -269,7 +272,7 @@ def _shared_lanes(
             name = in_words(scenario_name(one.name))
             yield _lane_in_words(microphone.name, name, scenario_sounds(one.spans))
     for other in labellings[1:]:
-        spans = disagreements(labellings[0].spans, other.spans)
+        spans = differing_spans(labellings[0].spans, other.spans)
         name = f"{labelling_in_words(other.name)} differs"
         yield _lane_in_words(microphone.name, name, spans)
     for name, spans in ((_RECURRING, microphone.recurring), (_VOICES, microphone.spoken)):
@@ -278,9 +281,9 @@ def _shared_lanes(
     if marking:
         yield selected_lane(microphone.name)
     marks = {one.name: one.spans for one in microphone.labellings if is_review(one.name)}
-    for scenario, looked_at in {"": microphone.reviewed, **microphone.reviewed_scenarios}.items():
+    for scenario, reviewed in {"": microphone.reviewed, **microphone.reviewed_scenarios}.items():
         own = marks.get(review_labelling(scenario), no_spans())
-        yield reviewed_lane(microphone.name, scenario, own, looked_at)
+        yield reviewed_lane(microphone.name, scenario, own, reviewed)
     kinds = (UNRECORDED, microphone.gaps, GAP), (_TROUBLE, microphone.troubles, _TROUBLED)
     for name, spans, shade in kinds:
         if len(spans):
@@ -339,7 +342,7 @@ def _degrees(vectors: NDArray[np.floating]) -> Float64:
     return degrees_of(vectors.astype(np.float64))[:, np.newaxis]
 
 
-SHARES = PlotKind(
+PROBABILITIES = PlotKind(
     "shares", "How probable each class is", 280, Style.BANDS, scale=(0.0, 1.0), frame_step=0.01
 )
 _LEVELS = "Level, and floor of the room, in dBFS"
@@ -362,7 +365,7 @@ DIRECTION = PlotKind(
     scale=(-180.0, 180.0),
     of_means=_degrees,
 )
-PLOTS = (SHARES, LEVEL, FLOOR, DIRECTION, NOVELTY, FEATURES)  # in the order of the views
+PLOTS = (PROBABILITIES, LEVEL, FLOOR, DIRECTION, NOVELTY, FEATURES)  # in the order of the views
 
 
 _ENERGY = "energy"
@@ -436,7 +439,7 @@ def _microphone_rows(
             yield Plot(FEATURES, microphone, "", names, times, values)
         case message_types.LABEL:
             names = checked_array_names(path, columns, "probabilities")
-            yield Plot(SHARES, microphone, labelling, names, times, columns["probabilities"])
+            yield Plot(PROBABILITIES, microphone, labelling, names, times, columns["probabilities"])
             novelty = columns["novelty"][:, np.newaxis]
             new = np.isfinite(novelty[:, 0])
             if new.any():

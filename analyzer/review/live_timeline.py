@@ -16,8 +16,8 @@ from hearthlog.analyzer.review.lanes import (
     GAP_STATE,
     GAPS,
     LEVEL,
+    PROBABILITIES,
     RECORDER,
-    SHARES,
     TROUBLE,
     TROUBLES,
     LaneRows,
@@ -112,7 +112,7 @@ class LiveTimeline:
         if isinstance(update, StateLane):
             states = [UNKNOWN if self._is_hidden(state) else state for state in update.states]
             return update._replace(states=states)
-        if isinstance(update, Plot) and update.kind is SHARES:
+        if isinstance(update, Plot) and update.kind is PROBABILITIES:
             rows = [row for row, name in enumerate(update.names) if not self._is_hidden(name)]
             names = tuple(update.names[row] for row in rows)
             return update._replace(names=names, values=update.values[:, rows])
@@ -128,13 +128,13 @@ class LiveTimeline:
             scale = self._scales.setdefault((rows.microphone, *rows.names), _Scale())
             yield rows._replace(times=times[present], values=scale(means[present]))
             return
-        if rows.kind is SHARES:
+        if rows.kind is PROBABILITIES:
             names = ordered(rows.names)
             means = means[:, [rows.names.index(name) for name in names]]
             rows = rows._replace(names=tuple(names))
         values = rows.kind.of_means(means)
         yield rows._replace(times=times, values=values.round(1) if rows.kind is LEVEL else values)
-        if rows.kind is SHARES:
+        if rows.kind is PROBABILITIES:
             best = np.where(present, np.nan_to_num(means).argmax(axis=1), len(rows.names))
             states = np.array([*rows.names, None], object)[best]
             yield StateLane(RECORDER, rows.microphone, starts, states.tolist())

@@ -113,16 +113,16 @@ class Marking:
         before = {log: [one for one in own if one in old] for log, own in self._marks.items()}
         logs = [*new, *(log for log, own in before.items() if own and log not in new)]
         # A judged item of a queue is reviewed from end to end: this follows the mark.
-        looked_at = {
+        reviewed = {
             log: [one for one in self._reviewed[log] if _is_of(one, before[log])] for log in logs
         }
-        chosen = next((one for own in looked_at.values() for one in own), None)
+        chosen = next((one for own in reviewed.values() for one in own), None)
         changes = []
         for log in logs:
             spans = [*before[log], *([new[log]] if log in new else [])]
             edges = min(one.start for one in spans), max(one.end for one in spans)
             change = self._change(log, *edges, now, "")
-            change.not_reviewed += looked_at[log]
+            change.not_reviewed += reviewed[log]
             if chosen is not None and log in new:
                 own = chosen._replace(start=new[log].start, end=new[log].end, made=now)
                 change.reviewed.append(own)

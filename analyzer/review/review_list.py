@@ -70,7 +70,7 @@ class ReviewSpan(NamedTuple):
         return self._asdict() | {"start": time_text(self.start), "end": time_text(self.end)}
 
 
-def disagreements(difference: LabellingDifference, microphone: str) -> list[ReviewSpan]:
+def disagreements_to_review(difference: LabellingDifference, microphone: str) -> list[ReviewSpan]:
     """List the spans in which two labellings differ, without scores.
 
     They are at most `MOST_SPANS`, the longest first.
@@ -114,8 +114,8 @@ def random_minutes(minutes: Spans, side: NamedLabelling, microphone: str) -> lis
     return spans
 
 
-def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
-    """Write up to `MOST_SPANS` spans as CSV, in their order, for `read_list`.
+def write_spans(path: Path, spans: Sequence[ReviewSpan]) -> None:
+    """Write up to `MOST_SPANS` spans as CSV, in their order, for `read_spans`.
 
     Raise `LogError` if the file exists, or cannot be written.
     """
@@ -126,7 +126,7 @@ def write_list(path: Path, spans: Sequence[ReviewSpan]) -> None:
         writer.writerows(span.as_text().values() for span in spans)
 
 
-def read_list(path: Path) -> list[ReviewSpan]:
+def read_spans(path: Path) -> list[ReviewSpan]:
     """Read a list of spans in file order, at least one.
 
     Raise `DataError` if the file cannot be read, is no list of spans, or is empty; the message has
@@ -351,7 +351,7 @@ def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:
     ]
 
 
-def looked_at(
+def reviewed_spans(
     requested: Iterable[ReviewSpan],
     marks: Sequence[Mark],
     coverage: Mapping[str, Coverage],

@@ -28,7 +28,7 @@ from hearthlog.analyzer.review.review_list import (
     chosen_as,
     queued,
     random_minutes,
-    read_list,
+    read_spans,
 )
 from hearthlog.analyzer.review.spans import LEAST_AUDIBLE
 from hearthlog.models.classes import in_words
@@ -177,7 +177,7 @@ def _listed(path: Path, microphone: str, limits: Limits, scenario: str) -> list[
     start, end = limits
     spans = [
         span
-        for span in read_list(path)
+        for span in read_spans(path)
         if span.microphone == microphone
         and (start is None or span.end > start)
         and (end is None or span.start < end)

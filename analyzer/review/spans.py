@@ -22,7 +22,7 @@ from hearthlog.models.features import FeatureSet, Inputs, WindowStatistics
 from hearthlog.models.features.floor import BLOCK_FRAMES, FloorTracker
 from hearthlog.models.features.installed import feature_set
 from hearthlog.models.modelfile import load_model
-from hearthlog.models.registry import find_model
+from hearthlog.models.registry import find_model_by_sha256
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.errors import LogError, ModelError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS
@@ -243,7 +243,9 @@ def labelling_model(
     unusable.
     """
     with suppress(ModelError):
-        path = find_model(models, model_of(logs[-1].path, microphone, scenario).model_sha256)
+        path = find_model_by_sha256(
+            models, model_of(logs[-1].path, microphone, scenario).model_sha256
+        )
         return None if path is None else load_model(path)
     return None
 

@@ -32,7 +32,7 @@ from hearthlog.analyzer.review.lanes import (
     GAPS,
     NOVELTY,
     PLOTS,
-    SHARES,
+    PROBABILITIES,
     LaneRows,
     StateRows,
     read_rows,
@@ -128,7 +128,7 @@ class _Microphone:
         key = rows.kind, rows.labelling
         self.means.setdefault(key, _NamedMeans(self.grid)).add(rows)
         if rows.kind.frame_step and (
-            self.keeps_frames or (rows.kind is SHARES and not self.sampled)
+            self.keeps_frames or (rows.kind is PROBABILITIES and not self.sampled)
         ):
             values = rows.kind.of_means(rows.values)
             self.frames.setdefault(key, []).append(rows._replace(values=values))
@@ -136,7 +136,7 @@ class _Microphone:
 
     def _forget_frames(self, labelling: str) -> None:
         """Drop the frames covered by segments, unless single frames are kept."""
-        spans, frames = self.spans.get(labelling), self.frames.get((SHARES, labelling))
+        spans, frames = self.spans.get(labelling), self.frames.get((PROBABILITIES, labelling))
         while (
             not self.keeps_frames and spans and frames and frames[0].times[-1] < spans[-1].ends[-1]
         ):
@@ -144,13 +144,13 @@ class _Microphone:
 
     def timeline(self) -> MicrophoneTimeline:
         """Return all collected data, and release the clips."""
-        labels = {labelling for kind, labelling in self.means if kind is SHARES}
+        labels = {labelling for kind, labelling in self.means if kind is PROBABILITIES}
         names = sorted({*labels, *self.spans}, key=lambda one: (is_review(one), one != LIVE, one))
         keys = [(kind, labelling) for kind in PLOTS for labelling in ("", *names)]
         plots = {key: plot for key in keys if (plot := self._plot(*key)) is not None}
         return MicrophoneTimeline(
             name=self.name,
-            labellings=[self._labelling(name, plots.get((SHARES, name))) for name in names],
+            labellings=[self._labelling(name, plots.get((PROBABILITIES, name))) for name in names],
             plots=plots,
             frames={k: self.frames[k] for k in keys if self.keeps_frames and k in self.frames},
             reviewed=self._join(self.reviewed.get("", [])),
@@ -185,15 +185,17 @@ class _Microphone:
         floor = np.where(np.isnan(features.values).all(axis=1), math.nan, floor)
         return features._replace(kind=FLOOR, names=("floor",), values=floor[:, np.newaxis])
 
-    def _labelling(self, name: str, shares: Plot | None) -> LabellingTimeline:
+    def _labelling(self, name: str, probabilities: Plot | None) -> LabellingTimeline:
         parts = self.spans.get(name, [])
         end = max((int(spans.ends.max()) for spans in parts), default=0)
-        frames = self.frames.get((SHARES, name), [])  # open segments are not logged yet
+        frames = self.frames.get((PROBABILITIES, name), [])  # open segments are not logged yet
         parts = [*parts, *_runs(frames, end, FRAME_NANOSECONDS)]
-        if not parts and shares is not None:
-            means = self.means[SHARES, name].means
-            parts = list(_runs(_shares(means, self.grid), 0, self.grid.step))
-        return LabellingTimeline(name, self._join(parts), () if shares is None else shares.names)
+        if not parts and probabilities is not None:
+            means = self.means[PROBABILITIES, name].means
+            parts = list(_runs(_probability_frames(means, self.grid), 0, self.grid.step))
+        return LabellingTimeline(
+            name, self._join(parts), () if probabilities is None else probabilities.names
+        )
 
     def _join(self, parts: Sequence[LabelledSpans]) -> LabelledSpans:
         """Concatenate spans in time order, clipped to the grid."""
@@ -207,13 +209,15 @@ class _Microphone:
         return LabelledSpans(starts[order], ends[order], spans.texts[order])
 
 
-def _shares(means: Mapping[tuple[str, ...], GridMeans], grid: TimelineGrid) -> Iterator[Plot]:
+def _probability_frames(
+    means: Mapping[tuple[str, ...], GridMeans], grid: TimelineGrid
+) -> Iterator[Plot]:
     """Yield the grid shares as frames, without empty shares."""
     for names, part in means.items():
         values = part.values
         present = ~np.isnan(values[:, 0])
         times = grid.edges[:-1][present]
-        yield Plot(SHARES, "", "", names, times, values[present].astype(np.float32))
+        yield Plot(PROBABILITIES, "", "", names, times, values[present].astype(np.float32))
 
 
 def _runs(parts: Iterable[Plot], after: int, step: int) -> Iterator[LabelledSpans]:

@@ -47,7 +47,7 @@ _NO_SILENCE = (
     "nowhere in the logs is it silent, as the model to be adapted hears it: by marks of other "
     "sounds alone it would forget silence; mark some seconds in which nothing sounds as silence"
 )
-_NOT_LOOKED_AT = (
+_NOTHING_REVIEWED = (
     "no time of this home was looked at: only silence, and what the model is very sure of, is kept "
     "as it is; what a review leaves alone, such as `hearthlog review --queue`, keeps more"
 )
@@ -98,8 +98,8 @@ def read_home_training_set(
                 raise DataError(_NO_SILENCE)
         if in_room:
             kept += unreviewed_sounds(folders, model, _seldom_kept(kept, model), scenario)
-        if in_room and not counts.looked_at:
-            notes.append(_NOT_LOOKED_AT)
+        if in_room and not counts.has_reviewed:
+            notes.append(_NOTHING_REVIEWED)
     segments = cut_recordings([*marked, *_as_unknown(kept, model, learned)], learned, features)
     if CONFIRMED in segments.collection_names and HOME not in segments.collection_names:
         segments = cut_recordings([], learned, features)
@@ -116,7 +116,7 @@ class _Counts:
         self.marks = 0
         self.left_out = 0  # excluded from training
         self.short = 0  # pauses marked as silence
-        self.looked_at = False
+        self.has_reviewed = False
         self.by_embedding: Counter[EmbeddingSpace | None] = Counter()  # marks
 
     def add(self, sound: HomeSound, features: FeatureSet, classes: Collection[str]) -> HomeSound:
@@ -126,7 +126,7 @@ class _Counts:
         self.by_embedding[sound.embedding] += len(sound.marks)
         self.left_out += len(sound.marks) - len(taught.marks)
         self.short += sum(is_short_silence(mark, features) for mark in taught.marks)
-        self.looked_at |= bool(sound.confirmed)
+        self.has_reviewed |= bool(sound.confirmed)
         return taught
 
     def notes(self) -> list[str]:

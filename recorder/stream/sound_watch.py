@@ -11,7 +11,7 @@ from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 _FULL_SCALE = 0.999
 _CLIPPED_SAMPLES = 4  # per frame; the highest sample of a recording may be full scale
 _CLIPPED_ENERGY = 0.99 * _CLIPPED_SAMPLES * _FULL_SCALE**2  # with a margin for rounding
-_LOOKED_AT = 16  # samples of a frame: usually enough to detect a change
+_COMPARED_SAMPLES = 16  # samples of a frame: usually enough to detect a change
 _CLIPPED_FRAMES = round(1.0 / FRAME_SECONDS)  # of the last minute
 _MINUTE = round(60.0 / FRAME_SECONDS)
 _LOUD_DBFS = -25.0
@@ -66,7 +66,9 @@ class SoundWatch:
         self._infrasound.add(samples, filtered)
         self._clipped = np.concatenate([self._clipped, _are_clipped(samples)])[-_MINUTE:]
         # Zeros are no fault: in a file they are silence, and a microphone's are reported elsewhere.
-        moving = (samples[:, :_LOOKED_AT] != samples[:, :1]).any(axis=1) | (samples[:, 0] == 0.0)
+        moving = (samples[:, :_COMPARED_SAMPLES] != samples[:, :1]).any(axis=1) | (
+            samples[:, 0] == 0.0
+        )
         still = np.flatnonzero(~moving)
         moving[still] = np.ptp(samples[still], axis=1) > 0
         moving = np.flatnonzero(moving & ~_is_offset_only(samples, filtered))
@@ -134,7 +136,7 @@ def _is_offset_only(samples: Float32, filtered: Float32) -> Bool:
     """Return the frames that hold only an offset: a dead microphone."""
     if filtered is samples:
         return np.zeros(len(samples), bool)
-    is_offset_only = np.ptp(samples[:, :_LOOKED_AT], axis=1) <= _DEAD_RANGE
+    is_offset_only = np.ptp(samples[:, :_COMPARED_SAMPLES], axis=1) <= _DEAD_RANGE
     flat = np.flatnonzero(is_offset_only)
     is_flat = np.ptp(samples[flat], axis=1) <= _DEAD_RANGE
     is_offset_only[flat] = is_flat & (filtered[flat] != samples[flat]).any(axis=1)

@@ -55,7 +55,7 @@ _NAME = re.compile(rf"(.+?)(?:\.({RELABEL_LAYER}.+|{REVIEW_LAYER}|{AUDIO_LAYER})
 _RECORDED = re.compile(r"(.+)_(\d{8}T\d{6}Z.*)", re.DOTALL)
 CATALOG = "catalog.sqlite"  # in the folder of its logs
 ENROLLED = "enrolled"  # folder of training sounds among the logs of a home
-_LOOKED_AT = 1000  # maximum number of entries inspected in a folder without logs
+_MOST_ENTRIES = 1000  # maximum number of entries inspected in a folder without logs
 CUT = "_cut"  # ends the name, without suffix, of a file cut from a log
 
 
@@ -227,7 +227,7 @@ def _warn_of_compressed(folder: Path, names: Sequence[str]) -> None:
 
 def _others_in(folder: Path) -> str:
     """Return the name of a log in another format in a folder without logs."""
-    entries = islice(folder.rglob("*"), _LOOKED_AT)
+    entries = islice(folder.rglob("*"), _MOST_ENTRIES)
     for other in sorted(entry for entry in entries if entry.suffix in OTHER_SUFFIXES):
         with suppress(OSError), os.fdopen(open_regular(other), "rb") as stream:
             return f": {other.name} {not_mcap(stream.read(16))}"

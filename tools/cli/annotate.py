@@ -106,10 +106,10 @@ def import_labels(
     )
     from hearthlog.analyzer.review.review_list import (
         check_scenario,
-        looked_at,
         outside_requests,
         queue_file,
-        read_list,
+        read_spans,
+        reviewed_spans,
     )
 
     if labels is None:  # a single argument is the labels
@@ -122,7 +122,7 @@ def import_labels(
     _check_microphone(log, coverage, microphone)
     options = ImportOptions(microphone, names, choice, strict)
     queue = queue_file(labels)
-    spans = read_list(queue) if queue.exists() else []
+    spans = read_spans(queue) if queue.exists() else []
     check_scenario(queue, spans, scenario, "--scenario")
     by_log, left_out, moved = read_labels(
         labels, coverage, options, lambda folded: _agree(labels, folded, yes=yes)
@@ -136,10 +136,10 @@ def import_labels(
         print_notice(*losses)
         raise typer.Exit(1)
     every_mark = [mark for marks in by_log.values() for mark in marks]
-    looked = looked_at(spans, every_mark, coverage, name, now)
+    reviewed_by_log = reviewed_spans(spans, every_mark, coverage, name, now)
     taken: list[Mark] = []
     seen: list[ReviewedSpan] = []
-    for path in sorted(by_log.keys() | looked.keys()):
+    for path in sorted(by_log.keys() | reviewed_by_log.keys()):
         new = [
             mark._replace(reviewer=mark.reviewer or name, made=mark.made or now)
             for mark in new_marks(by_log.get(path, []), read_marks(path, scenario))
@@ -147,7 +147,7 @@ def import_labels(
         before = {span._replace(reviewer="", made=0) for span in read_reviewed(path, scenario)}
         reviewed = [
             span
-            for span in looked.get(path, [])
+            for span in reviewed_by_log.get(path, [])
             if span._replace(reviewer="", made=0) not in before
         ]
         if new or reviewed:

@@ -257,7 +257,7 @@ class Accuracy:
         reviewed = list(read_reviewed_labels(logs, LIVE, 0, _EVER, self.losses))
         self.minutes: CheckedMinutes = checked_minutes(reviewed)
         self.weight = quiet_weight(logs, self.minutes.sounding)
-        self.right, self.looked_at = count_unchanged(reviewed)
+        self.right, self.reviewed = count_unchanged(reviewed)
 
     def lines(self) -> Iterator[str]:
         """Yield what was checked, and how much of it was correct."""
@@ -285,9 +285,9 @@ class Accuracy:
                 f"{number(FEWEST - len(self.minutes), 'more minute')}, and the report says in "
                 "which range the right numbers lie"
             )
-        if self.looked_at:
+        if self.reviewed:
             yield (
-                f"of {number(self.looked_at, 'span')} of the review queue or chosen, "
+                f"of {number(self.reviewed, 'span')} of the review queue or chosen, "
                 f"{self.right} had the right label (the queue prefers doubtful ones)"
             )
 
@@ -300,7 +300,7 @@ class Accuracy:
                 | {"precision": check.precision, "miss_rate": check.miss_rate(self.weight)}
                 for name, check in self._checks()
             },
-            "spans": self.looked_at,
+            "spans": self.reviewed,
             "spans_right": self.right,
         }
 

@@ -177,7 +177,7 @@ def diff(
     Exit status 3: a log is damaged or unfinished; its readable part and the others were used.
     """
     from hearthlog.analyzer.logs.labelling import find_labellings
-    from hearthlog.analyzer.review.review_list import write_list
+    from hearthlog.analyzer.review.review_list import write_spans
     from hearthlog.schemas.messages.topics import labelling_topic
 
     place = log_location(log)
@@ -200,7 +200,7 @@ def diff(
         result = _difference(name, sides, spans or _SHOWN)
     if output is not None:
         listed = result.spans()
-        write_list(output, listed)
+        write_spans(output, listed)
         print_notice(f"{len(listed)} spans are listed in {output}")
     if as_json:
         spans_as_text = [span.as_text() for span in result.spans()]
@@ -219,12 +219,12 @@ class _Result(NamedTuple):
 
 def _difference(microphone: str, sides: "list[NamedLabelling]", shown: int) -> _Result:
     from hearthlog.analyzer.evaluation import compare_labellings
-    from hearthlog.analyzer.review.review_list import disagreements
+    from hearthlog.analyzer.review.review_list import disagreements_to_review
 
     difference = compare_labellings(*sides)
     figures = {"microphone": microphone, **asdict(difference)}
     figures["disagreements"] = len(difference.disagreements.starts)
-    spans = partial(disagreements, difference, microphone)  # may be a hundred thousand
+    spans = partial(disagreements_to_review, difference, microphone)  # may be a hundred thousand
     return _Result(figures, spans, partial(print_difference, difference, shown))
 
 
@@ -380,13 +380,15 @@ class _Models:
 
     def __call__(self, info: "RecorderInfo") -> "Model | None":
         """Return the model for a recorder's info."""
-        from hearthlog.analyzer.relabel.replay import find_model
+        from hearthlog.analyzer.relabel.replay import find_recorded_model
 
         if self._given is not None:
             return self._given
         key = info.model, info.model_sha256
         if key not in self._models:
-            self._models[key] = find_model(*key, self._folders) if info.model_sha256 else None
+            self._models[key] = (
+                find_recorded_model(*key, self._folders) if info.model_sha256 else None
+            )
         return self._models[key]
 
     def report(self, infos: Sequence["RecorderInfo"]) -> None:

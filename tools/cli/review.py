@@ -377,8 +377,8 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
         queue_file,
         sound_files,
         sounds_folder,
-        write_list,
         write_sounds,
+        write_spans,
     )
     from hearthlog.schemas.messages.topics import scenario_name
 
@@ -406,7 +406,7 @@ def _save_queue(path: Path, logs: list[Path], choice: _Choice, timezone: str | N
             temporary.write_text(text, "utf-8")
     else:
         write_labels(path, marks, find_coverage(logs[0]))
-    write_list(queue, spans)
+    write_spans(queue, spans)
     clock = [datetime.fromtimestamp(one.start // NANOSECONDS, zone) for one in marks]
     minutes = {one.first: f"a minute, to {one.last}" for one in drawn_minutes(spans, marks)}
     print_table(

@@ -219,7 +219,7 @@ def _next_model(name: str) -> Path:
 def _model_of(home: list[Path], scenario: str) -> Path:
     """Return the model that labelled the latest log, and print its name."""
     from hearthlog.analyzer.logs.home_logs import find_home_logs
-    from hearthlog.models.registry import find_model
+    from hearthlog.models.registry import find_model_by_sha256
 
     logs = find_home_logs(home)
     models = logs.latest_scenario_models(scenario) if scenario else logs.latest_models()
@@ -235,7 +235,7 @@ def _model_of(home: list[Path], scenario: str) -> Path:
     if not name:
         wrong_use("the latest log has no labels: name a model with --base, such as --base general")
     folder = models_folder()
-    path = find_model(folder, sha256)
+    path = find_model_by_sha256(folder, sha256)
     if path is None:
         wrong_use(
             f"the latest log was labelled by {name} ({sha256[:12]}), which is neither in "

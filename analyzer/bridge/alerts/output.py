@@ -197,7 +197,7 @@ class AlertsOutput:
         self._report = report
         self._on_notification = on_notification
         self._has_problems = False
-        self._read_file, self._looked_at_file = object(), -math.inf  # the second: CLOCK_MONOTONIC
+        self._read_file, self._file_checked = object(), -math.inf  # the second: CLOCK_MONOTONIC
         self._outbox = Outbox(state, [BROKER, UNREAD], report)
         twice = "targets on edited lines may be notified twice"
         self._lines_entry = StateEntry(
@@ -268,9 +268,9 @@ class AlertsOutput:
         An unreadable line does not stop delivery to the others; notifications for its target wait
         until the line is fixed.
         """
-        if time.monotonic() - self._looked_at_file < _LOOK_AT_FILE_SECONDS:
+        if time.monotonic() - self._file_checked < _LOOK_AT_FILE_SECONDS:
             return
-        self._looked_at_file = time.monotonic()
+        self._file_checked = time.monotonic()
         current = None if self._file is None else _state_of(self._file)
         if current == self._read_file:
             return
@@ -298,7 +298,7 @@ class AlertsOutput:
 
         Returns when the clock is set back: messages so far may be from the future.
         """
-        home, looked, forgot = self._followed, -math.inf, time.monotonic()
+        home, checked, forgot = self._followed, -math.inf, time.monotonic()
         now = self._latest = time.time_ns()
         self._watch.reset_stale_progress(now)
         self._activity = LiveActivity(self._watch.needed_from(now), _PATIENCE)
@@ -313,9 +313,9 @@ class AlertsOutput:
             self._find_targets()
             while self._columns:
                 self._push(self._columns.popleft())
-            if time.monotonic() - looked >= _LOOK_SECONDS:
+            if time.monotonic() - checked >= _LOOK_SECONDS:
                 self._look()
-                looked = time.monotonic()
+                checked = time.monotonic()
             if time.monotonic() - forgot >= _FORGET_SECONDS:
                 self._activity.forget_before(self._watch.needed_from(time.time_ns()))
                 forgot = time.monotonic()

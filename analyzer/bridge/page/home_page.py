@@ -44,7 +44,7 @@ from hearthlog.analyzer.bridge.wording import (
 )
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time
-from hearthlog.analyzer.logs.shown_classes import read_list, write_list
+from hearthlog.analyzer.logs.shown_classes import read_hidden_classes, write_hidden_classes
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError
@@ -54,7 +54,7 @@ from hearthlog.schemas.messages.topics import is_sound
 _EVERY_SECONDS = 1.0
 _MARKS = {"/mark": False, "/mark-one": True}  # whether a mark is of the event alone
 _SHOW = {"yes": True, "no": False}
-_MOST_LOOKED_AT, _MOST_OTHERS = 24, 20  # bouts of the current day
+_MOST_TO_REVIEW, _MOST_OTHERS = 24, 20  # bouts of the current day
 _MOST_OF_DAY = 200  # bouts of a past day
 _MOST_IDS = 50  # events in a request
 _DAY = 24 * 3600 * NANOSECONDS
@@ -248,7 +248,7 @@ class HomePage:
 
     def _latest(self) -> list[Bout]:
         """Return the newest bouts that need review, and the newest others."""
-        left = {True: _MOST_LOOKED_AT, False: _MOST_OTHERS}
+        left = {True: _MOST_TO_REVIEW, False: _MOST_OTHERS}
         found = []
         for bout in self._bouts.values():
             uncounted = sum(event.id in self._uncounted for event in bout.events)
@@ -375,8 +375,8 @@ class HomePage:
             raise BridgeError("The configuration of the box hides this sound: never_tell.")
         folder = self._home.folder
         try:
-            names = read_list(folder)
-            write_list(folder, names - {name} if _SHOW[choice] else names | {name})
+            names = read_hidden_classes(folder)
+            write_hidden_classes(folder, names - {name} if _SHOW[choice] else names | {name})
         except (HearthlogError, OSError) as error:
             raise user_error(error) from error
         key = "shown again" if _SHOW[choice] else "shown nowhere"

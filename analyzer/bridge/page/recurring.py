@@ -47,21 +47,21 @@ def shown_groups(summary: GroupsSummary) -> dict[str, GroupSummary]:
 
 def recurring_list(
     summary: GroupsSummary,
-    looked: int,
+    written: int,
     outcomes: Mapping[str, str],
     moment: Moment,
     words: Translation = ENGLISH,
 ) -> Any:
     """Return the recurring sounds for JSON.
 
-    `looked` is when the summary was written, in nanoseconds of UTC; `outcomes` has the status of
+    `written` is when the summary was written, in nanoseconds of UTC; `outcomes` has the status of
     naming, by key of the group.
     """
     shown = shown_groups(summary)
     left = sum(not each.name for each in summary.groups) - _MOST_UNNAMED
     is_alone = len({name for each in summary.groups for name in each.microphones}) <= 1
     return {
-        "looked": words.when(min(max(looked, 0), moment.now), *moment),
+        "looked": words.when(min(max(written, 0), moment.now), *moment),
         "more": words.text("recurring.more", count=words.number(left)) if left > 0 else "",
         "groups": [
             _described(key, group, outcomes.get(key, ""), (moment, words), is_alone=is_alone)
@@ -232,7 +232,7 @@ class RecurringSounds:
         self.problem = ""
         self._file = folder / SUMMARY
         self._seen: tuple[int, ...] = ()
-        self._looked = 0
+        self._written = 0
         self._summary: GroupsSummary | None = None
         self._naming = GroupNaming(folder)
         self._described: dict[str, tuple[Any, Any]] = {}  # state and content, by language
@@ -246,7 +246,7 @@ class RecurringSounds:
         state = self._seen, outcomes, local_time(*moment).date()
         described = self._described.get(words.language)
         if described is None or described[0] != state:
-            shown = recurring_list(self._summary, self._looked, outcomes, moment, words)
+            shown = recurring_list(self._summary, self._written, outcomes, moment, words)
             described = self._described[words.language] = state, shown
         return described[1]
 
@@ -281,7 +281,7 @@ class RecurringSounds:
         seen = status.st_ino, status.st_size, status.st_mtime_ns
         if seen == self._seen:
             return
-        self._seen, self._looked, self.problem = seen, status.st_mtime_ns, ""
+        self._seen, self._written, self.problem = seen, status.st_mtime_ns, ""
         try:
             self._summary = load_summary(self._file)
         except HearthlogError as error:

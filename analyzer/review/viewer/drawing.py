@@ -12,10 +12,10 @@ from hearthlog.analyzer.logs.local_time import EVENING, MORNING
 from hearthlog.analyzer.logs.spans import Spans, rows_at
 from hearthlog.analyzer.review.lanes import (
     LEVEL,
+    PROBABILITIES,
     REVIEWED,
     SELECTED,
     SELECTED_COLOUR,
-    SHARES,
     Checked,
     Lane,
     labelling_in_words,
@@ -264,7 +264,7 @@ def draw_frames(
 
 def draw_plot(plot: Plot, entity: str, canvas: Canvas, *, is_new: bool = True) -> None:
     """Draw a plot, or add to it: bands fall apart where one zooms in, so shares are rows."""
-    if plot.kind is not SHARES:
+    if plot.kind is not PROBABILITIES:
         if is_new:
             configure_plot(plot, entity, canvas)
         _add_to_plot(plot, entity, canvas)
@@ -397,7 +397,7 @@ def plot_view(plots: Sequence[Plot], entities: Sequence[str], *, live: bool = Fa
     scale = kind.live_scale or kind.scale if live else kind.scale
     if kind.style is Style.HEAT_MAP:
         scale = (-0.5, len(plot.names) - 0.5)
-    elif kind is SHARES:
+    elif kind is PROBABILITIES:
         scale = (0.0, ROWS_HEIGHT)
     return _time_series(plot.title, entities, scale, legend=live and len(entities) > 1)
 
@@ -506,10 +506,10 @@ def _plot_views(
     microphone: MicrophoneTimeline, plots: Sequence[Plot], timeline: Timeline, *, close_up: bool
 ) -> list[rrb.View | rrb.Container]:
     """Show the plots of a microphone except the level; for close-ups, their drawn part."""
-    first = [plot for plot in plots if plot.kind is SHARES]
+    first = [plot for plot in plots if plot.kind is PROBABILITIES]
     if close_up:
         first += [plot for plot in plots if plot.kind is LEVEL]
-    others = [same for same in _by_title(plots) if same[0].kind not in {LEVEL, SHARES}]
+    others = [same for same in _by_title(plots) if same[0].kind not in {LEVEL, PROBABILITIES}]
     return [
         *(_close_up(plot, timeline.clock.name) if close_up else _all([plot]) for plot in first),
         *map(_all, reversed(others)),
@@ -561,7 +561,9 @@ def _all(plots: Sequence[Plot]) -> rrb.Container:
 
 def _with_text(plots: Sequence[Plot], view: rrb.View, note: str = "") -> rrb.Container:
     """Put a view of plots with one title next to a text that explains them."""
-    labelling = f": {labelling_in_words(plots[0].labelling)}" if plots[0].kind is SHARES else ""
+    labelling = (
+        f": {labelling_in_words(plots[0].labelling)}" if plots[0].kind is PROBABILITIES else ""
+    )
     return rrb.Horizontal(
         text_view(text_entity(plots[0])),
         view,

@@ -28,8 +28,8 @@ from hearthlog.analyzer.review.lanes import (
     FLOOR,
     NOVELTY,
     PLOTS,
+    PROBABILITIES,
     RECORDER,
-    SHARES,
     Checked,
     StateLane,
 )
@@ -335,7 +335,7 @@ def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
         names = [_name_entity(first[0], row) for row in range(max(map(_row_count, first)))]
         height, columns = first[0].kind.height, _LEVEL_COLUMNS
         texts: rrb.View | rrb.Container = text_view(names[0])
-        if first[0].kind is SHARES:
+        if first[0].kind is PROBABILITIES:
             height, columns = _ROW_HEIGHT * len(names) + _AXIS_HEIGHT, _ROW_COLUMNS
             texts = names_view(names, len(names))
         rows.append((height, rrb.Horizontal(texts, view, column_shares=columns)))
@@ -346,13 +346,13 @@ def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
 def _write_names(plot: Plot, canvas: Canvas) -> None:
     """Write what is next to a plot: the names of its rows, or its title."""
     canvas.write(NOTHING, "")
-    names = [*map(in_words, ordered(plot.names))] if plot.kind is SHARES else [plot.title]
+    names = [*map(in_words, ordered(plot.names))] if plot.kind is PROBABILITIES else [plot.title]
     for row, name in enumerate(names):
         canvas.write(_name_entity(plot, row), name)
 
 
 def _row_count(plot: Plot) -> int:
-    return len(plot.names) if plot.kind is SHARES else 1
+    return len(plot.names) if plot.kind is PROBABILITIES else 1
 
 
 def _name_entity(plot: Plot, row: int) -> str:
