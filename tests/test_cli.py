@@ -16,7 +16,7 @@ from conftest import FRESH_HEARTHLOG, HEARTHLOG
 from homelife import at, write_day
 from mcap.writer import Writer as McapWriter
 
-from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
+from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
 from hearthlog.models.classes import SILENCE, in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs

@@ -14,10 +14,10 @@ from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.wording import translation_for
+from hearthlog.analyzer.logs.hidden_classes import common_names, common_names_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.logs.shown_classes import common_names, common_names_of
 from hearthlog.analyzer.report.report import Period, make_report, read_report_data
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import BATHROOM, starter_file

@@ -30,8 +30,8 @@ from waiting import wait_for
 from hearthlog.analyzer.foxglove.publisher import RecordedSpan
 from hearthlog.analyzer.foxglove.server import Admission, RefusedError
 from hearthlog.analyzer.http import free_port
+from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
 from hearthlog.analyzer.logs.selection import array_names
-from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
 from hearthlog.models.classes import in_words, ordered
 from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.logs.files import find_logs

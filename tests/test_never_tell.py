@@ -18,13 +18,13 @@ from hearthlog.analyzer.bridge.alerts.output import RuleProgressStore, RuleWatch
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import Totals
 from hearthlog.analyzer.bridge.state import BridgeState
-from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.logs.shown_classes import (
+from hearthlog.analyzer.logs.hidden_classes import (
     NEVER_TELL_FILE,
     read_hidden_classes,
     write_hidden_classes,
 )
+from hearthlog.analyzer.logs.home_logs import find_home_logs
+from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

@@ -30,9 +30,9 @@ from hearthlog.analyzer.activity.values import (
     usual_range,
 )
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
-from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
 from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics

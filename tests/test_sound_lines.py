@@ -14,7 +14,7 @@ from conftest import HEARTHLOG
 from livehome import LiveHome
 from waiting import wait_for
 
-from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
+from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
 from hearthlog.analyzer.review.current_sounds import CurrentSound, lasting
 
 FRAME = 50_000_000

@@ -24,7 +24,7 @@ from waiting import wait_for
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
-from hearthlog.analyzer.logs.shown_classes import write_hidden_classes
+from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
 from hearthlog.analyzer.review.current_sounds import AWAY_SECONDS, CurrentSound, CurrentSounds
 from hearthlog.analyzer.review.lanes import (
     FEATURES,

@@ -23,10 +23,10 @@ from hearthlog.analyzer.activity.event_counts import (
     television_minutes,
 )
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overlaid, unified
 from hearthlog.analyzer.logs.recorder_info import model_of
-from hearthlog.analyzer.logs.shown_classes import common_names_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, lengths, overlay, rows_at, without
 from hearthlog.analyzer.marks.marks import (
     CHOICES,

@@ -8,6 +8,7 @@ import numpy as np
 
 from hearthlog.analyzer.activity.checked_minutes import labelling_of_marks
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.labelling import (
     MOST_CLASSES,
@@ -20,7 +21,6 @@ from hearthlog.analyzer.logs.labelling import (
 )
 from hearthlog.analyzer.logs.recorder_info import Trouble, gaps_of, troubles_of
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.shown_classes import common_names_of
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY, Spans, cut, joined
 from hearthlog.analyzer.marks.label_files import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed

@@ -23,10 +23,10 @@ from hearthlog.analyzer.activity.segments import (
 from hearthlog.analyzer.bridge.corrections import EventCorrections
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import Report
+from hearthlog.analyzer.logs.hidden_classes import common_names_of, read_hidden_classes
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.recorder_info import status_value
-from hearthlog.analyzer.logs.shown_classes import common_names_of, read_hidden_classes
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
 from hearthlog.models.classes import (
     OF_EVERY_SCENARIO,

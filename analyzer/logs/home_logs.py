@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.logs.hidden_classes import hidden_classes_of_log, recorded_hidden_classes
 from hearthlog.analyzer.logs.layers import find_with_layers, latest_records, readable_span
 from hearthlog.analyzer.logs.local_time import day_span, local_time
 from hearthlog.analyzer.logs.recorder_info import (
@@ -18,7 +19,6 @@ from hearthlog.analyzer.logs.recorder_info import (
     microphones_of,
     models_of,
 )
-from hearthlog.analyzer.logs.shown_classes import hidden_classes_of_log, recorded_hidden_classes
 from hearthlog.analyzer.logs.spans import NEVER
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hearthlog.analyzer.logs.hidden_classes import read_hidden_classes, recorded_hidden_classes
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.selection import checked_array_names, decode_types
-from hearthlog.analyzer.logs.shown_classes import read_hidden_classes, recorded_hidden_classes
 from hearthlog.analyzer.review.lanes import decibel
 from hearthlog.models.classes import class_name, in_words
 from hearthlog.schemas.arrays import Float32, Int64

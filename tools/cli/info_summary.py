@@ -18,9 +18,9 @@ from hearthlog.analyzer.activity.checked_minutes import (
 from hearthlog.analyzer.activity.daily_metrics import EventTotal
 from hearthlog.analyzer.activity.event_counts import FEWEST
 from hearthlog.analyzer.activity.values import Duration
+from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.logs.shown_classes import common_names_of
 from hearthlog.analyzer.logs.summary import LogSummary
 from hearthlog.models.classes import ON_TELEVISION, SILENCE, UNKNOWN, class_name, in_words, ordered
 from hearthlog.models.starter import GENERAL

@@ -42,9 +42,9 @@ from hearthlog.analyzer.bridge.wording import (
     room,
     translation_for,
 )
+from hearthlog.analyzer.logs.hidden_classes import read_hidden_classes, write_hidden_classes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time
-from hearthlog.analyzer.logs.shown_classes import read_hidden_classes, write_hidden_classes
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError

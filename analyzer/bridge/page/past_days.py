@@ -14,6 +14,7 @@ from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
 from hearthlog.analyzer.bridge.page.doubts import Doubts, doubtful, read_doubts
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
+from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, find_home_logs
 from hearthlog.analyzer.logs.local_time import (
     EVENING,
@@ -25,7 +26,6 @@ from hearthlog.analyzer.logs.local_time import (
     midnight,
 )
 from hearthlog.analyzer.logs.selection import array_names, select
-from hearthlog.analyzer.logs.shown_classes import common_names_of
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY
 from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.schemas.errors import HearthlogError
