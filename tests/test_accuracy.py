@@ -250,7 +250,7 @@ def test_a_range_is_in_order_the_same_each_time_and_grows_with_what_is_counted(m
     low, high = rates.range_of(strata)
     assert 0 <= low <= high
     assert again.range_of(strata) == (low, high)
-    twice = rates.range_of(strata.plus(strata))
+    twice = rates.range_of(strata.combined_with(strata))
     assert twice[1] >= high
     assert twice[0] >= low
 

@@ -33,7 +33,7 @@ from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, today
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE, one
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, single_span
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, write_marks
 from hearthlog.analyzer.promotion.paired_labels import reference_sounds
 from hearthlog.analyzer.promotion.recent_time import recent_logs, spans_of
@@ -125,7 +125,7 @@ def test_the_page_shows_the_counts_of_the_report(logs, followed):
         name = lane["label"]
         later = [e for e in own.events(name, moment.now) if e.start < day_span(DAY, ZONE)[1]]
         _, of_night, _ = reported(logs)[name]
-        waking = one(*(at_hour(DAY, hour, ZONE) for hour in (MORNING, EVENING)))
+        waking = single_span(*(at_hour(DAY, hour, ZONE) for hour in (MORNING, EVENING)))
         of_day = day.home.minutes.between(waking).count(name, None).labelled
         assert [count or 0 for count in lane["counts"]] == [of_night, of_day], (name, later)
 

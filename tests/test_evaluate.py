@@ -22,7 +22,7 @@ from hearthlog.analyzer.evaluation import (
 from hearthlog.analyzer.evaluation.log_scores import evaluate_labelling
 from hearthlog.analyzer.evaluation.model_scores import evaluate_model
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import Spans, common, joined
+from hearthlog.analyzer.logs.spans import Spans, intersection, joined
 from hearthlog.analyzer.training.clips import clip_frames, steady_noise
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import BUILTIN, read_manifest, scenario_of
@@ -202,7 +202,7 @@ def home(rng, count):
 
 
 def mistaken(rng, true):
-    kept = true.taken(np.flatnonzero(rng.random(len(true)) < 0.8))
+    kept = true.select(np.flatnonzero(rng.random(len(true)) < 0.8))
     moved = kept.starts + (rng.normal(0, 0.15, len(kept)) * SECOND).astype(np.int64)
     starts = np.maximum(moved, 0)
     ends = kept.ends + (rng.normal(0, 0.3, len(kept)) * SECOND).astype(np.int64)
@@ -275,7 +275,7 @@ def test_spans_are_joined_and_cut_like_sets_of_moments(first, second):
         for rows in (first, second)
     ]
     assert [one.length for one in spans] == [len(one) for one in sets]
-    assert common(*spans).length == len(sets[0] & sets[1])
+    assert intersection(*spans).length == len(sets[0] & sets[1])
 
 
 def test_what_is_outside_of_the_evaluated_spans_is_left_out():

@@ -17,7 +17,7 @@ from spliced import run
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation import compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
-from hearthlog.analyzer.logs.spans import Spans, common
+from hearthlog.analyzer.logs.spans import Spans, intersection
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion.comparison import (
     HomeComparison,
@@ -428,7 +428,7 @@ def test_a_home_that_is_mostly_quiet_is_heard_where_it_is_not():
     chosen = choose(parts, sounding)
     lengths = np.array([part.end - part.start for part in chosen])
     weights = np.array([part.weight for part in chosen])
-    recorded = [common(Spans(np.array([part.start]), np.array([part.end])), sounding).length
+    recorded = [intersection(Spans(np.array([part.start]), np.array([part.end])), sounding).length
              for part in chosen]  # fmt: skip
     assert lengths.sum() < 1.4 * hour
     assert sum(recorded) > 1500 * SECOND

@@ -19,7 +19,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import kept_time
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.layers import find_coverage
-from hearthlog.analyzer.logs.spans import NONE, cut, joined, one, pieces
+from hearthlog.analyzer.logs.spans import NONE, cut, intersection_rows, joined, single_span
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, read_marks, read_reviewed
 from hearthlog.analyzer.review import review_list as requested
 from hearthlog.analyzer.review.candidates import (
@@ -326,7 +326,7 @@ def test_a_label_file_of_a_queue_tells_the_import_what_was_looked_at_and_how_it_
     output = find_labellings(home).read(*LIVE).labelling
     for item in requested:
         if item.chosen == RANDOM:
-            parts, rows, _ = pieces(output, one(item.start, item.end))
+            parts, rows, _ = intersection_rows(output, single_span(item.start, item.end))
             marks = [m for m in written(home, read_marks) if item.start <= m.start < item.end]
             assert [mark.label for mark in marks] == output.labels[rows].tolist()
             assert [mark.start for mark in marks] == pytest.approx(parts.starts.tolist(), abs=1e6)
@@ -396,7 +396,7 @@ def test_a_minute_whose_log_is_gone_has_no_lines():
     minutes = [(START, end), (end, end + MINUTE)]
     spans = [ReviewSpan("mic", *each, "live", "", "", "", None, RANDOM) for each in minutes]
     marks = [Mark("mic", START, middle, "speech"), Mark("mic", middle, end, "music")]
-    kept = requested.KeptSoundLayers({}, "/mic/audio", one(START, end + MINUTE))
+    kept = requested.KeptSoundLayers({}, "/mic/audio", single_span(START, end + MINUTE))
     files = requested.sound_files(marks, spans, kept)
     assert [(file.first, file.last) for file in files] == [(1, 1), (2, 2), (1, 2)]
     lines = requested.label_lines(marks, spans, files, "ten", UTC).splitlines()

@@ -33,7 +33,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
-from hearthlog.analyzer.logs.spans import Spans, common, cut, joined, lengths, without
+from hearthlog.analyzer.logs.spans import Spans, cut, difference, intersection, joined, lengths
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.analyzer.report.report import Period, make_report
@@ -100,8 +100,8 @@ def ticks(some: Spans) -> set[int]:
 
 @given(spans, spans)
 def test_spans_are_joined_taken_from_each_other_and_measured_as_sets_are(a, b):
-    assert ticks(common(a, b)) == ticks(a) & ticks(b)
-    assert ticks(without(a, b)) == ticks(a) - ticks(b)
+    assert ticks(intersection(a, b)) == ticks(a) & ticks(b)
+    assert ticks(difference(a, b)) == ticks(a) - ticks(b)
     assert ticks(cut(a, 10, 30)) == ticks(a) & set(range(10, 30))
     edges = np.array([0, 7, 20, 21, 80])
     between = [len(ticks(a) & set(range(x, y))) for x, y in pairwise(edges)]

@@ -36,7 +36,7 @@ from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.alerts.rules import history
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import joined, one, without
+from hearthlog.analyzer.logs.spans import difference, joined, single_span
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.report.wording import difference_text, judgement_text
 from hearthlog.schemas.frames import NANOSECONDS
@@ -75,15 +75,15 @@ def home(days, zone=UTC, gaps=()):
             start = round(moment.replace(tzinfo=zone).timestamp() * NANOSECONDS)
             rows.append((start, start + round(seconds * NANOSECONDS), label))
     begin = midnight(MONDAY) - 2 * HOUR * NANOSECONDS
-    covered = one(begin, begin + (len(days) * 24 + 8) * HOUR * NANOSECONDS)
+    covered = single_span(begin, begin + (len(days) * 24 + 8) * HOUR * NANOSECONDS)
     for start, end in gaps:
-        covered = without(covered, one(start, end))
+        covered = difference(covered, single_span(start, end))
     parts = [Labelling(*covered, np.full(len(covered.starts), "silence", object))]
     for label in CLASSES:
         own = np.array([row[:2] for row in rows if row[2] == label], np.int64).reshape(-1, 2)
         spans = joined(own[:, 0], own[:, 1])
         for start, end in gaps:
-            spans = without(spans, one(start, end))
+            spans = difference(spans, single_span(start, end))
         parts.append(Labelling(*spans, np.full(len(spans.starts), label, object)))
     starts, ends, labels = (
         np.concatenate([getattr(part, name) for part in parts])

@@ -27,7 +27,7 @@ from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overlaid, unified
 from hearthlog.analyzer.logs.recorder_info import model_of
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, lengths, overlay, rows_at, without
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, difference, lengths, overlay, rows_at
 from hearthlog.analyzer.marks.marks import (
     CHOICES,
     RANDOM,
@@ -303,8 +303,8 @@ def _events(minute: ReviewedLabels, name: str) -> list[int]:
     start, end = minute.span.start, minute.span.end
     labelled, true = events_of(minute.labels, name), events_of(minute.true, name)
     own, others = _begun(labelled, minute), _begun(true, minute)
-    right = overlapping(own, without(cut(true, start, end), minute.undecided))
-    found = overlapping(others, without(cut(labelled, start, end), minute.undecided))
+    right = overlapping(own, difference(cut(true, start, end), minute.undecided))
+    found = overlapping(others, difference(cut(labelled, start, end), minute.undecided))
     return [len(own.starts), int(right.sum()), len(others.starts), int((~found).sum())]
 
 
@@ -313,7 +313,7 @@ def _begun(events: Spans, minute: ReviewedLabels) -> Spans:
     span = minute.span
     first, last = np.searchsorted(events.starts, [span.start, span.end])
     begun = Spans(events.starts[first:last], np.minimum(events.ends[first:last], span.end))
-    decided = overlapping(begun, without(begun, minute.undecided))
+    decided = overlapping(begun, difference(begun, minute.undecided))
     return Spans(begun.starts[decided], begun.ends[decided])
 
 
@@ -403,7 +403,7 @@ def checked_confidences(reviewed: Iterable[ReviewedLabels]) -> tuple[Float64, Bo
             segments = Spans(one.labels.starts[own], np.minimum(one.labels.ends[own], end))
             events, highest = events_and_confidences(one.labels, name)
             row, right = rows_at(events, segments.starts), np.zeros(len(events.starts), bool)
-            correct = without(cut(true.get(name, NONE), start, end), one.undecided)
+            correct = difference(cut(true.get(name, NONE), start, end), one.undecided)
             np.logical_or.at(right, row, overlapping(segments, correct))
             begun = (events.starts >= start) & (events.starts < end)
             confidences += highest[begun].tolist()

@@ -30,13 +30,13 @@ from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
     NONE,
     Spans,
-    common,
     cut,
+    difference,
     first_of_groups,
+    intersection,
     lengths,
-    one,
     rows_at,
-    without,
+    single_span,
 )
 from hearthlog.models.classes import (
     ON_TELEVISION,
@@ -128,7 +128,7 @@ def home_minutes(
     """
     first, last = int(coverage.starts[0]) // MINUTE, -(-int(coverage.ends[-1]) // MINUTE)
     edges = np.arange(first, last + 1) * MINUTE
-    reviewed = reduce(common, gone_through)
+    reviewed = reduce(intersection, gone_through)
     begun = {}
     for name, (starts, confidences) in events.items():
         labelled, certain = events_of(labels, name).starts, rows_at(reviewed, starts) >= 0
@@ -185,8 +185,8 @@ class HomeMetrics:
             {name: cut(spans, start, end) for name, spans in self.listened.items()},
             cut(self.sound, start, end),
             {name: cut(spans, start, end) for name, spans in self.spans.items()},
-            {name: self.events_in(name, one(start, end)) for name in self.events},
-            self.minutes.between(one(start, end)),
+            {name: self.events_in(name, single_span(start, end)) for name in self.events},
+            self.minutes.between(single_span(start, end)),
             self.rates,
         )
 
@@ -215,7 +215,7 @@ def metrics_of_home(data: HomeData, checks: CheckedMinutes | None = None) -> Hom
         own, highest = events_and_confidences(labels, name)
         events[name] = own.starts, highest
     if SILENCE in spans:
-        spans[SILENCE] = without(spans[SILENCE], sound)  # another microphone has a sound
+        spans[SILENCE] = difference(spans[SILENCE], sound)  # another microphone has a sound
         del events[SILENCE]
     gone_through = [data.gone_through.get(source, NONE) for source in data.segments]
     labelled = in_order(data.labelled.values())
@@ -258,7 +258,7 @@ class DayMetrics:
     @property
     def missing(self) -> Spans:
         """Spans of the day, as far as it is over, without coverage."""
-        return without(self.over, self.coverage)
+        return difference(self.over, self.coverage)
 
     @property
     def share(self) -> float:
@@ -268,13 +268,15 @@ class DayMetrics:
     @property
     def night_hours(self) -> float:
         """Covered hours of the night."""
-        return common(self.home.coverage, self.night).length / HOUR
+        return intersection(self.home.coverage, self.night).length / HOUR
 
     def comparable(self, name: str = "") -> bool:
         """Return whether three quarters of the day, and of its night, are covered."""
         spans = [self.home.listened[name]] if name else [*self.home.listened.values()]
         periods = self.span, self.night
-        shares = [common(own, period).length / period.length for own in spans for period in periods]
+        shares = [
+            intersection(own, period).length / period.length for own in spans for period in periods
+        ]
         return min(shares) >= MOST
 
     def share_of(self, name: str) -> float:
@@ -283,7 +285,7 @@ class DayMetrics:
 
     def minutes(self, name: str) -> Duration | None:
         """Return the duration of a class; None if unknown."""
-        minutes = _length(common(self.home.spans.get(name, NONE), self.span))
+        minutes = _length(intersection(self.home.spans.get(name, NONE), self.span))
         return _if_covered(minutes, self.share_of(name))
 
     def events(self, name: str) -> Int64:
@@ -313,12 +315,14 @@ class DayMetrics:
     @property
     def sound(self) -> Duration | None:
         """Duration of any sound on this day; None if unknown."""
-        return _if_covered(_length(common(self.home.sound, self.span)), self.share)
+        return _if_covered(_length(intersection(self.home.sound, self.span)), self.share)
 
     @property
     def night_sound(self) -> Duration | None:
         """Duration of any sound in the night; None if unknown."""
-        return _if_covered(_length(common(self.home.sound, self.night)), self._share_of(self.night))
+        return _if_covered(
+            _length(intersection(self.home.sound, self.night)), self._share_of(self.night)
+        )
 
     @property
     def night_stretches(self) -> Count | None:
@@ -348,7 +352,7 @@ class DayMetrics:
     @property
     def quiet(self) -> Duration | None:
         """Length of `longest_quiet`; None if less than half of its search window is covered."""
-        waking = one(*awake_span(self.day, self.zone))
+        waking = single_span(*awake_span(self.day, self.zone))
         return _length(self.longest_quiet) if self._share_of(waking) >= _HALF else None
 
     @property
@@ -380,7 +384,7 @@ class DayMetrics:
         if not len(times):
             return None
         start, end = quiet(int(times[0]))
-        if start < end and self._share_of(one(start, end)) < MOST:
+        if start < end and self._share_of(single_span(start, end)) < MOST:
             return None
         local = local_time(int(times[0]), self.zone)
         return Clock(60 * local.hour + local.minute)
@@ -393,18 +397,18 @@ def day_of(home: HomeMetrics, day: date, zone: tzinfo, now: int | None = None) -
     it that is not in the logs yet. By default the day is over.
     """
     start, end = day_span(day, zone)
-    span, night = one(start, end), one(*night_span(day, zone))
+    span, night = single_span(start, end), single_span(*night_span(day, zone))
     near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
-    coverage = common(near.coverage, span)
+    coverage = intersection(near.coverage, span)
     over = span
     if now is not None and start < now < end:
         recorded = int(coverage.ends[-1]) if coverage.length else start
-        over = one(start, recorded if now - recorded < HOUR else now)
+        over = single_span(start, recorded if now - recorded < HOUR else now)
     return DayMetrics(day, near, zone, span, night, coverage, over)
 
 
 def _share(covered: Spans, span: Spans) -> float:
-    return common(covered, span).length / span.length
+    return intersection(covered, span).length / span.length
 
 
 def _if_covered(value: _Figure, share: float) -> _Figure | None:
@@ -513,7 +517,9 @@ def _events_of(
     seconds = lengths(segments.spans(), edges) / NANOSECONDS
     highest = np.maximum.reduceat(segments.confidences, firsts)
     counted = np.isin(events.starts, metrics.minutes.counted(name, events.starts))
-    through = reduce(common, [data.gone_through.get(source, NONE) for source in data.segments])
+    through = reduce(
+        intersection, [data.gone_through.get(source, NONE) for source in data.segments]
+    )
     reviewed = rows_at(through, events.starts) >= 0
     microphones = np.split(segments.labels, firsts[1:])
     for row in range(begin, stop):

@@ -14,13 +14,13 @@ from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
     NONE,
     Spans,
-    common,
     cut,
+    difference,
+    intersection,
     joined,
     lengths,
-    one,
     rows_at,
-    without,
+    single_span,
 )
 from hearthlog.models.classes import (
     COUGHING,
@@ -43,7 +43,7 @@ _QUIET_PAUSE, _STRETCH = 10 * MINUTE, 30 * NANOSECONDS
 
 def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spans:
     """Find the longest quiet span from 07:00 to 22:00; empty without any sound in that time."""
-    quiet = without(cut(coverage, *awake_span(day, zone)), sound)
+    quiet = difference(cut(coverage, *awake_span(day, zone)), sound)
     if not len(quiet.starts):
         return NONE
     longest = int((quiet.ends - quiet.starts).argmax())
@@ -52,7 +52,7 @@ def longest_quiet(sound: Spans, coverage: Spans, day: date, zone: tzinfo) -> Spa
 
 def stretches(sound: Spans, night: Spans) -> int:
     """Count the stretches of half a minute of sound or more in a night, ten quiet minutes apart."""
-    inside = common(sound, night)
+    inside = intersection(sound, night)
     found = joined(*inside, _QUIET_PAUSE)
     if not len(found.starts):
         return 0
@@ -129,7 +129,7 @@ class Profiles:
         for name in names:
             spans, events = labels.spans(labels.labels == name), events_of(labels, name)
             if name in APART_IN_LENGTH:
-                spans = without(spans, television)
+                spans = difference(spans, television)
                 apart = rows_at(television, events.starts) < 0
                 events = Spans(events.starts[apart], events.ends[apart])
             self._spans[name], self._events[name] = spans, events
@@ -160,7 +160,7 @@ class Profiles:
             quiet = longest_quiet(self._sound, self._coverage, day, self._zone)
             return quiet.length / MINUTE
         if figure.what == STRETCHES:
-            return stretches(self._sound, one(*part)) / share
+            return stretches(self._sound, single_span(*part)) / share
         if figure.kind == COUNT:
             starts = self._events[figure.what].starts
             return int(np.diff(np.searchsorted(starts, part))[0]) / share

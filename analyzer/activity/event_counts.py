@@ -97,7 +97,7 @@ class Strata(NamedTuple):
     sounding: int = 0  # minutes
     labelled: int = 0
 
-    def plus(self, other: Self) -> "Strata":
+    def combined_with(self, other: Self) -> "Strata":
         """Return the sums."""
         return Strata(*(a + b for a, b in zip(self, other, strict=True)))
 

@@ -20,7 +20,7 @@ from hearthlog.analyzer.logs.spans import (
     Spans,
     cut,
     joined,
-    one,
+    single_span,
     union,
 )
 from hearthlog.models.classes import OF_EVERY_SCENARIO, SILENCE, class_name
@@ -306,7 +306,7 @@ class SegmentCollector:
         coverage = {name: own.spans(FRAME_NANOSECONDS) for name, own in self._coverage.items()}
         written = self._written.spans(_PAUSE)
         for source, start, end, label, confidence in others:
-            span, spans = one(start, end), coverage.get(source, NONE)
+            span, spans = single_span(start, end), coverage.get(source, NONE)
             written = union(written, span, pause=_PAUSE)
             coverage[source] = union(spans, span, pause=FRAME_NANOSECONDS)
             name = class_name(label)

@@ -53,7 +53,7 @@ class Count(_Quantity):
         return Count(
             self.labelled + other.labelled,
             self.certain + other.certain,
-            self.unchecked.plus(other.unchecked),
+            self.unchecked.combined_with(other.unchecked),
             self.rates or other.rates,
             self.unsure + other.unsure,
         )

@@ -20,7 +20,7 @@ from hearthlog.analyzer.discover import (
     are_numbers,
 )
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.logs.spans import ranges
+from hearthlog.analyzer.logs.spans import concatenated_ranges
 from hearthlog.models.classifiers.model import MOST_VALUES
 from hearthlog.schemas.arrays import Bool, Float32, Float64, Int64
 from hearthlog.schemas.messages.topics import EmbeddingSpace
@@ -272,7 +272,7 @@ def describe(values: Float32, names: Sequence[str], first: Int64, last: Int64) -
 
 def _described(values: Float32, names: Sequence[str], first: Int64, last: Int64) -> Float32:
     counts = last - first
-    sound, rows = ranges(first, counts)
+    sound, rows = concatenated_ranges(first, counts)
     begins = np.cumsum(counts) - counts
     x = values[rows][:, _used(names)].astype(np.float64)
     weights = _weights(values[rows], names)

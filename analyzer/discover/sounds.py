@@ -34,7 +34,7 @@ from hearthlog.analyzer.errors import DataError, collect_errors
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.selection import checked_array_names
 from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
-from hearthlog.analyzer.logs.spans import ranges
+from hearthlog.analyzer.logs.spans import concatenated_ranges
 from hearthlog.analyzer.marks.marks import (
     Mark,
     MarkedSpan,
@@ -96,7 +96,7 @@ def _find_sounds(
     counts = np.diff(np.append(first, len(rows)))
     enough = sounding[first + counts - 1] - sounding[first] >= _LEAST_NANOSECONDS
     first, counts = first[enough], counts[enough]
-    sound, inside = ranges(first, counts)
+    sound, inside = concatenated_ranges(first, counts)
     begin, end = rows[first], rows[first + counts - 1]
     sums = np.bincount(sound, confidence[there][inside], len(first))
     return SoundSpans(

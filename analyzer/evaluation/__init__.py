@@ -12,11 +12,11 @@ from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
     Overlay,
     Spans,
-    common,
+    concatenated_ranges,
+    intersection,
+    intersection_rows,
     joined,
     overlay,
-    pieces,
-    ranges,
 )
 from hearthlog.schemas.arrays import Bool, Float64, Indices, Int64
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, NANOSECONDS
@@ -40,9 +40,9 @@ class Events:
 
     def of(self, label: int) -> "Events":
         """Return the spans of one label."""
-        return self.taken(np.flatnonzero(self.labels == label))
+        return self.select(np.flatnonzero(self.labels == label))
 
-    def taken(self, rows: Indices | Bool) -> "Events":
+    def select(self, rows: Indices | Bool) -> "Events":
         """Return a selection of the spans, by mask, or by row numbers in their new order."""
         return Events(self.starts[rows], self.ends[rows], self.labels[rows])
 
@@ -111,7 +111,7 @@ def laid_out(events: Events, spans: Spans) -> Events:
     """
     seconds = -((spans.starts - spans.ends) // NANOSECONDS) + 1
     places = (np.cumsum(seconds) - seconds) * NANOSECONDS
-    parts, event, span = pieces(events, spans)
+    parts, event, span = intersection_rows(events, spans)
     shift = (places - spans.starts)[span]
     return Events(parts.starts + shift, parts.ends + shift, events.labels[event])
 
@@ -125,7 +125,7 @@ def segment_based(reference: Events, predicted: Events, classes: Sequence[str]) 
     counts = []
     for label in range(len(classes)):
         true, own = _seconds(reference.of(label)), _seconds(predicted.of(label))
-        counts.append((common(true, own).length, true.length, own.length))
+        counts.append((intersection(true, own).length, true.length, own.length))
     return _scores(counts, classes)
 
 
@@ -151,7 +151,7 @@ def event_based(reference: Events, predicted: Events, classes: Sequence[str]) ->
 
 def _matches(reference: Events, predicted: Events) -> int:
     """Size of the largest matching."""
-    predicted = predicted.taken(np.argsort(predicted.starts, kind="stable"))
+    predicted = predicted.select(np.argsort(predicted.starts, kind="stable"))
     first = np.searchsorted(predicted.starts, reference.starts - COLLAR, "left")
     count = np.searchsorted(predicted.starts, reference.starts + COLLAR, "right") - first
     if count.sum() > _MOST_PAIRS:
@@ -159,7 +159,7 @@ def _matches(reference: Events, predicted: Events) -> int:
     from scipy.sparse import coo_array  # noqa: PLC0415  which most readers of events do without
     from scipy.sparse.csgraph import maximum_bipartite_matching  # noqa: PLC0415
 
-    row, column = ranges(first, count)
+    row, column = concatenated_ranges(first, count)
     tolerance = np.maximum(COLLAR, _PART_OF_LENGTH * (reference.ends - reference.starts))
     near = np.abs(reference.ends[row] - predicted.ends[column]) <= tolerance[row]
     if not near.any():
@@ -219,7 +219,7 @@ class LabelRuns(NamedTuple):
     a: Int64  # shape (n,), indices of classes
     b: Int64
 
-    def taken(self, which: Bool | Indices) -> "LabelRuns":
+    def select(self, which: Bool | Indices) -> "LabelRuns":
         """Return a selection of the runs, by mask, or by row numbers in their new order."""
         return LabelRuns(*(column[which] for column in self))
 
@@ -276,7 +276,7 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> LabellingDiffere
         raise DataError(f"{a.name} and {b.name} have no time in common")
     counts = _Counts(pieces, events, len(classes))
     runs = runs_of(pieces, *events)
-    differing = runs.taken(runs.a != runs.b)
+    differing = runs.select(runs.a != runs.b)
     return LabellingDifference(
         a=a.name,
         b=b.name,
@@ -291,7 +291,9 @@ def compare_labellings(a: NamedLabelling, b: NamedLabelling) -> LabellingDiffere
             str(np.datetime64(day, "D")): counts.amounts(classes, i)
             for i, day in enumerate(counts.days.tolist())
         },
-        disagreements=differing.taken(np.argsort(differing.starts - differing.ends, kind="stable")),
+        disagreements=differing.select(
+            np.argsort(differing.starts - differing.ends, kind="stable")
+        ),
     )
 
 

@@ -20,7 +20,7 @@ from hearthlog.analyzer.evaluation import (
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, all_classes, labelling_of
 from hearthlog.analyzer.logs.layers import find_coverage, with_layers
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.spans import Spans, common, joined, pieces
+from hearthlog.analyzer.logs.spans import Spans, intersection, intersection_rows, joined
 from hearthlog.analyzer.marks.label_files import read_lines
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
@@ -71,7 +71,7 @@ def evaluate_labelling(
     classes or no frame with a single label, or if too many events start together for a labelling.
     """
     covered = joined(reference.starts, reference.ends, FRAME_NANOSECONDS)
-    spans = common(covered, joined(predicted.starts, predicted.ends, FRAME_NANOSECONDS))
+    spans = intersection(covered, joined(predicted.starts, predicted.ends, FRAME_NANOSECONDS))
     if not spans.length:
         raise DataError(
             f"the reference ({_between(reference)}) and what is labelled in the log "
@@ -88,7 +88,7 @@ def evaluate_labelling(
         for name, length in zip(names[len(classes) :], lengths[len(classes) :], strict=True)
         if length
     }
-    named = target.taken(target.labels < len(classes))
+    named = target.select(target.labels < len(classes))
     if not len(named):
         raise DataError(
             f"the reference has none of the labels of the log ({', '.join(classes)}) where they "
@@ -112,7 +112,7 @@ def _event_counts(
     """Count the events of each class, as the report does."""
 
     def counts(labelling: Labelling) -> Counter[str]:
-        inside, rows, _ = pieces(labelling, spans)
+        inside, rows, _ = intersection_rows(labelling, spans)
         within = Labelling(inside.starts, inside.ends, labelling.labels[rows])
         names = set(within.labels) - {SILENCE}
         return Counter({name: len(events_of(within, name).starts) for name in names})

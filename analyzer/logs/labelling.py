@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import find_with_layers
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.spans import NEVER, Rows, Spans, joined, one, pieces, remains
+from hearthlog.analyzer.logs.spans import (
+    NEVER,
+    Rows,
+    Spans,
+    difference_rows,
+    intersection_rows,
+    joined,
+    single_span,
+)
 from hearthlog.models.classes import CLASS_NAME, class_name, translation
 from hearthlog.schemas.arrays import Bool, Float32, Int64
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
@@ -90,7 +98,7 @@ class Labelling:
 
 def overlaid(labels: Labelling, above: Labelling) -> Labelling:
     """Overlay a labelling on another one; the upper labels replace the lower ones."""
-    left, rows = remains(labels, above.spans())
+    left, rows = difference_rows(labels, above.spans())
     return in_order([Labelling(*left, labels.labels[rows], labels.confidences[rows]), above])
 
 
@@ -296,8 +304,8 @@ class Labellings:
         if not parts:
             return None
         together = labelling_of(join(parts))
-        span = one(-NEVER if start is None else start, NEVER if end is None else end)
-        spans, rows, _ = pieces(together, span)
+        span = single_span(-NEVER if start is None else start, NEVER if end is None else end)
+        spans, rows, _ = intersection_rows(together, span)
         if not len(rows):
             return None
         return Labelling(*spans, together.labels[rows], together.confidences[rows])

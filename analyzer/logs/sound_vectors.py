@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hearthlog.analyzer.logs.spans import ranges
+from hearthlog.analyzer.logs.spans import concatenated_ranges
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES, Directions
 from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES, Embeddings
 from hearthlog.schemas.arrays import Float32, Float64, Int64
@@ -133,7 +133,7 @@ def mean_embeddings(
     there = np.flatnonzero(counts > 0)
     if len(there):
         first, counts = first[there].astype(np.int64), counts[there].astype(np.int64)
-        span, rows = ranges(first, counts)
+        span, rows = concatenated_ranges(first, counts)
         begins = np.cumsum(counts) - counts
         last = np.minimum(stamps[rows] + _WINDOW, ends[there][span])
         weights = (last - np.maximum(stamps[rows], starts[there][span])).astype(np.float64)

@@ -62,7 +62,7 @@ class Overlay(NamedTuple):
 NONE = Spans(np.empty(0, np.int64), np.empty(0, np.int64))
 
 
-def one(start: int, end: int) -> Spans:
+def single_span(start: int, end: int) -> Spans:
     """Return a single span in nanoseconds of UTC; the end is after the start."""
     return Spans(np.array([start]), np.array([end]))
 
@@ -86,7 +86,9 @@ def joined(starts: Int64, ends: Int64, pause: int = 0) -> Spans:
     return Spans(starts[firsts], np.maximum.reduceat(ends, firsts)) if len(firsts) else NONE
 
 
-def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Rows, Rows]:
+def concatenated_ranges(
+    firsts: NDArray[np.integer], counts: NDArray[np.integer]
+) -> tuple[Rows, Rows]:
     """Concatenate ranges of consecutive numbers, given the first number and length of each.
 
     Return the range (row) of each number, and the numbers: `firsts[0]`, `firsts[0] + 1` … of row 0,
@@ -96,18 +98,18 @@ def ranges(firsts: NDArray[np.integer], counts: NDArray[np.integer]) -> tuple[Ro
     return rows, np.arange(counts.sum()) + np.repeat(firsts - (np.cumsum(counts) - counts), counts)
 
 
-def pieces(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
+def intersection_rows(a: Timed, b: Spans) -> tuple[Spans, Rows, Rows]:
     """Intersect spans with other spans; return the rows of `a` and of `b` with each piece, too."""
     low = np.searchsorted(b.ends, a.starts, side="right")
     high = np.searchsorted(b.starts, a.ends, side="left")
-    of_a, of_b = ranges(low, np.maximum(high - low, 0))
+    of_a, of_b = concatenated_ranges(low, np.maximum(high - low, 0))
     starts = np.maximum(a.starts[of_a], b.starts[of_b])
     return Spans(starts, np.minimum(a.ends[of_a], b.ends[of_b])), of_a, of_b
 
 
-def common(a: Spans, b: Spans) -> Spans:
+def intersection(a: Spans, b: Spans) -> Spans:
     """Return the intersection of two sets of spans."""
-    return pieces(a, b)[0]
+    return intersection_rows(a, b)[0]
 
 
 def union(*parts: Spans, pause: int = 0) -> Spans:
@@ -124,12 +126,12 @@ def cut(spans: Spans, start: int, end: int) -> Spans:
     return Spans(np.maximum(spans.starts[rows], start), np.minimum(spans.ends[rows], end))
 
 
-def without(a: Spans, b: Spans) -> Spans:
-    """Return the time in the first spans that is not in the second."""
-    return remains(a, b)[0]
+def difference(a: Spans, b: Spans) -> Spans:
+    """Return the difference of two sets of spans: the time in the first and not in the second."""
+    return difference_rows(a, b)[0]
 
 
-def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
+def difference_rows(a: Timed, b: Spans) -> tuple[Spans, Rows]:
     """Cut spans `a`, ascending by start and by end, to the parts outside of other spans, in order.
 
     Return the row of `a` for each part, too.
@@ -139,7 +141,7 @@ def remains(a: Timed, b: Spans) -> tuple[Spans, Rows]:
     first, last = min(a.starts[0], b.starts[0]), max(a.ends[-1], b.ends[-1])
     starts, ends = np.concatenate([[first], b.ends]), np.concatenate([b.starts, [last]])
     left = starts < ends
-    spans, of_a, _ = pieces(a, Spans(starts[left], ends[left]))
+    spans, of_a, _ = intersection_rows(a, Spans(starts[left], ends[left]))
     return spans, of_a
 
 

@@ -69,7 +69,7 @@ class PairedAccuracy(NamedTuple):
     gained: int = 0  # correct in the second alone
     lost: int = 0  # correct in the first alone
 
-    def plus(self, other: "PairedAccuracy") -> "PairedAccuracy":
+    def combined_with(self, other: "PairedAccuracy") -> "PairedAccuracy":
         """Return the sums."""
         return PairedAccuracy(*(a + b for a, b in zip(self, other, strict=True)))
 

@@ -270,4 +270,4 @@ def _differing(frames: PairedFrames, classes: int) -> Events:
     first = np.flatnonzero(broken | (np.diff(pairs, prepend=-1) != 0))
     last = np.append(first[1:], len(stamps))[: len(first)] - 1
     spans = Events(stamps[first], stamps[last] + FRAME_NANOSECONDS, pairs[first])
-    return spans.taken(before[first] != after[first])
+    return spans.select(before[first] != after[first])

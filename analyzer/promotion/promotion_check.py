@@ -72,7 +72,7 @@ def regressions(evidence: HomeComparison, champion: str) -> list[str]:
         return [text]
     reasons = [*_silence_lost(evidence), *_not_better(evidence, champion)]
     right = evidence.random
-    better = clearly_better(right.plus(evidence.quiet))
+    better = clearly_better(right.combined_with(evidence.quiet))
     if not (better and right.sounds and right.gained >= right.lost):  # silence alone is not enough
         reasons += [*_sure_lost(evidence, champion), *_out_of_proportion(evidence)]
         reasons += _swallowed(evidence, champion)
@@ -115,7 +115,7 @@ def _silence_lost(evidence: HomeComparison) -> Iterator[str]:
 def _not_better(evidence: HomeComparison, champion: str) -> Iterator[str]:
     """Check for fewer correct sounds, or for no more although much changes."""
     right, changes = evidence.random, evidence.changes
-    counts, both = less_right(right, champion), right.plus(evidence.quiet)
+    counts, both = less_right(right, champion), right.combined_with(evidence.quiet)
     changed = changes.minutes.sum() - np.trace(changes.minutes)
     much = max(_CHANGED * _sound(evidence), _CHANGED_MINUTES)
     if is_worse(right):

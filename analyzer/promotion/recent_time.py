@@ -13,7 +13,15 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labellings, find_labellings
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, one, remains, without
+from hearthlog.analyzer.logs.spans import (
+    NONE,
+    Spans,
+    cut,
+    difference,
+    difference_rows,
+    joined,
+    single_span,
+)
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import SILENCE, UNDECIDED, class_name
 from hearthlog.models.classifiers.model import Model
@@ -95,7 +103,7 @@ def unlearned_time(logs: Sequence[RecentLog], learned: Spans) -> list[LogSpan]:
     """Return the time of logs outside the training set, in the order of the logs."""
     parts = []
     for log in logs:
-        rest = without(one(log.start, log.end), cut(learned, log.start, log.end))
+        rest = difference(single_span(log.start, log.end), cut(learned, log.start, log.end))
         spans = (span for span in rest.pairs() if span[1] - span[0] >= _SHORTEST_PART)
         parts += [LogSpan(log.path, *span) for span in spans]
     return parts
@@ -108,7 +116,7 @@ def choose(parts: Sequence[LogSpan], sounding: Spans, seed: int = _SEED) -> list
     quiet: list[LogSpan] = []
     for part in parts:
         inside = cut(near, part.start, part.end)
-        rest = without(one(part.start, part.end), inside)
+        rest = difference(single_span(part.start, part.end), inside)
         for chosen, spans in ((loud, inside), (quiet, rest)):
             chosen += [part._replace(start=start, end=end) for start, end in spans.pairs()]
     return [*_weighted(loud, *_LOUD, seed), *_weighted(quiet, *_QUIET, seed)]
@@ -246,7 +254,7 @@ def _parts(
     corrects = LIVE if span.corrects == LIVE else relabelling(span.corrects)
     name = labellings.find(span.microphone, corrects)
     labels = labellings.read(span.microphone, name, span.start, span.end).labelling
-    rest, row = remains(labels, spans_of([(mark.start, mark.end) for mark in own]))
+    rest, row = difference_rows(labels, spans_of([(mark.start, mark.end) for mark in own]))
     for start, end, label in zip(rest.starts, rest.ends, labels.labels[row], strict=True):
         yield sound(int(start), int(end), str(label))
 

@@ -9,7 +9,7 @@ from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Count, Duration, rounded
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
-from hearthlog.analyzer.logs.spans import common, joined, one, without
+from hearthlog.analyzer.logs.spans import difference, intersection, joined, single_span
 from hearthlog.analyzer.report.report_data import counted_events, television_spans
 from hearthlog.analyzer.report.wording import (
     clock_text,
@@ -179,14 +179,14 @@ def _labelled(day: DayMetrics) -> str:
     """Return the classes labelled longest, but those that have a sentence of their own."""
     lengths: list[tuple[int, str]] = []
     for name in set(day.home.classes) - {SILENCE, UNKNOWN, *WORRYING}:
-        spans = common(day.home.spans[name], day.span)
+        spans = intersection(day.home.spans[name], day.span)
         if name in ON_TELEVISION:
-            spans = without(spans, television_spans(day))
+            spans = difference(spans, television_spans(day))
         if spans.length >= _NAMED:
             lengths.append((-spans.length, in_words(name).lower()))
     if lengths:
         return listed([words for _, words in sorted(lengths)[:_NAMES]], "and")
-    sound = common(day.home.sound, day.span).length
+    sound = intersection(day.home.sound, day.span).length
     return f"{Duration(sound / MINUTE).text} of sound" if sound else "nothing but quiet"
 
 
@@ -208,8 +208,8 @@ def _missing(day: DayMetrics) -> Iterator[str]:
 
 def _is_known(day: DayMetrics) -> bool:
     """Whether three quarters of the day, and of its waking hours, were recorded."""
-    waking = one(*(at_hour(day.day, hour, day.zone) for hour in (MORNING, EVENING)))
-    return min(day.share, common(day.coverage, waking).length / waking.length) >= MOST
+    waking = single_span(*(at_hour(day.day, hour, day.zone) for hour in (MORNING, EVENING)))
+    return min(day.share, intersection(day.coverage, waking).length / waking.length) >= MOST
 
 
 def _lively(day: DayMetrics) -> Bool:
@@ -233,8 +233,8 @@ def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
     morning, evening = (at_hour(day.day, hour, day.zone) for hour in (MORNING, EVENING))
     times_of_day = (
         (day.night, "in the night"),
-        (one(morning, evening), "by day"),
-        (one(evening, int(day.span.ends[0])), f"after {EVENING}:00"),
+        (single_span(morning, evening), "by day"),
+        (single_span(evening, int(day.span.ends[0])), f"after {EVENING}:00"),
     )
     for name in WORRYING:
         parts: list[str] = []

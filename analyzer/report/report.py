@@ -37,7 +37,7 @@ from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, check_day, netw
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import Spans, common, joined, rows_at
+from hearthlog.analyzer.logs.spans import Spans, intersection, joined, rows_at
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import ReportData
@@ -197,7 +197,7 @@ def _unrecorded(home: HomeData, days: Sequence[Spans]) -> dict[str, float]:
     hours: dict[str, float] = {}
     for (_, microphone), segments in home.segments.items():
         covered = joined(segments.starts, segments.ends)
-        own = sum(common(covered, day).length for day in days)
+        own = sum(intersection(covered, day).length for day in days)
         hours[microphone] = max(hours.get(microphone, 0.0), (length - own) / HOUR)
     return hours
 

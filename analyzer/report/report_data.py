@@ -24,7 +24,7 @@ from hearthlog.analyzer.activity.values import (
     usual_range,
 )
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined
+from hearthlog.analyzer.logs.spans import NONE, Spans, intersection, joined
 from hearthlog.analyzer.report.wording import several_in_words
 from hearthlog.models.classes import (
     COUGHING,
@@ -74,7 +74,7 @@ def counted_events(day: DayMetrics, name: str, span: Spans) -> Int64:
 def television_spans(day: DayMetrics, pause: int = 0) -> Spans:
     """Return when something like a television sounded, with short pauses closed."""
     starts = day.home.minutes.starts[day.home.minutes.television]
-    return common(joined(starts, starts + MINUTE, pause), day.span)
+    return intersection(joined(starts, starts + MINUTE, pause), day.span)
 
 
 def sections(classes: Sequence[str]) -> list[FigureSection]:
@@ -109,7 +109,7 @@ def minutes_apart(day: DayMetrics, name: str) -> Duration | None:
 
 def television_minutes_of(day: DayMetrics, name: str) -> float:
     """Return the minutes of a class beside something like a television."""
-    return common(day.home.spans.get(name, NONE), television_spans(day)).length / MINUTE
+    return intersection(day.home.spans.get(name, NONE), television_spans(day)).length / MINUTE
 
 
 def event_figure(name: str, title: str = "") -> ReportFigure:

@@ -11,7 +11,7 @@ from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import joined, without
+from hearthlog.analyzer.logs.spans import difference, joined
 from hearthlog.analyzer.report.headline import amount, states_missing_time
 from hearthlog.analyzer.report.report_data import ReportData, television_spans
 from hearthlog.analyzer.report.wording import (
@@ -254,7 +254,7 @@ def _unexplained(data: ReportData) -> int:
     starts = np.array([gap.start for gap in data.gaps], np.int64)
     ends = np.array([gap.end for gap in data.gaps], np.int64)
     explained = joined(starts, ends)
-    missing = (without(day.missing, explained) for day in data.days)
+    missing = (difference(day.missing, explained) for day in data.days)
     return sum(spans.length for spans in missing)
 
 

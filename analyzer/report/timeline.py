@@ -12,11 +12,11 @@ from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
 from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
     Spans,
-    common,
+    difference,
+    intersection,
     joined,
     lengths,
-    one,
-    without,
+    single_span,
 )
 from hearthlog.analyzer.report.wording import clock_text
 from hearthlog.models.classes import SILENCE, Colour, colour_on_paper, in_words
@@ -163,7 +163,7 @@ def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimel
         span,
         round(span.length / _step(day, span)),
         [_lane(day, span, name) for name in names],
-        list(_blocks(span, common(day.missing, span))),
+        list(_blocks(span, intersection(day.missing, span))),
         list(
             _runs(lefts, (lengths(day.coverage, hours) < MINUTE) & (hours[:-1] < day.over.ends[0]))
         ),
@@ -182,13 +182,15 @@ def shown_span(day: DayMetrics) -> Spans:
     start = int(np.searchsorted(day.hours, first, side="right")) - 1
     end = max(int(np.searchsorted(day.hours, last)), start + _FEWEST_HOURS)
     end = min(end, len(day.hours) - 1)
-    return one(int(day.hours[min(start, end - _FEWEST_HOURS)]), int(day.hours[end]))
+    return single_span(int(day.hours[min(start, end - _FEWEST_HOURS)]), int(day.hours[end]))
 
 
 def occurring_classes(days: Sequence[DayMetrics]) -> list[str]:
     """Return the classes that were heard on some of the days; all if there are none."""
     names = [name for name in days[0].home.classes if name != SILENCE]
-    occurring = [n for n in names if any(common(d.home.spans[n], d.span).length for d in days)]
+    occurring = [
+        n for n in names if any(intersection(d.home.spans[n], d.span).length for d in days)
+    ]
     return occurring or names
 
 
@@ -230,10 +232,13 @@ def _lane(day: DayMetrics, span: Spans, name: str) -> TimelineLane:
     spans = day.home.spans[name]
     events = joined(spans.starts, spans.ends, EVENT_PAUSE)
     counts = np.isin(events.starts, day.home.minutes.counted(name, events.starts))
-    gaps = without(common(day.coverage, span), day.home.listened[name])
+    gaps = difference(intersection(day.coverage, span), day.home.listened[name])
     step = _step(day, span)
     counted, uncounted = (
-        (np.stack(common(Spans(events.starts[own], events.ends[own]), span), axis=1) - span.starts)
+        (
+            np.stack(intersection(Spans(events.starts[own], events.ends[own]), span), axis=1)
+            - span.starts
+        )
         / step
         for own in (counts, ~counts)
     )

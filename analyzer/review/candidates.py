@@ -11,14 +11,19 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation import Events, indexed_events
 from hearthlog.analyzer.logs.labelling import LabelledFile, Labelling, Labellings, NamedLabelling
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
-from hearthlog.analyzer.logs.spans import NONE, Spans, common, joined, lengths, overlay
+from hearthlog.analyzer.logs.spans import NONE, Spans, intersection, joined, lengths, overlay
 from hearthlog.analyzer.marks.marks import RANDOM, read_review
 from hearthlog.analyzer.promotion.paired_labels import ChangedTime, find_changed_time
 from hearthlog.analyzer.promotion.promotion_check import find_champion, other_features
 from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.analyzer.review.ranking import spread
 from hearthlog.analyzer.review.review_list import CHANGE, HINT, ReviewSpan
-from hearthlog.analyzer.review.spans import JudgeableSpans, judgeable_spans, other_labels, without
+from hearthlog.analyzer.review.spans import (
+    JudgeableSpans,
+    judgeable_spans,
+    other_labels,
+    remove_reviewed,
+)
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.classifiers.network_names import AUDIOSET
@@ -57,7 +62,7 @@ def hinted_spans(
     names = [name for name in audioset_names() if not name.is_event]
     hints, above = _named(sources, microphone, names)
     classes = list(dict.fromkeys([*side.classes, *(name.name for name in names)]))
-    spans = judgeable_spans(without(hints, reviewed))
+    spans = judgeable_spans(remove_reviewed(hints, reviewed))
     labels, _ = other_labels(spans, indexed_events(side.labelling, classes))
     own = [class_name(classes[label]) if label >= 0 else "" for label in labels.tolist()]
     new = np.array(
@@ -197,7 +202,7 @@ def _length_in(spans: Spans, minutes: Int64) -> Int64:
     if not len(minutes):
         return np.empty(0, np.int64)
     edges = np.unique(np.concatenate([minutes, minutes + MINUTE]))
-    inside = lengths(common(spans, joined(minutes, minutes + MINUTE)), edges)
+    inside = lengths(intersection(spans, joined(minutes, minutes + MINUTE)), edges)
     return inside[np.searchsorted(edges, minutes)]
 
 
@@ -255,7 +260,7 @@ def changed_by(  # noqa: PLR0913, PLR0917
     before = _champion(folder, after, paths)
     changed = find_changed_time(before, after, recent_logs(paths), microphone, progress)
     sources.losses.extend(loss for loss in changed.losses if loss not in sources.losses)
-    left = without(_where(changed, side), reviewed_time(sources, microphone).spans)
+    left = remove_reviewed(_where(changed, side), reviewed_time(sources, microphone).spans)
     spans = judgeable_spans(left)
     if not len(spans):
         raise DataError(f"{after.name}: no span is left in which it differs from {before.name}")

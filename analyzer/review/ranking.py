@@ -21,8 +21,8 @@ from hearthlog.analyzer.review.spans import (
     judgeable_spans,
     labelling_model,
     other_labels,
+    remove_reviewed,
     span_sounds,
-    without,
 )
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.registry import DEFAULT_FOLDER
@@ -177,7 +177,7 @@ def make_queue(  # noqa: PLR0913
     other = other and other.called_as(side.classes)
     classes = list(dict.fromkeys([*side.classes, *(other.classes if other else ())]))
     segments = indexed_events(side.labelling, classes)
-    segments = without(segments, reviewed)
+    segments = remove_reviewed(segments, reviewed)
     spans = judgeable_spans(segments)
     if audible is not None and ranking == USEFUL:
         spans = cut_to_audible(spans, audible, _LONG_ENOUGH)

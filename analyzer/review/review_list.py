@@ -15,7 +15,7 @@ from hearthlog.analyzer.evaluation import LabellingDifference
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
 from hearthlog.analyzer.logs.layers import Coverage
-from hearthlog.analyzer.logs.spans import NEVER, Spans, cut, one, pieces, union
+from hearthlog.analyzer.logs.spans import NEVER, Spans, cut, intersection_rows, single_span, union
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
 from hearthlog.analyzer.marks.formats import find_format
 from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
@@ -107,7 +107,7 @@ def random_minutes(minutes: Spans, side: NamedLabelling, microphone: str) -> lis
     """List minutes drawn at random, in their order."""
     spans = []
     for start, end in minutes.pairs():
-        parts, rows, _ = pieces(side.labelling, one(start, end))
+        parts, rows, _ = intersection_rows(side.labelling, single_span(start, end))
         labels, row = np.unique(side.labelling.labels[rows].astype(str), return_inverse=True)
         label = str(labels[np.bincount(row, parts.ends - parts.starts).argmax()])
         spans.append(ReviewSpan(microphone, start, end, side.name, label, "", "", None, RANDOM))
@@ -344,7 +344,7 @@ def labels_of(span: ReviewSpan, labelling: Labelling) -> list[Mark]:
     """Return the labels of a span for a label file: one, or all of a complete minute."""
     if span.reason != RANDOM:
         return [Mark(span.microphone, span.start, span.end, span.proposed_label)]
-    parts, rows, _ = pieces(labelling, one(span.start, span.end))
+    parts, rows, _ = intersection_rows(labelling, single_span(span.start, span.end))
     return [
         Mark(span.microphone, *each, label)
         for each, label in zip(parts.pairs(), labelling.labels[rows].tolist(), strict=True)

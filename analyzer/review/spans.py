@@ -15,7 +15,13 @@ from hearthlog.analyzer.logs.labelling import LabelledFile, Labellings
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
-from hearthlog.analyzer.logs.spans import Spans, overlay, pieces, ranges, remains
+from hearthlog.analyzer.logs.spans import (
+    Spans,
+    concatenated_ranges,
+    difference_rows,
+    intersection_rows,
+    overlay,
+)
 from hearthlog.models.classes import SILENCE, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features import FeatureSet, Inputs, WindowStatistics
@@ -68,7 +74,7 @@ def judgeable_spans(segments: Events) -> JudgeableSpans:
     parts = np.where(ends - starts < SHORTEST, 0, -(-(ends - starts) // LONGEST))
     if parts.sum() > _MOST:
         raise DataError("too much to rank at once: choose a part with --start and --end")
-    source, part = ranges(np.zeros(len(first), np.int64), parts)
+    source, part = concatenated_ranges(np.zeros(len(first), np.int64), parts)
     begins, stops = (
         starts[source] + (ends - starts)[source] * number // parts[source]
         for number in (part, part + 1)
@@ -92,7 +98,7 @@ def border_pieces(spans: JudgeableSpans, silent: Bool) -> Bool:
 
 def audible_time(spans: JudgeableSpans, audible: Spans) -> Int64:
     """Return the kept sound in each span, in nanoseconds; shape (n,)."""
-    kept, row, _ = pieces(spans, audible)
+    kept, row, _ = intersection_rows(spans, audible)
     return np.bincount(row, kept.ends - kept.starts, len(spans)).astype(np.int64)
 
 
@@ -102,7 +108,7 @@ def cut_to_audible(spans: JudgeableSpans, audible: Spans, least: int) -> Judgeab
     The part is at least `least` nanoseconds long, if its span is. Spans with less than a quarter of
     a second of kept sound stay as they are.
     """
-    kept, row, _ = pieces(spans, audible)
+    kept, row, _ = intersection_rows(spans, audible)
     enough = audible_time(spans, audible) >= LEAST_AUDIBLE
     first, last = spans.ends.copy(), spans.starts.copy()
     np.minimum.at(first, row, kept.starts)
@@ -119,9 +125,9 @@ def cut_to_audible(spans: JudgeableSpans, audible: Spans, least: int) -> Judgeab
     )
 
 
-def without(segments: Events, reviewed: Spans) -> Events:
+def remove_reviewed(segments: Events, reviewed: Spans) -> Events:
     """Return the parts of segments outside the reviewed time."""
-    spans, rows = remains(segments, reviewed)
+    spans, rows = difference_rows(segments, reviewed)
     return Events(*spans, segments.labels[rows])
 
 
@@ -393,7 +399,7 @@ def _means(recorded: Columns, starts: Int64, ends: Int64, space: _Space) -> Floa
     first = np.minimum(first[there], len(stamps) - length)
     room = np.maximum(last[there] - length - first, 0)
     counts = np.minimum(1 + room // length, _MOST_WINDOWS)
-    row, number = ranges(np.zeros(len(there), np.int64), counts)
+    row, number = concatenated_ranges(np.zeros(len(there), np.int64), counts)
     begin = first[row] + number * room[row] // np.maximum(counts - 1, 1)[row]
     windows = values[begin[:, np.newaxis] + np.arange(length)]
     floors = None

@@ -22,8 +22,7 @@ from hearthlog.analyzer.logs.layers import (
 from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, lasting
 from hearthlog.analyzer.logs.selection import decode_types
-from hearthlog.analyzer.logs.spans import joined, without
-from hearthlog.analyzer.logs.spans import one as one_span
+from hearthlog.analyzer.logs.spans import difference, joined, single_span
 from hearthlog.analyzer.marks.marks import Reviewed, read_review
 from hearthlog.analyzer.review.lanes import (
     FEATURES,
@@ -362,11 +361,11 @@ def _unrecorded(
     gaps = microphone.gaps
     spans = [gaps, *(one.spans for one in microphone.labellings)]
     past = max(time_ns(), *coverage.ends, grid.start)
-    span = one_span(grid.start, min(grid.end, past))
+    span = single_span(grid.start, min(grid.end, past))
     starts = np.concatenate([coverage.starts, *(each.starts for each in spans)]).astype(np.int64)
     ends = np.concatenate([coverage.ends, *(each.ends for each in spans)]).astype(np.int64)
     recorded = joined(starts, ends, NANOSECONDS)
-    off = without(span, recorded)
+    off = difference(span, recorded)
     starts = np.concatenate([gaps.starts, off.starts])
     order = np.argsort(starts, kind="stable")
     ends = np.concatenate([gaps.ends, off.ends])

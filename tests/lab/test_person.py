@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hearthlog.analyzer.logs.labelling import find_labellings
-from hearthlog.analyzer.logs.spans import one, overlay, pieces
+from hearthlog.analyzer.logs.spans import intersection_rows, overlay, single_span
 from hearthlog.analyzer.marks.marks import read_marks, read_reviewed
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
@@ -45,7 +45,7 @@ def written(logs, read):
 
 
 def labels_of(truth, mark):
-    _, rows, _ = pieces(truth, one(mark.start, mark.end))
+    _, rows, _ = intersection_rows(truth, single_span(mark.start, mark.end))
     return set(truth.labels[rows])
 
 
@@ -62,7 +62,7 @@ def test_a_person_marks_what_is_true_and_leaves_what_is_right(home):
             mark.label
         }
     for span in done.reviewed:
-        parts = overlay([truth, output, one(span.start, span.end)]).in_all()
+        parts = overlay([truth, output, single_span(span.start, span.end)]).in_all()
         unlike = truth.labels[parts.rows[0]] != output.labels[parts.rows[1]]
         marked = [any(m.start <= t < m.end for m in marks) for t in parts.starts.tolist()]
         left = unlike & ~np.array(marked) & (truth.labels[parts.rows[0]] != "other_negative")

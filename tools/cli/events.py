@@ -215,11 +215,11 @@ def _not_listened(
     metrics: "HomeMetrics", classes: Sequence[str], span: ListedSpan, *, every: bool
 ) -> "Spans":
     """Return the parts of a span in which no class could be labelled, or not every one of them."""
-    from hearthlog.analyzer.logs.spans import NONE, common, one, union, without
+    from hearthlog.analyzer.logs.spans import NONE, difference, intersection, single_span, union
 
-    own = one(span.start, span.end)
+    own = single_span(span.start, span.end)
     listened = [metrics.listened[name] for name in classes]
-    return without(own, reduce(common if every else union, listened) if listened else NONE)
+    return difference(own, reduce(intersection if every else union, listened) if listened else NONE)
 
 
 def _fields(event: "HomeEvent", labelling: str, zone: tzinfo) -> dict[str, object]:

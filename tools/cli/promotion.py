@@ -126,7 +126,7 @@ def print_trial(trial: Trial) -> None:
 
 
 def _trial_verdict(trial: Trial) -> str:
-    random, name = trial.random.plus(trial.quiet), trial.candidate
+    random, name = trial.random.combined_with(trial.quiet), trial.candidate
     if not random.sounds:
         return (
             "no randomly drawn minutes were reviewed since, so neither can be called better; "

@@ -19,7 +19,14 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
-from hearthlog.analyzer.logs.spans import NONE, Spans, one, overlay, pieces, rows_at
+from hearthlog.analyzer.logs.spans import (
+    NONE,
+    Spans,
+    intersection_rows,
+    overlay,
+    rows_at,
+    single_span,
+)
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion.paired_labels import TwoModels, joined_frames
 from hearthlog.analyzer.promotion.promotion_check import Verdict, judge
@@ -161,7 +168,7 @@ def _review_at_random(
 
 
 def _marks(log: RecentLog, truth: Labelling, start: int, end: int) -> list[Mark]:
-    inside, rows, _ = pieces(truth, one(start, end))
+    inside, rows, _ = intersection_rows(truth, single_span(start, end))
     name = _microphone(log)
     return [
         Mark(name, int(a), int(b), _label(truth.labels[row]))

@@ -13,7 +13,7 @@ import numpy as np
 
 from hearthlog.analyzer.activity.day_profile import HomeSegments
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import Spans, joined, without
+from hearthlog.analyzer.logs.spans import Spans, difference, joined
 from hearthlog.models.classes import (
     COUGHING,
     FLUSHING_WATER,
@@ -79,7 +79,7 @@ class Sounds:
         later = Sounds(starts, self.lengths, self.labels, self.places, self.activities)
         return later.rows(np.argsort(starts, kind="stable"))
 
-    def plus(self, other: "Sounds") -> "Sounds":
+    def combined_with(self, other: "Sounds") -> "Sounds":
         """Return these sounds and others.
 
         Parameters
@@ -164,7 +164,7 @@ def lived(sounds: Sounds, days: int, rng: Rng) -> Sounds:
         count = rng.poisson(up) + 3 * int(rng.random() < _RESTLESS)
         times += (number * _DAY + rng.uniform(0.0, 5.5, count) * _HOUR).tolist()
     sounds = Sounds(*(getattr(sounds, each.name)[kept] for each in fields(sounds)))
-    return sounds.moved(delays[kept]).plus(_times_up(np.array(times), rng))
+    return sounds.moved(delays[kept]).combined_with(_times_up(np.array(times), rng))
 
 
 def _shifts(days: int, rng: Rng) -> Float64:
@@ -200,7 +200,7 @@ def nothing(sounds: Sounds, first: int, last: int, rng: Rng) -> Sounds:
 def bad_nights(sounds: Sounds, first: int, last: int, rng: Rng) -> Sounds:
     """Let somebody get up three times more in the nights after some days."""
     nights = np.arange(first + 1, last + 1).repeat(3) * _DAY
-    return sounds.plus(_times_up(nights + rng.uniform(0.0, 5.5, len(nights)) * _HOUR, rng))
+    return sounds.combined_with(_times_up(nights + rng.uniform(0.0, 5.5, len(nights)) * _HOUR, rng))
 
 
 def meals_missed(
@@ -222,7 +222,7 @@ def more_coughs(sounds: Sounds, first: int, last: int, rng: Rng) -> Sounds:
     """Let there be three times as much coughing on some days and in the nights after them."""
     own = sounds.rows(sounds.within(first, last + 1) & (sounds.labels == COUGHING))
     for _ in range(2):
-        sounds = sounds.plus(own.moved(rng.uniform(-1.0, 1.0, len(own.starts)) * _HOUR))
+        sounds = sounds.combined_with(own.moved(rng.uniform(-1.0, 1.0, len(own.starts)) * _HOUR))
     return sounds
 
 
@@ -280,7 +280,7 @@ def heard(
     rng : numpy.random.Generator
     """
     sounds = sounds.rows(sounds.within(*days))
-    coverage = without(Spans(*(_time(np.array([day * _DAY])) for day in days)), missing)
+    coverage = difference(Spans(*(_time(np.array([day * _DAY])) for day in days)), missing)
     parts, listened = [_labelled(SILENCE, coverage)], {}
     for microphone, names in hearing.classes.items():
         labels = hearing.draw(microphone, sounds.labels, sounds.places, rng)
@@ -291,7 +291,7 @@ def heard(
             starts = _time(np.concatenate([sounds.starts[own], false]))
             lengths = np.concatenate([sounds.lengths[own], rng.uniform(1.0, 8.0, count)])
             ends = starts + np.rint(lengths * NANOSECONDS).astype(np.int64)
-            parts.append(_labelled(name, without(joined(starts, ends, _JOINED), missing)))
+            parts.append(_labelled(name, difference(joined(starts, ends, _JOINED), missing)))
             listened[name] = coverage
     starts, ends, labels = (
         np.concatenate([getattr(part, name) for part in parts])

@@ -29,7 +29,15 @@ from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.wording import ENGLISH
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
-from hearthlog.analyzer.logs.spans import NONE, Spans, common, cut, joined, lengths, one
+from hearthlog.analyzer.logs.spans import (
+    NONE,
+    Spans,
+    cut,
+    intersection,
+    joined,
+    lengths,
+    single_span,
+)
 from hearthlog.analyzer.logs.summary import summarise
 from hearthlog.analyzer.report.headline import LIVELY_MINUTES
 from hearthlog.analyzer.report.page import day_page
@@ -314,8 +322,8 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
     evening = at_hour(day.day, EVENING, day.zone)
     parts = {
         "night": day.night,
-        "by day": one(int(day.night.ends[0]), evening),
-        "22:00": one(evening, int(day.span.ends[0])),
+        "by day": single_span(int(day.night.ends[0]), evening),
+        "22:00": single_span(evening, int(day.span.ends[0])),
     }
     modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
     for stated in sentence.split("; "):
@@ -398,11 +406,11 @@ def _busiest(sound: Spans, start: int, end: int) -> float:
 
 
 def _minutes(day: DayMetrics, name: str) -> float:
-    return common(day.home.spans.get(name, NONE), day.span).length / MINUTE
+    return intersection(day.home.spans.get(name, NONE), day.span).length / MINUTE
 
 
 def _sound(day: DayMetrics) -> float:
-    return common(day.home.sound, day.span).length / MINUTE
+    return intersection(day.home.sound, day.span).length / MINUTE
 
 
 def _quiet(text: str, truth: TrueDay) -> Statement:
@@ -497,8 +505,8 @@ def page_statements(
 ) -> Iterator[Statement]:
     """Yield the statements of the page of the home about a past day, and of its morning."""
     picture = picture_of(home)
-    night, day = (one(part.start, part.end) for part in home.times_of_day())
-    both = one(int(night.starts[0]), int(day.ends[0]))
+    night, day = (single_span(part.start, part.end) for part in home.times_of_day())
+    both = single_span(int(night.starts[0]), int(day.ends[0]))
     yield from _page_sentence(picture["sentence"], home, truth, both)
     morning = home._replace(
         moment=home.moment._replace(now=at_hour(truth.metrics.day, MORNING, home.zone) + HOUR),
@@ -539,7 +547,7 @@ def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Ite
             yield _counted(PAGE, f"{text} [{in_words(name)}]", (0, 0), true, modest=modest)
         return
     if "quiet night" in text:
-        sound = common(day.home.sound, span).length / MINUTE
+        sound = intersection(day.home.sound, span).length / MINUTE
         limit = (1 + _TOLERANCE) * 0.01 * span.length / MINUTE
         yield _judged(PAGE, text, f"{sound:.1f} min of sound", right=sound <= limit, modest=modest)
     for name in names:

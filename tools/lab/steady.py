@@ -15,7 +15,7 @@ import soundfile
 import typer
 
 from hearthlog.analyzer.logs.labelling import find_labellings
-from hearthlog.analyzer.logs.spans import one, pieces
+from hearthlog.analyzer.logs.spans import intersection_rows, single_span
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.starter import GENERAL
 from hearthlog.recorder.sources.decoding import read_audio
@@ -75,7 +75,9 @@ def sounding_seconds(sound: Float64, level: float, model: str = GENERAL) -> floa
         labellings = find_labellings(logs)
         labels = labellings.read(labellings.microphone(None), LIVE).labelling
     begins = (_START + _ROOM_SECONDS) * NANOSECONDS
-    inside, rows, _ = pieces(labels, one(begins, begins + _SECONDS * NANOSECONDS))
+    inside, rows, _ = intersection_rows(
+        labels, single_span(begins, begins + _SECONDS * NANOSECONDS)
+    )
     sounds = labels.labels[rows] != SILENCE
     return float((inside.ends - inside.starts)[sounds].sum()) / NANOSECONDS
 

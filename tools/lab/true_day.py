@@ -13,7 +13,7 @@ from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import HomeData
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.logs.spans import NONE, Spans, cut, joined, without
+from hearthlog.analyzer.logs.spans import NONE, Spans, cut, difference, joined
 from hearthlog.models.classes import (
     FLUSHING_WATER,
     MUSIC,
@@ -112,7 +112,7 @@ def true_day(sounds: Sequence[TrueSound], day: DayMetrics) -> TrueDay:
 
     rows = sorted((sound.start, sound.end, called(sound)) for sound in sounds)
     starts, ends = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
-    quiet = without(day.home.coverage, joined(starts, ends))
+    quiet = difference(day.home.coverage, joined(starts, ends))
     labels = np.array([row[2] for row in rows] + [SILENCE] * len(quiet.starts), object)
     order = np.argsort(np.concatenate([starts, quiet.starts]), kind="stable")
     edges = (np.concatenate(both)[order] for both in zip((starts, ends), quiet, strict=True))

@@ -46,13 +46,13 @@ from hearthlog.analyzer.logs.local_time import day_span, local_time, night_span
 from hearthlog.analyzer.logs.spans import (
     Spans,
     Timed,
-    common,
     cut,
+    difference,
     first_of_groups,
+    intersection,
     joined,
     lengths,
     rows_at,
-    without,
 )
 from hearthlog.analyzer.report.wording import differences_text, rarity_text, short_day
 from hearthlog.models.classes import ON_TELEVISION, SILENCE
@@ -74,7 +74,7 @@ class SoundEvents(NamedTuple):
         if self.counted is self.starts:
             return self.coverage
         begun = self.counted < self.ends
-        return common(self.coverage, Spans(self.counted[begun], self.ends[begun]))
+        return intersection(self.coverage, Spans(self.counted[begun], self.ends[begun]))
 
 
 def events_of_rule(rule: SoundRule, activity: HomeActivity) -> SoundEvents:
@@ -317,7 +317,7 @@ def unlike_conditions(
         television = television_spans(home_sound(activity).labels)
         starts = starts[rows_at(television, events.starts) < 0]
         if rule.label in APART_IN_LENGTH:
-            spans = without(spans, television)
+            spans = difference(spans, television)
     listened = activity.listened(rule.label, rule.microphone)
 
     @cache

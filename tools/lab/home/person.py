@@ -9,7 +9,7 @@ import numpy as np
 
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.layers import Coverage, find_coverage
-from hearthlog.analyzer.logs.spans import one, overlay, pieces
+from hearthlog.analyzer.logs.spans import intersection_rows, overlay, single_span
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.ranking import USEFUL
 from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
@@ -161,7 +161,7 @@ class Person:
         list of (int, int, str)
             Start, end and label, in the order of time; those of silence, too.
         """
-        inside, row, _ = pieces(self.truth, one(start, end))
+        inside, row, _ = intersection_rows(self.truth, single_span(start, end))
         labels = self.truth.labels[row]
         parts = overlay([inside, labelled]).in_all()
         true, own = labels[parts.rows[0]], labelled.labels[parts.rows[1]]
