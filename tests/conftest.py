@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from brokers import broker
 from command_server import FRESH_HEARTHLOG, HEARTHLOG, CommandPopen
+from log_fixtures import record_logs
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
 from realday import write_real_day
-from spliced import record_logs
 from stores import bucket, in_memory, s3_account, throttled_account
 from streams import camera, live_server
 

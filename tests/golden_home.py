@@ -28,7 +28,7 @@ from unittest.mock import patch
 import numpy as np
 import soundfile
 from brokers import Broker
-from lossy import LossySource
+from lossy_source import LossySource
 from receivers import server
 from waiting import wait_for
 

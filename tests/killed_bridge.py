@@ -19,9 +19,9 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
-from bridged import expected_totals, expected_values
 from brokers import Broker, settled_values, start_bridge
 from conftest import HEARTHLOG
+from expected_outputs import expected_totals, expected_values
 from microphones import DIES_WITH_PARENT
 from prometheus_client.parser import text_string_to_metric_families
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from growing import plain
+from grown_schema import plain
+from log_fixtures import Result
 from logreader import LogReader
 from rosbags import rosbag1, rosbag2
-from spliced import Result
 
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.review.live_timeline import LiveTimeline

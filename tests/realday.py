@@ -8,7 +8,7 @@ from threading import Event as Flag
 
 import numpy as np
 import soundfile
-from lossy import LossySource
+from lossy_source import LossySource
 
 from hearthlog.analyzer.training.dataset import build_dataset
 from hearthlog.analyzer.training.manifest import LabelledClip, Scenario, read_manifest

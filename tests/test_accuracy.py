@@ -11,8 +11,8 @@ import pytest
 from homelife import HOUR, at, midnight, write_day
 from hypothesis import given
 from hypothesis import strategies as st
+from log_fixtures import run
 from scipy.special import betaincinv
-from spliced import run
 
 from hearthlog.analyzer.activity.checked_minutes import (
     UNMEASURED,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from homelife import GENERAL, at, midnight, write_day
 from livehome import rule
-from spliced import run
+from log_fixtures import run
 
 from hearthlog.analyzer.activity.checked_minutes import read_checked_minutes
 from hearthlog.analyzer.activity.daily_metrics import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import soundfile
 from blobs import blobs, with_arrays
-from spliced import run
+from log_fixtures import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.model_scores import segment_probabilities

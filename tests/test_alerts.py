@@ -16,7 +16,7 @@ import pytest
 from homelife import HOUR, midnight, write_day
 from livehome import LiveHome as WrittenHome
 from livehome import following, rule
-from spliced import run
+from log_fixtures import run
 from waiting import wait_for
 
 from hearthlog.analyzer.activity.live import LiveActivity, LiveLabel

@@ -16,8 +16,8 @@ import pytest
 import soundfile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from log_fixtures import run, small_disk, write_log
 from logreader import LogReader
-from spliced import run, small_disk, write_log
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import ROUNDING, find_coverage

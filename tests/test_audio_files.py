@@ -15,8 +15,8 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pytest
 import soundfile
+from log_fixtures import run
 from logs import features, read
-from spliced import run
 
 from hearthlog.recorder.events import Frames, Gap
 from hearthlog.recorder.sources import ffmpeg

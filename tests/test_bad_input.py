@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 import pytest
 import soundfile
+from log_fixtures import run, small_disk
 from logreader import LogReader
 from logs import features
-from spliced import run, small_disk
 
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, save_model

@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import soundfile
-from kept import keep_models
+from log_fixtures import run
 from logreader import LogReader
 from logs import read
-from spliced import run
+from model_folders import keep_models
 from test_model_changes import block, count, labels_by, output, recording, wait_for
 
 from hearthlog.analyzer.logs.layers import find_coverage

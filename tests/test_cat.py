@@ -17,9 +17,9 @@ import typer
 from conftest import HEARTHLOG
 from hypothesis import given
 from hypothesis import strategies as st
+from log_fixtures import run, write_log
 from logreader import LogReader
 from mcap.writer import Writer
-from spliced import run, write_log
 
 from hearthlog.analyzer.export.text import _moments, in_order, json_lines, quoted, text_lines
 from hearthlog.analyzer.logs.selection import decode_all

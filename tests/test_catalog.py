@@ -22,9 +22,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from homelife import write_day
+from log_fixtures import record_logs, run
 from logs import features, read
 from mcap.opcode import Opcode
-from spliced import record_logs, run
 from stores import put
 
 import hearthlog.analyzer.logs.catalog_writer

@@ -16,11 +16,11 @@ import soundfile
 from conftest import HEARTHLOG
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from kept import put_by_hand
+from log_fixtures import raw_messages, small_disk
 from logreader import LogReader
 from logs import read
-from lossy import LossySource
-from spliced import raw_messages, small_disk
+from lossy_source import LossySource
+from model_folders import put_by_hand
 from waiting import wait_for
 
 from hearthlog.analyzer.training.dataset import build_dataset

@@ -9,9 +9,8 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
-import spliced
+from conversations import two_spoken_days
 from recurring import two_recurring_days
-from spoken import two_spoken_days
 
 from hearthlog.analyzer.discover import ClusterKind
 from hearthlog.analyzer.discover.groups import GROUPS, load_groups
@@ -31,7 +30,7 @@ class Home(NamedTuple):
 @pytest.fixture
 def hearthlog(capfd):
     """Run the command in this process and return what came of it."""
-    return partial(spliced.run, capfd)
+    return partial(log_fixtures.run, capfd)
 
 
 @pytest.fixture(params=[GROUPS, VOICES], ids=lambda kind: kind.plural)

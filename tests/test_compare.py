@@ -8,8 +8,8 @@ from threading import Event as Flag
 
 import numpy as np
 import pytest
-from kept import keep_models
-from spliced import run
+from log_fixtures import run
+from model_folders import keep_models
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.model_scores import compare_models, evaluate_model

@@ -13,7 +13,7 @@ from typing import get_args
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from spliced import run
+from log_fixtures import run
 
 from hearthlog.analyzer.bridge.alerts.rules import AlertRule
 from hearthlog.analyzer.bridge.settings import (

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from logs import read
-from lossy import LossySource
+from lossy_source import LossySource
 from mcap.records import Metadata
 from rewriting import Log
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kept import keep_models
+from log_fixtures import record_logs, run
+from model_folders import keep_models
 from sklearn.metrics import cohen_kappa_score, confusion_matrix
-from spliced import record_logs, run
 from stores import put
 
 from hearthlog.analyzer.errors import DataError

@@ -15,7 +15,7 @@ from arrays import SQUARE, array_frames
 from hypothesis import given
 from hypothesis import strategies as st
 from logs import read
-from lossy import LossySource
+from lossy_source import LossySource
 from rewriting import Log
 from safetensors.numpy import load, save
 

@@ -13,7 +13,6 @@ import pytest
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
-import spliced
 from conftest import HEARTHLOG
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -51,7 +50,7 @@ from hearthlog.tools.lab.recurring_scene import OTHER
 @pytest.fixture
 def hearthlog(capfd):
     """Run the command in this process and return what came of it."""
-    return partial(spliced.run, capfd)
+    return partial(log_fixtures.run, capfd)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import soundfile
 import typer
-from spliced import run
+from log_fixtures import run
 from typer.testing import CliRunner
 
 pytest.importorskip("hearthlog.tools.lab.month", reason="the wheel leaves what developers run out")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import soundfile
 import zstandard
-from lossy import LossySource
+from lossy_source import LossySource
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,

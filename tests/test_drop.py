@@ -6,7 +6,7 @@ from threading import Event as Flag
 import matplotlib.image
 import numpy as np
 import pytest
-from lossy import LossySource
+from lossy_source import LossySource
 from viewers import shown, viewer
 
 from hearthlog.recorder.config import Settings

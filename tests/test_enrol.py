@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import soundfile
 from conftest import HEARTHLOG
-from spliced import run
+from log_fixtures import run
 from stores import put
 
 from hearthlog.analyzer.logs.layers import find_coverage

@@ -8,8 +8,8 @@ import pytest
 import soundfile
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_fixtures import run
 from sklearn.metrics import confusion_matrix, f1_score, precision_recall_fscore_support
-from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation import (

@@ -15,7 +15,7 @@ import sounddevice
 import soundfile
 from conftest import HEARTHLOG
 from homelife import GENERAL, at, midnight, write_day
-from spliced import run
+from log_fixtures import run
 from waiting import wait_for
 
 from hearthlog.analyzer.activity.daily_metrics import day_of, metrics_of_home

@@ -21,10 +21,10 @@ import pyarrow.parquet as pq
 import pytest
 import soundfile
 from conftest import HEARTHLOG
+from log_fixtures import raw_messages, run, small_disk, write_log
 from logreader import LogReader
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
-from spliced import raw_messages, run, small_disk, write_log
 
 from hearthlog import open_logs
 from hearthlog.recorder.sources.decoding import read_audio

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import soundfile
 from conftest import HEARTHLOG
-from foreign import FILES
-from spliced import run
+from foreign_label_files import FILES
+from log_fixtures import run
 
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.marks.marks import read_marks

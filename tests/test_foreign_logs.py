@@ -7,9 +7,9 @@ from functools import partial
 import pytest
 import zstandard
 from bags import INT32, STRING, T0, Bag, definition, int32, string
+from log_fixtures import run
 from mcap.reader import SeekingReader, make_reader
 from mcap.writer import CompressionType, IndexType, Writer
-from spliced import run
 
 import hearthlog as package
 from hearthlog.analyzer.logs.recorder_info import features_of, read_recorder_infos

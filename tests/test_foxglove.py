@@ -19,7 +19,7 @@ import psutil
 import pytest
 from conftest import HEARTHLOG
 from foxglove import layouts
-from growing import GROWN, grown_definitions, write_as_later
+from grown_schema import GROWN, grown_definitions, write_as_later
 from homelife import GENERAL as GENERAL_HOME
 from livehome import LiveHome
 from logreader import LogReader

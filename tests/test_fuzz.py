@@ -12,7 +12,7 @@ import zstandard
 from fuzzing import Victim
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from lossy import LossySource
+from lossy_source import LossySource
 from mcap.opcode import Opcode
 from mcap.records import Chunk
 from rewriting import HEAD, Raw, as_raw, joined, parsed, split

@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from growing import GROWN, NEXT, grown_definitions, plain, write_as_later
+from grown_schema import GROWN, NEXT, grown_definitions, plain, write_as_later
+from log_fixtures import run as run_here
 from readers import (
     READERS,
     Run,
@@ -35,7 +36,6 @@ from readers import (
     by_text_and_sound,
     by_watching,
 )
-from spliced import run as run_here
 
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.marks.marks import read_marks

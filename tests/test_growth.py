@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from growing import GROWN, NEXT, grown_definitions
+from grown_schema import GROWN, NEXT, grown_definitions
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from log_fixtures import run
 from logreader import LogMessage, LogReader
 from mcap.records import Channel
 from rewriting import Log
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from spliced import run
 
 from hearthlog import __version__
 from hearthlog.analyzer.logs.selection import select

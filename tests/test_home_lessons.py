@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from spliced import run
+from log_fixtures import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks

@@ -4,8 +4,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from kept import keep_models
-from spliced import run
+from log_fixtures import run
+from model_folders import keep_models
 
 from hearthlog.models import modelfile, starter
 from hearthlog.models.modelfile import load_model

@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
 import numpy as np
-import spliced
 from recurring import record_recurring
 
 from hearthlog.analyzer.discover import NO_CLUSTER
@@ -81,7 +80,7 @@ def home(days, tmp_path):
 @pytest.fixture
 def hearthlog(capfd):
     """Run the command in this process and return what came of it."""
-    return partial(spliced.run, capfd)
+    return partial(log_fixtures.run, capfd)
 
 
 def day_of(sounds):

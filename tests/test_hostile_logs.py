@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 import zstandard
 from bags import INT32, STRING, T0, Bag, definition, int32, string
+from log_fixtures import run
 from mcap.reader import SeekingReader, make_reader
 from mcap.writer import CompressionType
-from spliced import run
 
 import hearthlog as package
 from hearthlog.analyzer.export import merge

@@ -9,9 +9,9 @@ from threading import Event as Flag
 import numpy as np
 import pytest
 import soundfile
+from log_fixtures import run
 from mcap.records import Metadata
 from rewriting import Log
-from spliced import run
 
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.models.classifiers.model import PublicCollection

@@ -8,7 +8,7 @@ from contextlib import closing
 from threading import Event
 
 import pytest
-from spliced import record_logs, run
+from log_fixtures import record_logs, run
 
 from hearthlog.schemas.logs.follow import follow_messages
 

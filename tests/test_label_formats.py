@@ -10,9 +10,9 @@ import pympi
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from log_fixtures import run
 from pyannote.core import Annotation, Segment
 from pyannote.database.util import load_rttm
-from spliced import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import ROUNDING, Coverage, find_coverage

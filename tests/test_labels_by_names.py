@@ -10,8 +10,8 @@ import pytest
 import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
+from log_fixtures import run
 from logreader import LogReader
-from spliced import run
 from test_scenarios_at_once import keep, renamed, replace_file
 
 from hearthlog.analyzer.bridge.alerts.rule_checks import unknown_class

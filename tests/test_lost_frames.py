@@ -9,7 +9,7 @@ import pytest
 import soundfile
 from logreader import LogReader
 from logs import features, read
-from lossy import LossySource
+from lossy_source import LossySource
 from mcap.opcode import Opcode
 from mcap.writer import Writer
 from rewriting import HEAD, Chunked, Log, split

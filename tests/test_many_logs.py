@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
-from spoken import START, record_conversation, two_voices
+from conversations import START, record_conversation, two_voices
 
 from hearthlog.analyzer.discover.sounds import ALL, discover, read_sounds
 from hearthlog.analyzer.discover.speech import find_voices, read_speech

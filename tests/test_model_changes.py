@@ -17,10 +17,10 @@ import pytest
 import soundfile
 import waiting
 from conftest import HEARTHLOG
-from kept import keep_models, put_by_hand
+from log_fixtures import run
 from logreader import LogReader
 from logs import features, labelled_frames, read
-from spliced import run
+from model_folders import keep_models, put_by_hand
 
 from hearthlog.models.classifiers.classifier import Classifier, label_timing
 from hearthlog.models.features.installed import DEFAULT

@@ -9,8 +9,8 @@ from threading import Event
 import pytest
 from homelife import at, write_day
 from livehome import rule
+from log_fixtures import run
 from servedhome import serving
-from spliced import run
 
 from hearthlog.analyzer.activity.segments import read_activity
 from hearthlog.analyzer.bridge.alerts.delivery import Outbox

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from conftest import HEARTHLOG
-from spliced import record_logs
+from log_fixtures import record_logs
 
 VERBS = {
     "help": "--help",

@@ -13,8 +13,8 @@ import pytest
 from conftest import FRESH_HEARTHLOG, HEARTHLOG
 from hypothesis import given
 from hypothesis import strategies as st
+from log_fixtures import run
 from logs import features, read
-from spliced import run
 from test_capture import wait_for_frames
 from test_model_changes import wait_for
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from logreader import LogReader
 from logs import read
-from lossy import LossySource
+from lossy_source import LossySource
 
 from hearthlog.analyzer.training.home_recordings import read_sound_of
 from hearthlog.models.classifiers.classifier import Classifier

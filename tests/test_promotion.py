@@ -12,7 +12,7 @@ from threading import Event as Flag
 
 import numpy as np
 import pytest
-from spliced import run
+from log_fixtures import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation import compare_labellings

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("hearthlog.tools.lab.home", reason="the wheel leaves the lab out")
 
 import soundfile
-from spliced import run
+from log_fixtures import run
 from viewers import display, free_port, reviewing
 
 from hearthlog.analyzer.errors import DataError

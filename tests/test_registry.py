@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from kept import keep_models, put_by_hand
-from spliced import run
+from log_fixtures import run
+from model_folders import keep_models, put_by_hand
 
 from hearthlog.models.modelfile import load_model, model_card, save_model
 from hearthlog.models.registry import (

@@ -16,12 +16,12 @@ import soundfile
 from blobs import with_arrays
 from clusters import scheduler_in, worker_of
 from conftest import HEARTHLOG
+from log_fixtures import run, small_disk
 from logs import features, labelled_frames
-from lossy import LossySource
+from lossy_source import LossySource
 from mcap.reader import make_reader
 from mcap.records import Metadata
 from rewriting import Log
-from spliced import run, small_disk
 from stores import put
 from together import record_together
 from waiting import wait_for

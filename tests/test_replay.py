@@ -19,7 +19,7 @@ from blobs import blobs
 from conftest import HEARTHLOG, spread_files
 from logreader import LogReader
 from logs import features, labelled_frames, read
-from lossy import LossySource
+from lossy_source import LossySource
 from mcap.records import Metadata
 from rewriting import Log
 from together import record_together

@@ -13,9 +13,9 @@ import pytest
 from homelife import BATHROOM, GENERAL, HOUR, at, midnight, write_day, write_life
 from hypothesis import given
 from hypothesis import strategies as st
+from log_fixtures import run
 from logs import read
 from PIL import Image
-from spliced import run
 
 from hearthlog.analyzer.activity.daily_metrics import day_of, metrics_of_home
 from hearthlog.analyzer.activity.event_counts import Strata, checked_rates

@@ -14,8 +14,8 @@ from threading import Event as Flag
 
 import numpy as np
 import pytest
+from log_fixtures import small_disk
 from logs import read
-from spliced import small_disk
 
 from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks

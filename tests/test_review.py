@@ -22,8 +22,8 @@ import pytest
 from conftest import HEARTHLOG
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lossy import LossySource
-from spliced import run
+from log_fixtures import run
+from lossy_source import LossySource
 from viewers import Window, browsing, display, find_ruler, free_port, patiently, reviewing
 
 from hearthlog.analyzer.errors import DataError

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 import soundfile
 import zstandard
+from log_fixtures import run
 from logreader import LogReader
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.typesys import Stores, get_typestore
-from spliced import run
 
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.recording import record_files

@@ -9,7 +9,7 @@ from queue import SimpleQueue
 import numpy as np
 import pytest
 import soundfile
-from spliced import run
+from log_fixtures import run
 from test_review import Screen
 from test_scenarios_at_once import START, record, sound
 

@@ -17,10 +17,10 @@ import pytest
 import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
+from log_fixtures import run
 from logreader import LogReader
 from mcap.records import Channel
 from prometheus_client.parser import text_string_to_metric_families
-from spliced import run
 from test_model_changes import MICROPHONE, block, wait_for
 
 from hearthlog.analyzer.activity.live import FIELDS, LiveActivity, is_of_alerts

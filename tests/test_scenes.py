@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import soundfile
-from spliced import run
+from log_fixtures import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.scenes import (

@@ -14,7 +14,7 @@ import tasks
 from blobs import blobs
 from clusters import running, scheduler_in, two_threads_in, worker_of
 from joblib import delayed
-from spliced import run
+from log_fixtures import run
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from hearthlog.analyzer.errors import WorkerError

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 from conftest import FRESH_HEARTHLOG
-from spliced import small_disk
+from log_fixtures import small_disk
 from systemd import PREFIX, PROGRAM
 from test_service import LOGS, UNIT, USER_ID, machine, service, wait_for_labels
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
-from kept import keep_models
-from spliced import run
+from log_fixtures import run
+from model_folders import keep_models
 from together import record_together
 
 from hearthlog.analyzer.activity.checked_minutes import read_reviewed_labels

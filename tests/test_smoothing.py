@@ -7,7 +7,7 @@ from threading import Event as Flag
 import numpy as np
 import pytest
 from logreader import LogReader
-from lossy import LossySource
+from lossy_source import LossySource
 from rewriting import Log
 
 from hearthlog.analyzer.doctor.examination import examine

@@ -8,7 +8,7 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 
 import numpy as np
 import soundfile
-from spoken import ALLISON, START, THEO, two_voices
+from conversations import ALLISON, START, THEO, two_voices
 from typer.testing import CliRunner
 
 from hearthlog.analyzer.discover.speech import check_voices, is_of_two

@@ -7,12 +7,12 @@ from functools import partial
 
 import numpy as np
 import pytest
+from log_fixtures import LOST, raw_messages, run, small_disk, write_log
 from logreader import LogReader
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
-from spliced import LOST, raw_messages, run, small_disk, write_log
 
 from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.selection import select

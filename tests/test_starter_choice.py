@@ -10,9 +10,9 @@ from threading import Event as Flag
 import numpy as np
 import pytest
 import soundfile
+from log_fixtures import run
 from networks import model
 from onnx import helper
-from spliced import run
 
 from hearthlog.analyzer.recorder_status import _networks
 from hearthlog.models.embedding.networks import NETWORKS, YAMNET, NetworkFile

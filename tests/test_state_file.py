@@ -9,7 +9,7 @@ import sys
 from contextlib import closing, suppress
 
 import pytest
-from spliced import small_disk
+from log_fixtures import small_disk
 
 from hearthlog.analyzer.bridge import state as bridge_state
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, StateEntry

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import HEARTHLOG, spread_files
+from log_fixtures import raw_messages, run
 from logreader import LogReader
-from spliced import raw_messages, run
 from stores import account, put
 
 from hearthlog.analyzer.logs.locations import location

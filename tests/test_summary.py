@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from logreader import LogReader
 from logs import read
-from lossy import LossySource
+from lossy_source import LossySource
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import StoragePlugin

@@ -12,9 +12,9 @@ import time
 from functools import partial
 
 import pytest
+from log_fixtures import run
 from logreader import LogReader
 from logs import read
-from spliced import run
 
 from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.marks.marks import Mark, write_marks

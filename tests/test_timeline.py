@@ -18,10 +18,10 @@ import rerun as rr
 from blobs import blobs
 from hypothesis import given
 from hypothesis import strategies as st
+from log_fixtures import run, write_log
 from logs import features, read
-from lossy import LossySource
+from lossy_source import LossySource
 from rerun.chunk import RrdReader
-from spliced import run, write_log
 from viewers import rerun_home, shown, viewer
 
 from hearthlog.analyzer.errors import DataError

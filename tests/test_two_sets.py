@@ -9,8 +9,8 @@ from threading import Event
 
 import numpy as np
 import pytest
+from log_fixtures import run
 from logs import features, read
-from spliced import run
 
 from hearthlog.analyzer.logs import recorder_info
 from hearthlog.analyzer.marks.marks import Mark, write_marks

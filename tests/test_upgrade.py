@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 import soundfile
 from golden_home import CONFIGURATION, entries, following, write_secrets
-from growing import NEXT
+from grown_schema import NEXT
+from log_fixtures import Result
+from log_fixtures import run as run_here
 from prometheus_client.parser import text_string_to_metric_families
 from receivers import server
 from rewriting import Log
-from spliced import Result
-from spliced import run as run_here
 from waiting import wait_for
 
 from hearthlog import __version__

@@ -11,10 +11,18 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 
 import numpy as np
 import soundfile
+from conversations import (
+    ALLISON,
+    DAY,
+    START,
+    THEO,
+    record_conversation,
+    two_spoken_days,
+    two_voices,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
-from spoken import ALLISON, DAY, START, THEO, record_conversation, two_spoken_days, two_voices
 
 from hearthlog.analyzer.discover import NO_CLUSTER
 from hearthlog.analyzer.discover.speech import (

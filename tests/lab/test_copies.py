@@ -9,8 +9,8 @@ from threading import Event as Flag
 import numpy as np
 import pytest
 import soundfile
+from log_fixtures import run
 from mcap.reader import make_reader
-from spliced import run
 
 from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.models.starter import GENERAL, starter_file

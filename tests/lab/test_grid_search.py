@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from blobs import blobs
 from clusters import two_threads_in
-from spliced import run, run_function
+from log_fixtures import run, run_function
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.train import evaluate_method

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from spliced import run_function
+from log_fixtures import run_function
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.training.dataset import build_dataset

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from log_fixtures import run_function
 from scipy.signal import welch
-from spliced import run_function
 
 from hearthlog.analyzer.evaluation.model_scores import evaluate_model
 from hearthlog.analyzer.training.manifest import read_manifest, scenario_of

@@ -10,7 +10,7 @@ from threading import Event as Flag
 from typing import Any, NamedTuple
 
 import pytest
-from lossy import LossySource
+from lossy_source import LossySource
 from mcap.reader import make_reader
 
 from hearthlog.recorder.config import Settings
