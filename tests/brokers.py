@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 from microphones import DIES_WITH_PARENT
 
+from hearthlog.analyzer.http import free_port
+
 _SECONDS = 60.0
 _SETTINGS = "allow_anonymous true\npersistence false\n"
 _AS_WE = "user root\n"  # else it gives up the right to read its files, where root starts it
@@ -28,7 +30,7 @@ class Broker:
     """
 
     def __init__(self, folder: Path, settings: str = _SETTINGS):
-        self.port = _free_port()
+        self.port = free_port()
         self.log_file = folder / "mosquitto.log"
         self._configuration = folder / "mosquitto.conf"
         self._configuration.write_text(f"{_AS_WE}listener {self.port} 127.0.0.1\n{settings}")
@@ -204,8 +206,3 @@ def _mosquitto() -> str:
             pytest.fail(reason)
         pytest.skip(reason)
     return found
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return probe.getsockname()[1]

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import time
 import urllib.error
@@ -22,6 +21,8 @@ import soundfile
 from conftest import HEARTHLOG
 from microphones import DIES_WITH_PARENT
 from waiting import wait_for
+
+from hearthlog.analyzer.http import free_port
 
 _ROOT = Path(__file__).parents[1]
 _VERSIONS = _ROOT / "build" / "home-assistant"
@@ -64,13 +65,6 @@ def hass_of(version):
             pytest.fail("no Home Assistant: run .ci/home-assistant")
         pytest.skip("needs a Home Assistant: .ci/home-assistant")
     return command
-
-
-def free_port():
-    """Return a port of loopback that nobody uses."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
 
 
 def end(process, number=signal.SIGTERM, seconds=120):

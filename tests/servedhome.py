@@ -9,12 +9,13 @@ from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 from livehome import LiveHome, midday_zone
-from viewers import free_port, patiently
+from viewers import patiently
 
 from hearthlog.analyzer.bridge.bridge import Bridge
 from hearthlog.analyzer.bridge.page import server
 from hearthlog.analyzer.bridge.page.home_page import HomePage
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
+from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.schemas.logs.files import find_logs

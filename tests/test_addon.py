@@ -18,10 +18,10 @@ import pytest
 import yaml
 from brokers import Listener
 from microphones import DIES_WITH_PARENT
-from viewers import free_port
 from waiting import wait_for
 
 from hearthlog import __version__
+from hearthlog.analyzer.http import free_port
 from hearthlog.tools.service import addon as addon_program
 from hearthlog.tools.service.addon import AddonFolders, AddonOptions, MicrophoneOptions
 

@@ -17,7 +17,7 @@ from homelife import GENERAL
 from livehome import LiveHome
 from pydantic import ValidationError
 from servedhome import JSON, PALE_TEXTS, Phone, pages, proxying, serving
-from viewers import address_of, browsing, free_port, patiently
+from viewers import address_of, browsing, patiently
 
 from hearthlog.analyzer import http
 from hearthlog.analyzer.activity import SoundEvent
@@ -34,7 +34,7 @@ from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
 from hearthlog.analyzer.bridge.wording import ENGLISH
-from hearthlog.analyzer.http import HttpServer
+from hearthlog.analyzer.http import HttpServer, free_port
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import ON_TELEVISION

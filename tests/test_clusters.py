@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
+import log_fixtures
 from conversations import two_spoken_days
 from recurring import two_recurring_days
 

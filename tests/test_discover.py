@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
+import log_fixtures
 import numpy as np
 from conftest import HEARTHLOG
 from hypothesis import given, settings

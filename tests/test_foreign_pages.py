@@ -13,9 +13,9 @@ import pytest
 from conftest import HEARTHLOG
 from homelife import at, write_day
 from shortsounds import DAY
-from viewers import browsing, display, free_port, patiently, reviewing
+from viewers import browsing, display, patiently, reviewing
 
-from hearthlog.analyzer.http import HOST
+from hearthlog.analyzer.http import HOST, free_port
 
 __all__ = ["display"]  # fixture
 

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
+import log_fixtures
 import numpy as np
 from recurring import record_recurring
 

@@ -6,11 +6,13 @@ from http.client import HTTPConnection
 from types import SimpleNamespace
 
 import pytest
-from homeassistant import free_port, hass_of, versions
+from homeassistant import hass_of, versions
 from microphones import DIES_WITH_PARENT
 from servedhome import Phone, serving
 from viewers import browsing
 from waiting import wait_for
+
+from hearthlog.analyzer.http import free_port
 
 PATH = "/api/hassio_ingress/abc123/"
 # The view of the integration hassio alone, as all of it would need all of the Supervisor, and what

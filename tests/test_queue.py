@@ -13,9 +13,10 @@ pytest.importorskip("hearthlog.tools.lab.home", reason="the wheel leaves the lab
 
 import soundfile
 from log_fixtures import run
-from viewers import display, free_port, reviewing
+from viewers import display, reviewing
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.clips import kept_time
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.layers import find_coverage

@@ -24,9 +24,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_fixtures import run
 from lossy_source import LossySource
-from viewers import Window, browsing, display, find_ruler, free_port, patiently, reviewing
+from viewers import Window, browsing, display, find_ruler, patiently, reviewing
 
 from hearthlog.analyzer.errors import DataError
+from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks

@@ -7,7 +7,6 @@ import json
 import os
 import select
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -22,6 +21,8 @@ import psutil
 import pytest
 from PIL import Image
 from rerun.experimental import ViewerClient
+
+from hearthlog.analyzer.http import free_port
 
 _WAIT_SECONDS = 120
 _DRAW_SECONDS = 2
@@ -103,12 +104,6 @@ def pixels(picture):
     """Read a PNG as an array of red, green and blue."""
     with Image.open(io.BytesIO(picture)) as image:
         return np.asarray(image.convert("RGB")).astype(int)
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def _missing(why):

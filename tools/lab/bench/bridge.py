@@ -1,7 +1,6 @@
 """The bridge beside a recorder of two microphones: how late it is, and what it takes."""
 
 import shutil
-import socket
 import subprocess
 import time
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.activity import ANY_SOUND, ActiveClasses
+from hearthlog.analyzer.http import free_port
 from hearthlog.models.classes import SILENCE
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, NANOSECONDS, SAMPLE_RATE
 from hearthlog.schemas.logs.columns import Columns, read_columns
@@ -55,7 +55,7 @@ def _measured(work: Workload) -> list[Row]:
     folder.mkdir()
     samples = _sounds(work.samples)
     env = make_microphone(folder, samples)
-    port, config = _free_port(), folder / "home.toml"
+    port, config = free_port(), folder / "home.toml"
     config.write_text(_configuration(folder, work.model_file, port))
     broker = folder / "mosquitto.conf"
     broker.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
@@ -150,11 +150,6 @@ def _configuration(folder: Path, model: Path, port: int) -> str:
     bridge = f'[bridge.mqtt]\nhost = "127.0.0.1"\nport = {port}\n'
     head = f'output = "{folder}/logs"\nmodel = "{model}"\ntimezone = "UTC"\n'
     return "".join([head, *microphones, bridge])
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 def _resident(process: "subprocess.Popen[bytes]") -> int:
