@@ -95,7 +95,7 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
         for second in range(edge // SECOND, now // SECOND):
             if second in labels:
                 live.add_label("mic", LiveLabel(second * SECOND, labels[second], 0.9), CLASSES)
-        until = live.known_until(now)
+        until = live.complete_until(now)
         new = watch.evaluate(live.activity, pytest.fail, until, now)
         assert all(now - each.time < 90 * SECOND for each in new)
         found += new
@@ -143,12 +143,12 @@ def test_what_was_read_and_the_news_after_it_are_the_activity_of_a_replay(tmp_pa
 
 def test_no_more_is_known_than_labels_have_decided():
     live, begin = LiveActivity(0, 30 * SECOND), 1000
-    assert live.known_until(2000 * SECOND) == 1970 * SECOND  # nobody is heard
+    assert live.complete_until(2000 * SECOND) == 1970 * SECOND  # nobody is heard
     for second in range(begin, begin + 100):
         live.add_label("mic", LiveLabel(second * SECOND, "silence", 0.9), CLASSES)
     now = (begin + 100) * SECOND
-    assert live.known_until(now) == (begin + 94) * SECOND
-    assert live.known_until(now + 100 * SECOND) == now + 70 * SECOND  # it is away
+    assert live.complete_until(now) == (begin + 94) * SECOND
+    assert live.complete_until(now + 100 * SECOND) == now + 70 * SECOND  # it is away
 
 
 def test_a_scenario_that_is_taken_away_keeps_nobody_waiting():
@@ -158,7 +158,7 @@ def test_a_scenario_that_is_taken_away_keeps_nobody_waiting():
         live.add_label("mic", LiveLabel(time, "silence", 0.9), ["silence", "speech"])
         if second < 3600:
             live.add_label("mic-water", LiveLabel(time, "tap_water", 0.9), ["silence", "tap_water"])
-    assert time - live.known_until(time) < 10 * SECOND
+    assert time - live.complete_until(time) < 10 * SECOND
     assert [name for name, *_ in live.open_segments()] == ["mic"]
     taps = live.activity().of("tap_water")
     assert taps.ends.tolist() == [begin + (3599 - 5) * SECOND]

@@ -395,7 +395,7 @@ def test_what_is_not_counted_is_drawn_pale_and_its_entry_says_so():
 def test_the_page_says_which_sounds_that_people_ask_about_it_does_not_know():
     home = home_at(9, tiled((-3, 9)))
     (microphone,) = home.microphones
-    microphone.never_tell = frozenset({"yelling"})
+    microphone.hidden_classes = frozenset({"yelling"})
     note = picture_of(home)["missing"]
     assert ": telephone ringing, toilet flush, shower and water tap. To teach" in note
     microphone.names = ["silence", "coughing", "crying", "speech", "phone_ring", "running_water"]

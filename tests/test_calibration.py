@@ -7,7 +7,7 @@ import pytest
 from blobs import blobs
 
 from hearthlog.analyzer.training.calibration import (
-    KNOWN_LOST,
+    LOST_TO_UNKNOWN,
     calibrate_elsewhere,
     collection_folds,
     home_temperature,
@@ -69,7 +69,7 @@ def test_unknown_takes_as_many_of_the_known_as_it_may():
     assert bias[[0, 1, 3]].tolist() == [0.0, 0.0, 0.0]
     known = target != 2
     lost = ((decisions + bias).argmax(axis=1) == 2)[known].mean()
-    assert lost == pytest.approx(KNOWN_LOST, abs=0.005)
+    assert lost == pytest.approx(LOST_TO_UNKNOWN, abs=0.005)
 
 
 def test_without_unknown_nothing_is_biased():

@@ -244,7 +244,7 @@ def test_frames_in_pieces_of_any_size_give_the_same_evidence(blocks, sizes, seed
     for size in [*sizes, 100]:
         count = min(size, 100 - at)
         windows = min(max(at + count - 7, 0), count)
-        parts.append(one.push(directions.known_at(at, count), at, count, windows))
+        parts.append(one.push(directions.available_at(at, count), at, count, windows))
         at += count
     np.testing.assert_array_equal(np.concatenate(parts), complete)
 
@@ -264,7 +264,7 @@ def test_evidence_is_full_once_nothing_depends_on_what_was_before(blocks, first,
     directions, weights = of_blocks(sorted(blocks), seed), strong()
     complete, late = DirectionEvidence(weights), DirectionEvidence(weights)
     expected = complete.push(directions, 0, 100, 100)
-    found = late.push(directions.known_at(first, 100 - first), first, 100 - first, 100 - first)
+    found = late.push(directions.available_at(first, 100 - first), first, 100 - first, 100 - first)
     full = next(frame for frame in range(first, 200) if late.is_full(frame))
     assert full <= first + 30
     np.testing.assert_array_equal(found[full - first :], expected[full:])

@@ -192,7 +192,7 @@ def test_what_is_said_of_frames_is_the_same_in_pieces_of_any_size(step):
     expected = full.at(0, 300)
     parts, pieces = EmbeddingEvidence(as_they_are, 2), []
     for first in range(0, 300, step):
-        parts.push(embeddings.known_at(first, step), first)
+        parts.push(embeddings.available_at(first, step), first)
         begin, end = max(first - 19, 0), max(first + step - 19, 0)
         pieces.append(parts.at(begin, end - begin))
     joined = np.concatenate(pieces)
@@ -304,7 +304,7 @@ def test_a_gap_separates_windows(real_frames):
 
 
 def test_of_nothing_nothing_is_known():
-    assert not len(NO_AUXILIARY.known_at(0, 100).embeddings.frames)
+    assert not len(NO_AUXILIARY.available_at(0, 100).embeddings.frames)
     joined = Auxiliary(embeddings=embeddings_at(10)).followed_by(NO_AUXILIARY)
     assert joined.embeddings.frames.tolist() == [10]
 

@@ -350,7 +350,9 @@ def test_the_doctor_misses_what_the_version_of_a_log_had(golden, capfd, tmp_path
     log.metadata("hearthlog").metadata["schema_version"] = str(NEXT)
     log.write(golden)
     with grown_definitions(tmp_path), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hearthlog.schemas.logs.metadata._KNOWN", {"1": 1, "2": 2, str(NEXT): NEXT})
+        patch.setattr(
+            "hearthlog.schemas.logs.metadata._SCHEMA_VERSIONS", {"1": 1, "2": 2, str(NEXT): NEXT}
+        )
         output = json.loads(run(capfd, "doctor", golden, "--json").stdout)
     wrong = [each["what"] for each in output["findings"] if each["level"] == "error"]
     absent = {  # in this log

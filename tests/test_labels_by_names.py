@@ -108,7 +108,7 @@ def labelled(labeller, embeddings, count, sizes=(1000,)):
 
 
 def pushed(labeller, embeddings, first, stamps):
-    known = Auxiliary(embeddings=embeddings.known_at(first, len(stamps)))
+    known = Auxiliary(embeddings=embeddings.available_at(first, len(stamps)))
     return labeller.push(np.zeros((len(stamps), 1), np.float32), None, first, stamps, known)
 
 

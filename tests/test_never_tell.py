@@ -87,7 +87,7 @@ def test_a_list_that_is_damaged_is_said_and_hides_nothing(logs, hearthlog, conte
 def test_the_classes_of_the_configuration_are_in_the_logs(tmp_path, model_file, day):
     settings = Settings(output=tmp_path / "logs", model=model_file, never_tell=["music", "shout"])
     record(settings, FileSource([day], 1_772_348_400 * 10**9), Event())
-    assert find_home_logs([tmp_path / "logs"]).never_tell() == {"music", "yelling"}
+    assert find_home_logs([tmp_path / "logs"]).hidden_classes() == {"music", "yelling"}
 
 
 def test_a_rule_of_a_hidden_class_never_notifies(logs, tmp_path, hearthlog):
@@ -104,7 +104,7 @@ def test_a_rule_of_a_hidden_class_never_notifies(logs, tmp_path, hearthlog):
         box = Outbox(state, ["x"], pytest.fail)
         memory = RuleProgressStore(state, pytest.fail)
         watch = RuleWatch(rules, UTC, box, memory, pytest.fail, start + MINUTE)
-        watch.never_tell = frozenset(hidden)
+        watch.hidden_classes = frozenset(hidden)
         rang = watch.evaluate(lambda: recorded, pytest.fail, end - MINUTE, end - MINUTE)
         assert {each.rule for each in rang} == reported
     write_hidden_classes(logs, ["music"])
@@ -155,12 +155,12 @@ def test_totals_go_on_for_a_class_that_is_hidden_for_a_while(logs, tmp_path):
     (columns,) = read_columns(find_logs(logs), ["/mic/segment"]).values()
     state = HomeState()
     own = state.microphones["mic"] = LiveMicrophone("mic")
-    state.never_tell = frozenset({"music"})
+    state.hidden_classes = frozenset({"music"})
     assert {event.label for event in own.push_segments(columns)} == {"coughing"}
     assert own.labels() == ["coughing"]
     assert {event.label for event in own.ended_events()} == {"coughing"}
     totals = Totals(BridgeState(tmp_path, "home", pytest.fail), 0, pytest.fail)
     totals.keep(state, day_span(DAY, UTC)[1])
-    state.never_tell = frozenset()
+    state.hidden_classes = frozenset()
     counts = {total.label: total.events for total in totals.count(state)}
     assert (counts["music"], counts["coughing"]) == (2, 1)

@@ -479,10 +479,10 @@ def test_right_is_better_only_beyond_chance():
     assert not clearly_better(PairedAccuracy())
 
 
-NOTHING_KNOWN = PairedAccuracy()
+NO_PAIRS = PairedAccuracy()
 
 
-def evidence(minutes, right=NOTHING_KNOWN, sure=None):
+def evidence(minutes, right=NO_PAIRS, sure=None):
     """Make evidence of a home with silence, speech and music, in minutes of a day."""
     table = np.array(minutes, float)
     certain = np.zeros_like(table) if sure is None else np.array(sure, float)

@@ -60,7 +60,7 @@ def view(timeline):
 def query(view, logs, start, end):
     """Go to a span, as a queue does."""
     view.draw_close_up(read_timeline([logs], start - MARGIN, end + MARGIN))
-    view.ask(start, end, Question("Music?", "1 of 10", [Key("a", "yes")]))
+    view.show_question(start, end, Question("Music?", "1 of 10", [Key("a", "yes")]))
     view.show(start, end, MARGIN)
 
 
@@ -177,7 +177,7 @@ def test_the_question_is_large_and_all_is_shown_on_a_small_screen(timeline):
     with open_hidden(size=(1366, 768)) as viewer:
         viewer.draw(timeline, close_up=True)
         viewer.wait_until_drawn()
-        viewer.ask(start, start + 5 * SECOND, question)
+        viewer.show_question(start, start + 5 * SECOND, question)
         viewer.show(start, start + 5 * SECOND, MARGIN)
 
         def is_right(png):

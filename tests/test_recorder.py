@@ -247,8 +247,8 @@ def test_a_gap_closes_the_segment_and_the_next_label_waits_for_a_floor_and_a_win
     frames = [[decode(r.data, LABEL).frame for r in found] for found in labels]
     # Blocks end with frames 7 and 55, the first windows behind them with 14 and 62.
     assert frames == [[*range(14 - 3, 40 - 3)], [*range(62 - 3, 87 - 3)]]
-    known_at = [START + frame * FRAME_NANOSECONDS for frame in (14, 62)]
-    assert [found[0].log_time for found in labels] == known_at
+    decided_at = [START + frame * FRAME_NANOSECONDS for frame in (14, 62)]
+    assert [found[0].log_time for found in labels] == decided_at
     statistics = [[r.data[20:] for r in x if r.topic == "/mic/statistics"] for x in (before, after)]
     payload = [[data[12:] for data in found] for found in statistics]
     assert payload[0] == payload[1]

@@ -273,7 +273,7 @@ class Screen:
     def clear_question(self):
         self.requested.append(None)
 
-    def ask(self, start, end, question):
+    def show_question(self, start, end, question):
         self.requested.append((start, end, question))
 
     def play(self, start):
@@ -437,7 +437,7 @@ def test_the_question_before_is_gone_until_the_next_span_is_drawn(home):
     sitting.session.look_closely = lambda *span: (shown.append("draw"), draw(*span))
     sitting.screen.show = lambda *span, **more: (shown.append("show"), show(*span, **more))
     sitting.screen.clear_question = lambda: shown.append("clear")
-    sitting.screen.ask = lambda *_: shown.append("ask")
+    sitting.screen.show_question = lambda *_: shown.append("ask")
     sitting.session.announce = shown.append
     sitting.run("n")
     assert shown[1:5] == ["clear", "draw", "show", "ask"]

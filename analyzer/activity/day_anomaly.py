@@ -315,7 +315,7 @@ class Routines:
     def _of(self, day: date) -> DayProfile | None:
         if day not in self._profile_of_day:
             profile = self._profiles.of(day)
-            self._profile_of_day[day] = profile if profile.is_known else None
+            self._profile_of_day[day] = profile if profile.is_comparable else None
         return self._profile_of_day[day]
 
 

@@ -102,7 +102,7 @@ class DayProfile:
     half_hours: Float64  # [shape=(c, 48)]; minutes, for each class of its `Profiles`
 
     @property
-    def is_known(self) -> bool:
+    def is_comparable(self) -> bool:
         """Whether at least half of the figures are present, so that the day can be compared."""
         return bool(np.isfinite(self.values).mean() >= _LEAST_FIGURES)
 

@@ -111,7 +111,7 @@ def read_home(
     _check(home, logs, labelling, close)
     _name_classes(home, logs.between(*close, layer), name)
     try:
-        home.hidden = logs.never_tell()
+        home.hidden = logs.hidden_classes()
     except LogError as error:
         home.lose(str(error))
     home.classes = {

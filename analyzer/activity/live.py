@@ -180,7 +180,7 @@ class LiveActivity:
         if not run.start:
             run.begin(max(self._start, self._collector.recorder_began or 0))
 
-    def known_until(self, now: int) -> int:
+    def complete_until(self, now: int) -> int:
         """Return the time up to which the activity is complete, in nanoseconds of UTC."""
         until = now
         for source, pending in self._pending.items():

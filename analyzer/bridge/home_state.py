@@ -105,7 +105,7 @@ class LiveMicrophone:
     def __init__(self, name: str, unnamed: Collection[str] = (SILENCE,)) -> None:
         self.name = name
         self._unnamed = unnamed
-        self.never_tell: frozenset[str] = frozenset()  # classes that no output shows
+        self.hidden_classes: frozenset[str] = frozenset()  # classes that no output shows
         self.common_names: Mapping[str, str] = {}  # of classes that the model takes for one another
         self.names: list[str] = []
         self.active = ActiveClasses([])
@@ -127,13 +127,13 @@ class LiveMicrophone:
     @property
     def classes(self) -> list[str]:
         """Classes of the model that outputs show, silence among them."""
-        left_out = {*self._unnamed, *self.never_tell} - {SILENCE}
+        left_out = {*self._unnamed, *self.hidden_classes} - {SILENCE}
         return [name for name in self.names if name not in left_out]
 
     @property
     def shown_label(self) -> str:
         """The newest label; `unknown` in place of a class that no output shows."""
-        return UNKNOWN if self.label in self.never_tell else self.label
+        return UNKNOWN if self.label in self.hidden_classes else self.label
 
     def is_listening(self) -> bool:
         """Whether labels have arrived in the last fifteen seconds."""
@@ -146,7 +146,7 @@ class LiveMicrophone:
 
     def labels(self) -> list[str]:
         """Return the classes with recorded events that outputs show."""
-        return [label for label in self._records if label not in self.never_tell]
+        return [label for label in self._records if label not in self.hidden_classes]
 
     def _named_events(self, name: str, since: int, names: Mapping[str, str]) -> list[SoundEvent]:
         """Return the events of the classes that share a name."""
@@ -199,7 +199,7 @@ class LiveMicrophone:
             record = self._records.setdefault(label, EventRecord(self.name, label))
             before = record.current
             if record.push(start, start + max(duration, 0), confidence) and record.current:
-                if label not in self.never_tell:
+                if label not in self.hidden_classes:
                     begun.append(record.current)
                 if before is not None and label in self._unended:
                     self._replaced.append(before)
@@ -254,7 +254,7 @@ class LiveMicrophone:
 
         A count is None in place of 0 if coverage is too low for a count of 0.
         """
-        key = self._changes, corrections.number, today[1:], self.never_tell, *self.classes
+        key = self._changes, corrections.number, today[1:], self.hidden_classes, *self.classes
         if key != self._counts[0]:
             counts = {}
             for name, own in self.sounds(min(today.midnight, today.night), corrections, {}).items():
@@ -327,7 +327,7 @@ class LiveMicrophone:
             if not self.is_listening() or (is_quiet and not self.active.is_active(label)):
                 self._unended.remove(label)
                 ended += [] if event is None else [event]
-        return [event for event in ended if event.label not in self.never_tell]
+        return [event for event in ended if event.label not in self.hidden_classes]
 
     def forget(self, before: int, after: int) -> None:
         """Drop events before `before`, except the last of each class, and events after `after`."""
@@ -369,7 +369,7 @@ class HomeState:
         self.caught_up = False
         self.sources: Collection[str] | None = None
         self.corrections = NO_CORRECTIONS
-        self._never_tell: frozenset[str] = frozenset()
+        self._hidden_classes: frozenset[str] = frozenset()
         self.common_names: Mapping[str, str] = {}
         self._seen = -math.inf  # time of the last message, by CLOCK_MONOTONIC
         self._diagnosed: set[str] = set()  # subjects with diagnostics in the current log
@@ -379,16 +379,16 @@ class HomeState:
         return time.monotonic() - self._seen <= _AWAY_SECONDS
 
     @property
-    def never_tell(self) -> frozenset[str]:
+    def hidden_classes(self) -> frozenset[str]:
         """Classes that no output shows."""
-        return self._never_tell
+        return self._hidden_classes
 
-    @never_tell.setter
-    def never_tell(self, names: frozenset[str]) -> None:
-        if names != self._never_tell:
-            self._never_tell = names
+    @hidden_classes.setter
+    def hidden_classes(self, names: frozenset[str]) -> None:
+        if names != self._hidden_classes:
+            self._hidden_classes = names
             for microphone in self.every():
-                microphone.never_tell = names
+                microphone.hidden_classes = names
 
     def every(self) -> list[LiveMicrophone]:
         """Return the states of all microphones and scenarios."""
@@ -448,7 +448,7 @@ class HomeState:
         own = self.scenarios if is_scenario else self.microphones
         if name not in own:
             own[name] = LiveMicrophone(name, OF_EVERY_SCENARIO if is_scenario else {SILENCE})
-            own[name].never_tell = self._never_tell
+            own[name].hidden_classes = self._hidden_classes
             own[name].common_names = self.common_names
         return own[name]
 
@@ -502,7 +502,7 @@ def follow_home(
     """
     state, folder = HomeState(), home.folder
     state.corrections = EventCorrections(folder, home.node)
-    state.never_tell = home.never_tell
+    state.hidden_classes = home.never_tell
     _hide(state, home, report)
     while not folder.is_dir():
         report(f"{folder}: no such folder yet; waiting for a recorder")
@@ -549,7 +549,7 @@ def _hide(state: HomeState, home: RecorderAddress, report: Report) -> None:
     While the list cannot be read, what it hid last stays hidden.
     """
     try:
-        state.never_tell = home.never_tell | read_hidden_classes(home.folder)
+        state.hidden_classes = home.never_tell | read_hidden_classes(home.folder)
     except (LogError, OSError) as error:
         report(f"{error}; until then, classes hidden since the start of the bridge stay hidden")
 

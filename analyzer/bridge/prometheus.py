@@ -71,7 +71,7 @@ class PrometheusOutput:
         )
         registry = CollectorRegistry()
         totals = self.totals.count(update.state)
-        shown = [total for total in totals if total.label not in update.state.never_tell]
+        shown = [total for total in totals if total.label not in update.state.hidden_classes]
         registry.register(HomeCollector(update, self._home, shown))
         text = generate_latest(registry)
         self._made = text, time.monotonic()

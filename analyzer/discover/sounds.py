@@ -51,7 +51,7 @@ from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.messages import message_types
 from hearthlog.schemas.messages.topics import LIVE, EmbeddingSpace, topic
 
-ALL, UNSURE, NOT_KNOWN = CHOICES = ("all", "unsure", "unknown")
+ALL, UNSURE, ONLY_UNKNOWN = CHOICES = ("all", "unsure", "unknown")
 # A sound has at least four frames and may contain two silent ones; stamps follow a clock.
 _PAUSE = 3 * FRAME_NANOSECONDS + FRAME_NANOSECONDS // 2
 _LEAST_NANOSECONDS = 3 * FRAME_NANOSECONDS - FRAME_NANOSECONDS // 2

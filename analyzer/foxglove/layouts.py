@@ -55,7 +55,7 @@ def microphones_to_lay_out(logs: HomeLogs) -> list[LaidOutMicrophone]:
 
     Raise `DataError` if there are none.
     """
-    hidden = logs.never_tell()
+    hidden = logs.hidden_classes()
     latest: dict[str, list[records.Channel]] = {}
     for entry in reversed(logs.between()):
         if entry.node not in latest:

@@ -107,8 +107,8 @@ class HomeLogs:
         layers = {entry.layer for entry in self.entries if entry.layer.startswith(RELABEL_LAYER)}
         return sorted(layer.removeprefix(RELABEL_LAYER) for layer in layers)
 
-    def never_tell(self) -> frozenset[str]:
-        """Return the classes that nobody is told of, by the last log and the list beside it.
+    def hidden_classes(self) -> frozenset[str]:
+        """Return the hidden classes: those of the configuration in the last log, and the list.
 
         Raise `LogError` if the list is damaged.
         """

@@ -74,7 +74,7 @@ class PairedAccuracy(NamedTuple):
         return PairedAccuracy(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-NOTHING_KNOWN = PairedAccuracy()
+NO_PAIRS = PairedAccuracy()
 
 
 class NamedSounds(NamedTuple):
@@ -99,7 +99,7 @@ class HomeComparison:
     random: PairedAccuracy  # sounds of the minutes drawn at random
     marks: PairedAccuracy  # sounds of other marks outside both training sets
     losses: list[str]
-    quiet: PairedAccuracy = NOTHING_KNOWN  # silences of the minutes drawn at random
+    quiet: PairedAccuracy = NO_PAIRS  # silences of the minutes drawn at random
     # classes of the second model from marks of the home, without those of the first
     taught: frozenset[str] = frozenset()
     # sounds of known label, including training sounds, by reviewed class, class of the first model
@@ -279,7 +279,7 @@ class Trial:
     random: PairedAccuracy  # sounds of the minutes drawn at random
     marks: PairedAccuracy  # sounds of other marks
     losses: list[str]
-    quiet: PairedAccuracy = NOTHING_KNOWN  # silences of the minutes drawn at random
+    quiet: PairedAccuracy = NO_PAIRS  # silences of the minutes drawn at random
 
 
 def compare_on_trial(folders: Sequence[Path]) -> Trial:

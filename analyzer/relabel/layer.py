@@ -341,7 +341,7 @@ def _rows_of(labels: FrameLabels) -> NDArray[np.void]:
 
 def _row_type(classes: int) -> np.dtype[np.void]:
     """Return the row type of a label in the part file."""
-    times = [(name, np.int64) for name in ("frames", "stamps", "known_at")]
+    times = [(name, np.int64) for name in ("frames", "stamps", "decided_at")]
     return np.dtype([*times, ("probabilities", np.float32, (classes,)), ("novelty", np.float32)])
 
 
@@ -391,9 +391,9 @@ def _batches(
     for name, (label, segment) in topics.items():
         rows = np.frombuffer(stored, _row_type(len(classes)), labelled.frames[name], first)
         first += rows.nbytes
-        rows = rows[rows["known_at"].argsort(kind="stable")]  # a sound card's time may jump back
+        rows = rows[rows["decided_at"].argsort(kind="stable")]  # a sound card's time may jump back
         fields = label_columns(rows, classes, name)
-        labels.append(TopicBatch(label.name, rows["known_at"].copy(), fields))
+        labels.append(TopicBatch(label.name, rows["decided_at"].copy(), fields))
         own = labelled.segments[name]
         times = np.array([each.decided_at for each in own], np.int64)
         segments.append(TopicBatch(segment.name, times, segment_columns(own, classes, name)))

@@ -64,7 +64,7 @@ class Features(NamedTuple):
     def part(self, frames: slice) -> "Features":
         """Return some of the frames."""
         first, stamps = self.first + (frames.start or 0), self.stamps[frames]
-        auxiliary = self.auxiliary.known_at(first, len(stamps))
+        auxiliary = self.auxiliary.available_at(first, len(stamps))
         return Features(first, self.values[frames], stamps, auxiliary)
 
 

@@ -53,8 +53,8 @@ def day_headline(day: DayMetrics) -> str:
 
 def week_headline(days: Sequence[DayMetrics]) -> str:
     """Return the headline of a week: its quiet days; coughing, crying and shouting."""
-    known = [day for day in days if day.coverage.length]
-    complete_days = [day for day in known if _is_known(day)]
+    recorded = [day for day in days if day.coverage.length]
+    complete_days = [day for day in recorded if _is_covered(day)]
     quiet = sum(is_quiet(day) for day in complete_days)
     number, of = number_in_words(len(complete_days)), number_in_words(len(days))
     which = {0: "none", len(complete_days): "all" if len(complete_days) > _ONE_MORE else "both"}
@@ -71,7 +71,7 @@ def week_headline(days: Sequence[DayMetrics]) -> str:
         parts = [f"Too little was recorded to judge any of the {of} days."]
     sounds: list[tuple[str, bool]] = []
     for name in WORRYING:
-        counts = [(count, day) for day in known if (count := day.count(name)) and count.labelled]
+        counts = [(count, day) for day in recorded if (count := day.count(name)) and count.labelled]
         if counts:
             total = sum((count for count, _ in counts), Count())
             on = f"{number_in_words(len(counts))} day{'s' * (len(counts) > 1)}"
@@ -88,14 +88,14 @@ def _by_sound(sounds: Sequence[tuple[str, bool]]) -> Iterator[str]:
 
     A count of a class in words comes with whether a person reviewed all of it.
     """
-    yield from (f"{_capital(text)}." for text, is_known in sounds if is_known)
-    if labelled := [text for text, is_known in sounds if not is_known]:
+    yield from (f"{_capital(text)}." for text, is_checked in sounds if is_checked)
+    if labelled := [text for text, is_checked in sounds if not is_checked]:
         yield f"By the sound of it, {'; '.join(labelled)}."
 
 
 def is_quiet(day: DayMetrics) -> bool:
     """Whether a day was quiet; false if too little of it was recorded."""
-    return _is_known(day) and int(_lively(day).sum()) <= QUIET_HOURS
+    return _is_covered(day) and int(_lively(day).sum()) <= QUIET_HOURS
 
 
 def amount(name: str, count: Count, *, named: bool = True) -> str:
@@ -155,7 +155,7 @@ def _day(day: DayMetrics) -> str:
 
 def states_missing_time(day: DayMetrics) -> bool:
     """Whether the headline says how much was not recorded, and what was labelled in the rest."""
-    return not _is_known(day)
+    return not _is_covered(day)
 
 
 def _recorded_part(day: DayMetrics) -> str:
@@ -206,7 +206,7 @@ def _missing(day: DayMetrics) -> Iterator[str]:
         yield f"The {other if hours else 'rest of the day was'} not recorded."
 
 
-def _is_known(day: DayMetrics) -> bool:
+def _is_covered(day: DayMetrics) -> bool:
     """Whether three quarters of the day, and of its waking hours, were recorded."""
     waking = single_span(*(at_hour(day.day, hour, day.zone) for hour in (MORNING, EVENING)))
     return min(day.share, intersection(day.coverage, waking).length / waking.length) >= MOST
@@ -238,16 +238,16 @@ def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
     )
     for name in WORRYING:
         parts: list[str] = []
-        is_known = True
+        is_checked = True
         for span, when in times_of_day:
             starts = counted_events(day, name, span)
             if len(starts):
                 count = day.home.minutes.between(span).count(name, day.home.rates.get(name))
                 times = f" ({_when(day, starts)})" if _when(day, starts) else ""
                 parts.append(f"{amount(name, count, named=not parts)} {when}{times}")
-                is_known &= count.certain == count.labelled
+                is_checked &= count.certain == count.labelled
         if parts:
-            yield listed(parts, "and"), is_known
+            yield listed(parts, "and"), is_checked
 
 
 def _when(day: DayMetrics, starts: Int64) -> str:

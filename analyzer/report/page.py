@@ -200,8 +200,8 @@ def _description(timeline: DayTimeline) -> str:
 def _page(data: ReportData, picture: PagePicture, **parts: Any) -> str:
     days = [day for day in (*data.before, *data.days) if day.coverage.length]
     names = [name for name in data.classes if name not in {SILENCE, UNKNOWN}]
-    absent = [name for name in names if _is_known(data, name) and not _occurs(data, name)]
-    uncertain = [name for name in names if not _is_known(data, name)]
+    absent = [name for name in names if _has_count(data, name) and not _occurs(data, name)]
+    uncertain = [name for name in names if not _has_count(data, name)]
     uncounted = [name for name in ON_TELEVISION if name in data.classes]
     return fill_page(
         data=data,
@@ -335,7 +335,7 @@ def _is_unsure(data: ReportData, name: str) -> bool:
     return any(count.unsure and count.range is None for count in counts)
 
 
-def _is_known(data: ReportData, name: str) -> bool:
+def _has_count(data: ReportData, name: str) -> bool:
     """Whether enough was recorded on some of the days to tell how often a class was heard."""
     return any(day.count(name) is not None or day.uncounted_events(name) for day in data.days)
 
@@ -363,11 +363,11 @@ def _text(value: Value | None) -> str:
 
 
 def _part(data: ReportData, section: FigureSection, day: DayMetrics) -> PageSection:
-    known = [figure for figure in section.figures if figure.value(day) is not None]
-    rows = [[Cell(figure.title), _cell(data, figure, day, is_alone=True)] for figure in known]
+    shown = [figure for figure in section.figures if figure.value(day) is not None]
+    rows = [[Cell(figure.title), _cell(data, figure, day, is_alone=True)] for figure in shown]
     remarks = [*_remarks(section, day)]
-    if len(known) < len(section.figures):
-        more = "more" if known else "anything"
+    if len(shown) < len(section.figures):
+        more = "more" if shown else "anything"
         remarks.append(f"Too little was recorded to tell {more}.")
     return PageSection(section, PageTable(["", "This day"], rows, "figures"), remarks)
 
@@ -463,11 +463,11 @@ def _sum(values: Sequence[Value | None]) -> Count | Duration | None:
     """Add daily figures, some unknown; None if a total of 0 is uncertain."""
     counts = [value for value in values if isinstance(value, Count)]
     minutes = [value for value in values if isinstance(value, Duration)]
-    known = counts or minutes
-    if not known:
+    of_kind = counts or minutes
+    if not of_kind:
         return None
     total = sum(counts, Count()) if counts else sum(minutes, Duration())
-    return total if total.middle or len(known) >= MOST * len(values) else None
+    return total if total.middle or len(of_kind) >= MOST * len(values) else None
 
 
 def _interrai(data: ReportData, days: Sequence[DayMetrics]) -> PageTable:

@@ -169,14 +169,14 @@ def _doubts(
     close, name, layer = logs.between(start, end), LIVE, list[HomeLog]()
     if labelling != LIVE:
         name, layer = relabelling(labelling), logs.between(start, end, RELABEL_LAYER + labelling)
-    known = [day.home.minutes for day in days]
-    television = np.concatenate([each.starts[each.television] for each in known])
+    minutes = [day.home.minutes for day in days]
+    television = np.concatenate([each.starts[each.television] for each in minutes])
     found: list[DoubtfulSound] = []
     for (node, microphone), labels in home.labelled.items():
         events = doubtful_events(labels)
         own = (events.starts >= start) & (events.starts < end)
         own &= ~np.isin(events.starts // MINUTE * MINUTE, television)
-        own &= rows_at(known[0].reviewed, events.starts) < 0
+        own &= rows_at(minutes[0].reviewed, events.starts) < 0
         own &= ~np.isin(events.labels, [*home.hidden])
         entries = [(e.path, e.start, e.end) for e in (*close, *layer) if e.node == node]
         topics = labelling_topic(microphone, name, "label"), f"/{microphone}/features"

@@ -62,7 +62,7 @@ class Screen(Protocol):
     def clear_question(self) -> None:
         """Remove the question of the previous span."""
 
-    def ask(self, start: int, end: int, question: Question) -> None:
+    def show_question(self, start: int, end: int, question: Question) -> None:
         """Draw the requested span and its question, in place of the previous ones.
 
         Parameters
@@ -388,7 +388,9 @@ class ReviewSession:
             self.screen.show(item.start, item.end, margin, select=item.chosen != RANDOM)
         with self._unless_silent():
             text = f"{place}, {span}{silent}"
-            self.screen.ask(item.start, item.end, Question(_question(item), text, self._answers()))
+            self.screen.show_question(
+                item.start, item.end, Question(_question(item), text, self._answers())
+            )
         # Not before: nobody is to answer from the picture of the item before.
         self.announce(f"{place}: {_question(item)} {span}; {item.text}{silent}")
 

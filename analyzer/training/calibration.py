@@ -59,7 +59,7 @@ def softmax(values: Float64) -> Float64:
     return grown / grown.sum(axis=1, keepdims=True)
 
 
-KNOWN_LOST = 0.05  # share of known segments that may be labelled `unknown`
+LOST_TO_UNKNOWN = 0.05  # share of known segments that may be labelled `unknown`
 _FEWEST_COLLECTIONS = 3
 _FEWEST_SOURCES = 5  # of a class in other collections
 _BASE_SEGMENTS = 30
@@ -193,7 +193,7 @@ def unknown_bias(decisions: Float64, target: Indices, classes: Sequence[str]) ->
         margin = best - decisions[others, unknown]
         margin = margin[np.isfinite(margin)]
         if len(margin):
-            bias[unknown] = np.clip(np.quantile(margin, KNOWN_LOST), -100.0, 100.0)
+            bias[unknown] = np.clip(np.quantile(margin, LOST_TO_UNKNOWN), -100.0, 100.0)
     return bias
 
 

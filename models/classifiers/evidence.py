@@ -111,10 +111,10 @@ class Auxiliary(NamedTuple):
     directions: Directions = NOWHERE
     embeddings: Embeddings = NO_EMBEDDINGS
 
-    def known_at(self, first: int, count: int) -> "Auxiliary":
+    def available_at(self, first: int, count: int) -> "Auxiliary":
         """Return the entries that become available with some successive frames."""
         return Auxiliary(
-            self.directions.known_at(first, count), self.embeddings.known_at(first, count)
+            self.directions.available_at(first, count), self.embeddings.available_at(first, count)
         )
 
     def followed_by(self, later: "Auxiliary") -> "Auxiliary":

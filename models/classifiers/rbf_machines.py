@@ -275,7 +275,7 @@ class SvmMachine:
         self._scaled = Scaler(model.arrays)
         self._intercepts = model.arrays["intercepts"]
         self._count = len(model.classes)
-        self._tells_novelty = model.description.novelty == "machine"
+        self._has_novelty = model.description.novelty == "machine"
         self._distances = _distances(model)
         self._blocks = self._support(model)
         self._home_blocks = self._of_home(model)
@@ -302,12 +302,12 @@ class SvmMachine:
         vector; NaN if the novelty is not computed.
         """
         count = len(rows.values)
-        nearest = np.full(count, -np.inf if self._tells_novelty else np.nan)
+        nearest = np.full(count, -np.inf if self._has_novelty else np.nan)
         against = np.zeros((self._count, count, self._count - 1))
         others = np.zeros((count, 1))
         for vectors, parts in self._blocks:
             exponents = self._distances.between(rows, vectors)
-            if self._tells_novelty:
+            if self._has_novelty:
                 np.maximum(nearest, exponents.max(axis=1), out=nearest)
             if self._home_blocks:
                 sharp = np.exp(HOME_SHARPNESS * exponents)

@@ -47,7 +47,7 @@ class FrameSpans:
         """Return the chosen spans."""
         return type(self)(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
-    def known_at(self, first: int, count: int) -> Self:
+    def available_at(self, first: int, count: int) -> Self:
         """Return the spans that are completed by some successive frames."""
         begin, end = np.searchsorted(self.last_frames, [first, first + count])
         return self.rows(slice(begin, end))

@@ -266,10 +266,10 @@ def read_network_file(network: EmbeddingNetwork, path: Path) -> tuple[bytes, str
     with suppress(OSError):  # the error is raised on reading
         size = path.stat().st_size
         if path.is_file() and size not in sizes:
-            known = " or ".join(f"{each:,}" for each in sorted(sizes))
+            sizes_text = " or ".join(f"{each:,}" for each in sorted(sizes))
             raise ModelError(
                 f"{path}: is not the network {network.name}, or not all of it: it has {size:,} "
-                f"bytes, not {known}; {remedy}"
+                f"bytes, not {sizes_text}; {remedy}"
             )
     data = read_limited(path, "network", max(sizes), ModelError)
     sha256 = hashlib.sha256(data).hexdigest()

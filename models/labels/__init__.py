@@ -166,7 +166,7 @@ class SegmenterInput(NamedTuple):
     probabilities: Float32  # [shape=(n, C)]
     powers: NDArray[Any]  # [shape=(n,)] mean squares of the samples
     stamps: Int64  # [shape=(n,)] starts of the frames in nanoseconds of UTC
-    known_at: Int64  # [shape=(n,)] starts of the frames that completed the probabilities
+    decided_at: Int64  # [shape=(n,)] starts of the frames that completed the probabilities
 
     def followed_by(self, later: "SegmenterInput") -> "SegmenterInput":
         """Concatenate these frames and later frames."""
@@ -174,7 +174,7 @@ class SegmenterInput(NamedTuple):
             np.concatenate([self.probabilities, later.probabilities]),
             np.concatenate([self.powers, later.powers]),
             np.concatenate([self.stamps, later.stamps]),
-            np.concatenate([self.known_at, later.known_at]),
+            np.concatenate([self.decided_at, later.decided_at]),
         )
 
     def part(self, frames: slice) -> "SegmenterInput":
@@ -183,7 +183,7 @@ class SegmenterInput(NamedTuple):
             self.probabilities[frames],
             self.powers[frames],
             self.stamps[frames],
-            self.known_at[frames],
+            self.decided_at[frames],
         )
 
 
@@ -254,7 +254,7 @@ class Segmenter:
         count = len(refined)
         self._decided += count
         self._undecided = frames.part(slice(count, None))
-        segments = self._merge(refined, frames.part(slice(count)), frames.known_at[self._delay :])
+        segments = self._merge(refined, frames.part(slice(count)), frames.decided_at[self._delay :])
         converged_at = self._converged_at
         self.segments_converged |= converged_at is not None and any(
             segment.end > converged_at for segment in segments

@@ -30,7 +30,7 @@ class FrameLabels(NamedTuple):
     frames: Int64  # [shape=(n,)] numbers of the frames
     stamps: Int64  # [shape=(n,)] starts of the frames in nanoseconds of UTC
     # [shape=(n,)] starts of the last frames of the windows, which complete the labels
-    known_at: Int64
+    decided_at: Int64
     probabilities: Float32  # [shape=(n, C)]
     # [shape=(n, C)] probabilities from the features alone, which the privacy filter uses
     by_features: Float32
@@ -213,7 +213,7 @@ class Labeller:
             self.classes,
             np.arange(first, first + count)[again:],
             labelled.stamps[again:],
-            labelled.known_at[again:],
+            labelled.decided_at[again:],
             labelled.probabilities[again:],
             by_features.probabilities[again:],
             novelty[again:],
@@ -255,7 +255,7 @@ class Labeller:
             evidence = np.concatenate([self._pending_evidence, evidence])
         count = max(len(pending.stamps) - ahead, 0)
         self._pending = pending.part(slice(count, None))
-        complete = pending.part(slice(count))._replace(known_at=pending.known_at[ahead:])
+        complete = pending.part(slice(count))._replace(decided_at=pending.decided_at[ahead:])
         if evidence is not None:
             evidence, self._pending_evidence = evidence[:count], evidence[count:]
         return complete, evidence

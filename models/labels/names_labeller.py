@@ -120,7 +120,7 @@ class NamesLabeller:
             self.classes,
             frames,
             labelled.stamps,
-            labelled.known_at,
+            labelled.decided_at,
             labelled.probabilities,
             labelled.probabilities,
             np.full(count, np.nan, np.float32),

@@ -192,7 +192,7 @@ class EmbeddingPrivacyFilter:
         """Return the embeddings that end with these frames and may be logged."""
         private = np.append(self._private, frames.private)
         self._private = private[1 - WINDOW_FRAMES :]
-        ended = self._held.known_at(frames.first, len(frames.stamps))
+        ended = self._held.available_at(frames.first, len(frames.stamps))
         self._held = self._held.rows(slice(len(ended.frames), None))
         if not len(ended.frames):
             return ended

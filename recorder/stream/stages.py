@@ -232,7 +232,7 @@ class LabelStream:
         columns = labels.columns(self._microphone)
         return [
             *self._segment_messages(segments),
-            *self._messages("label", message_types.LABEL, labels.known_at, columns),
+            *self._messages("label", message_types.LABEL, labels.decided_at, columns),
         ]
 
     def close(self, end: int) -> list[EncodedMessage]:

@@ -28,7 +28,7 @@ THINNED = "thinned"  # message kinds dropped from a log
 THINNED_OF = "thinned_of"  # digests of the log before each thinning
 _VERSION_KEY = "schema_version"
 _FIRST = "1"  # the first version did not write its number
-_KNOWN = {str(number): number for number in range(1, SCHEMA_VERSION + 1)}
+_SCHEMA_VERSIONS = {str(number): number for number in range(1, SCHEMA_VERSION + 1)}
 _LARGEST, _MOST = 1 << 20, 64 << 20  # bytes per record and in total; hearthlog's have below 1000
 
 
@@ -71,7 +71,7 @@ def version_text(record: Mapping[str, str]) -> str:
 
 def schema_version(record: Mapping[str, str]) -> int | None:
     """Return the schema version of a record; None if this version does not support it."""
-    return _KNOWN.get(version_text(record))
+    return _SCHEMA_VERSIONS.get(version_text(record))
 
 
 def describes_model(record: Mapping[str, str]) -> bool:

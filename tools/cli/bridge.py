@@ -183,7 +183,7 @@ def replay(
         activity = read_activity(
             home, settings.node, first - longest, last, losses.append, progress
         )
-    hidden = home.never_tell().union(map(class_name, settings.never_tell))
+    hidden = home.hidden_classes().union(map(class_name, settings.never_tell))
     found = {rule.name: notifications(rule, activity, first, last, zone)[0] for rule in own.alert}
     found |= {rule.name: [] for rule in own.alert if is_hidden(rule, hidden)}
     microphones = {source_microphone(name) for name in activity.coverage}

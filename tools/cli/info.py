@@ -262,7 +262,7 @@ def _zone_and_hidden(logs: "HomeLogs") -> "tuple[tzinfo, frozenset[str]]":
     if not logs.entries:
         return UTC, frozenset()
     try:
-        hidden = logs.never_tell()
+        hidden = logs.hidden_classes()
     except LogError as error:
         print_notice(str(error))
         return UTC, frozenset()

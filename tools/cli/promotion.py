@@ -33,7 +33,7 @@ def print_changes(changes: "LabelChanges", before: str, after: str) -> None:
     print_table((changes.each.strip() or "in all", before, after), rows)
 
 
-_WHOLE_DAY = 0.95 * 24 * 60  # minutes
+_COMPLETE_DAY = 0.95 * 24 * 60  # minutes
 
 
 def print_verdict(verdict: "Verdict", home: Sequence[Path], model: str) -> None:
@@ -75,7 +75,7 @@ def _print_changes(evidence: "HomeComparison", model: str, champion: str) -> Non
     period = "" if changes.each else f" of the {time_words(evidence.recorded)} recorded"
     day = changes.minutes.sum()
     mean = f" (a day: the {time_words(day)} that a mean day with logs has)"
-    end = (mean if changes.each and day < _WHOLE_DAY else "") + end
+    end = (mean if changes.each and day < _COMPLETE_DAY else "") + end
     print(
         f"\n{model} in place of {champion} would change{much}{period}, judged by "
         f"{time_words(evidence.minutes)} of the last two weeks that it was not trained on{end}"

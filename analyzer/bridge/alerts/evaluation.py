@@ -154,9 +154,9 @@ def _too_long(rule: MoreThan, events: SoundEvents, until: int) -> Spans:
     if len(edges) < 2:
         return joined(edges[:0], edges[:0])
     amounts = _sum_to(spans, edges) - _sum_to(spans, edges - rule.window)
-    known = np.searchsorted(events.counted, edges, side="right")
+    counted = np.searchsorted(events.counted, edges, side="right")
     gone = np.searchsorted(events.counted, edges - rule.window, side="right")
-    amounts, lengths_of = (amounts + lump * (known - gone))[:-1], np.diff(edges)
+    amounts, lengths_of = (amounts + lump * (counted - gone))[:-1], np.diff(edges)
     now, earlier = (rows_at(spans, times[:-1]) >= 0 for times in (edges, edges - rule.window))
     slopes = now.astype(np.int64) - earlier
     missing = np.where(slopes > 0, np.maximum(most - amounts, 0), 0)

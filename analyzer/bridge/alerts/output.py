@@ -56,8 +56,8 @@ class RuleProgressStore:
 
     def load(self, rules: Sequence[AlertRule]) -> dict[str, RuleState]:
         """Return the states of rules by name."""
-        known = self._entry.load() or {}
-        return {rule.name: known.get(rule.fingerprint, RuleState()) for rule in rules}
+        saved = self._entry.load() or {}
+        return {rule.name: saved.get(rule.fingerprint, RuleState()) for rule in rules}
 
     def save(self, rules: Sequence[AlertRule], states: Mapping[str, RuleState]) -> None:
         """Save the states of rules; they are on disk on return."""
@@ -89,7 +89,7 @@ class RuleWatch:
         self._report = report
         self._progress = memory.load(rules)
         self._saved = now
-        self.never_tell: frozenset[str] = frozenset()  # classes whose rules never notify
+        self.hidden_classes: frozenset[str] = frozenset()  # classes whose rules never notify
         self.reset_stale_progress(now)
 
     def reset_stale_progress(self, now: int) -> None:
@@ -127,7 +127,7 @@ class RuleWatch:
             own = self._progress[rule.name]
             if until - own.until < _EVERY:
                 continue
-            if is_hidden(rule, self.never_tell):
+            if is_hidden(rule, self.hidden_classes):
                 self._progress[rule.name] = replace(own, until=until, has_rung=False)
                 continue
             if isinstance(rule, DailyRule):
@@ -225,7 +225,7 @@ class AlertsOutput:
             if microphone.label:
                 label = LiveLabel(microphone.active.time, microphone.label, microphone.confidence)
                 self._labels.append((microphone.name, label, microphone.classes))
-        self._watch.never_tell = update.state.never_tell
+        self._watch.hidden_classes = update.state.hidden_classes
         self._columns += update.columns
         self._has_news.set()
         if self._on_notification is not None:
@@ -321,10 +321,10 @@ class AlertsOutput:
                 forgot = time.monotonic()
 
     def _push(self, columns: Columns) -> None:
-        known = columns.between(None, self._now() + _TO_COME)
-        if len(known) < len(columns):
+        past = columns.between(None, self._now() + _TO_COME)
+        if len(past) < len(columns):
             self._report("alerts: was the clock ahead? segments in the future are left out")
-        self._activity.push([known])
+        self._activity.push([past])
 
     def _look(self) -> None:
         if not self._has_news.is_set() and time.monotonic() - self._began < _WAIT_SECONDS:
@@ -335,7 +335,7 @@ class AlertsOutput:
             if label.time < now + _TO_COME:
                 self._activity.add_label(name, label, classes)
         self._watch.evaluate(
-            self._activity.activity, self._weeks, self._activity.known_until(now), now
+            self._activity.activity, self._weeks, self._activity.complete_until(now), now
         )
         if time.monotonic() - self._began >= _WAIT_SECONDS:
             unknown = (unknown_class(rule, self._activity.classes) for rule in self._rules)

@@ -73,9 +73,9 @@ def unknown_microphone(
     return f"{rule.name}: {lacks}; there is {listed(sorted(microphones))}"
 
 
-def hidden_class(rule: AlertRule, never_tell: Collection[str]) -> str:
+def hidden_class(rule: AlertRule, hidden: Collection[str]) -> str:
     """Report that nobody is told of the class of a rule; empty if it is not hidden."""
-    if not is_hidden(rule, never_tell):
+    if not is_hidden(rule, hidden):
         return ""
     return (
         f"{rule.name}: {rule.words.lower()} is hidden (never_tell, or the page of the home), so it "
@@ -93,10 +93,10 @@ def rule_doubts(
 
     Names are not checked if no configured microphones are given.
     """
-    never_tell = set(map(class_name, settings.never_tell))
+    hidden = set(map(class_name, settings.never_tell))
     for rule in rules:
         lines = (
-            hidden_class(rule, never_tell),
+            hidden_class(rule, hidden),
             unknown_microphone(rule, microphones),
             impossible_amount(rule),
         )

@@ -267,9 +267,9 @@ def _check_names(rules: list[AlertRule]) -> list[AlertRule]:
 AlertRules = Annotated[list[AlertRule], AfterValidator(_check_names), Field(max_length=100)]
 
 
-def is_hidden(rule: AlertRule, never_tell: Collection[str]) -> TypeGuard[SoundRule]:
+def is_hidden(rule: AlertRule, hidden: Collection[str]) -> TypeGuard[SoundRule]:
     """Whether a rule is of a class that nobody is told of, so that the rule never notifies."""
-    return isinstance(rule, SoundRule) and rule.label in never_tell
+    return isinstance(rule, SoundRule) and rule.label in hidden
 
 
 def pause_of(rule: SoundRule) -> int:

@@ -134,8 +134,8 @@ class Connection:
                 return
             del self._unsent[topic]
         while self._events and self._is_answering():
-            known, topic, payload = self._events[0]
-            timely = time.monotonic() - known <= _TIMELY_SECONDS
+            queued, topic, payload = self._events[0]
+            timely = time.monotonic() - queued <= _TIMELY_SECONDS
             if timely and not self._publish(topic, payload, retain=False):
                 return
             self._events.popleft()

@@ -263,12 +263,12 @@ class MqttPublisher:
         if self._forgotten and self._connection.is_taken():
             self._announced.remove(self._forgotten)
             self._forgotten.clear()
-        known = {each.name for each in state.every()}
+        present = {each.name for each in state.every()}
         for topic, key in list(self._announced.topics.items()):
             if self._is_gone(topic, key, state):
                 self._connection.forget(topic)
                 self._forgotten.add(topic)
-            elif key.kind == "listening" and key.microphone not in known:
+            elif key.kind == "listening" and key.microphone not in present:
                 self._connection.keep(topic, _ONLINE[False])  # no recent messages
 
     def _is_gone(self, topic: str, key: TopicKey, state: HomeState) -> bool:

@@ -164,11 +164,13 @@ def _missing_classes(home: HomeDay) -> str:
     if not home.microphones or not all(each.names for each in home.microphones):
         return ""
     words = home.words
-    known = {each.common_names.get(name, name) for each in home.microphones for name in each.names}
-    hidden = frozenset[str]().union(*(each.never_tell for each in home.microphones))
-    missing = _EXPECTED - known - hidden
+    covered = {
+        each.common_names.get(name, name) for each in home.microphones for name in each.names
+    }
+    hidden = frozenset[str]().union(*(each.hidden_classes for each in home.microphones))
+    missing = _EXPECTED - covered - hidden
     notes = []
-    if RUNNING_WATER in known and (joined_classes := missing & {*WATER}):
+    if RUNNING_WATER in covered and (joined_classes := missing & {*WATER}):
         missing -= {*WATER}
         water = words.inside(words.class_words(RUNNING_WATER))
         classes = _listed_classes(joined_classes, words)
@@ -184,20 +186,20 @@ def _listed_classes(names: Iterable[str], words: Translation) -> str:
 
 def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
     times_of_day = home.times_of_day()
-    known = [_is_known(microphone, part, day, home.moment.now) for part in times_of_day]
+    covered = [_is_covered(microphone, part, day, home.moment.now) for part in times_of_day]
     gaps = _gaps(microphone, day, home)
     return {
         "room": room(microphone.name),
         "gaps": [(day.place(a), day.place(b)) for a, b in gaps],
         "unheard": _gaps_in_words(gaps, home),
         "lanes": [
-            _lane(label, sounds, home, [*zip(times_of_day, known, strict=True)])
+            _lane(label, sounds, home, [*zip(times_of_day, covered, strict=True)])
             for label, sounds in home.sounds(microphone, 0).items()
         ],
     }
 
 
-def _is_known(microphone: LiveMicrophone, part: TimeOfDay, day: DaySpan, now: int) -> bool:
+def _is_covered(microphone: LiveMicrophone, part: TimeOfDay, day: DaySpan, now: int) -> bool:
     """Whether a part of the day was listened to enough for a count of 0."""
     share = microphone.listened_share(part.start, min(part.end, now))
     return share >= MOST if part.start == day.start else share > 0
@@ -231,8 +233,8 @@ def _lane(
     counted = [e for e in sounds.counted if e.start < day.end]
     of_parts = [[e for e in counted if part.start <= e.start < part.end] for part, _ in parts]
     counts = [
-        len(own) if own or is_known else None
-        for own, (_, is_known) in zip(of_parts, parts, strict=True)
+        len(own) if own or is_covered else None
+        for own, (_, is_covered) in zip(of_parts, parts, strict=True)
     ]
     of_day = [event for own in of_parts for event in own]
     count = len(of_day) if of_day or None not in counts else None
@@ -346,8 +348,8 @@ def _sentence_of_day(home: HomeDay) -> str:
     when = "" if home.is_past else words.text("since", time=clock(start, home.zone))
     if any(name in IMPORTANT for name in found):
         return _sentence(when, found, home)
-    known = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
-    names = [words.inside(words.class_words(name)) for name in ordered(known)]
+    covered = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
+    names = [words.inside(words.class_words(name)) for name in ordered(covered)]
     if not names:
         return _sentence(when, found, home) if found else ""
     key = "day.past none" if home.is_past else "day.none"

@@ -187,7 +187,7 @@ class HomePage:
             self._events = {event.id: event for event in every}
             self._doubtful = doubtful(microphones, every)
             folded = bouts(
-                every, events_to_review(doubts, self._doubtful, every, update.state.never_tell)
+                every, events_to_review(doubts, self._doubtful, every, update.state.hidden_classes)
             )
             self._bouts = {bout.first.id: bout for bout in folded}
             self._uncounted = uncounted_ids(microphones, every)
@@ -236,10 +236,10 @@ class HomePage:
         shown = shown._replace(
             common_names=update.state.common_names,
             uncounted=self._uncounted,
-            hidden=update.state.never_tell,
+            hidden=update.state.hidden_classes,
         )
         every = [shown.describe(bout) for bout in self._latest()]
-        hidden = ordered(update.state.never_tell)
+        hidden = ordered(update.state.hidden_classes)
         return {
             "events": every,
             "classes": [(label, words.class_words(label)) for label in names if is_sound(label)],
@@ -305,7 +305,7 @@ class HomePage:
             for state in states
             for each in state.every()
             for label in each.all_labels()
-            if label in self._state.never_tell
+            if label in self._state.hidden_classes
             for other in each.events(label, event.start - _DAY)
         ]
         return self._sounds.wav(event, hidden)
@@ -316,14 +316,14 @@ class HomePage:
         if event is None:
             past = self._past.find_event(identifier)
             event = None if past is None else past[1]
-        return None if event is None or event.label in self._state.never_tell else event
+        return None if event is None or event.label in self._state.hidden_classes else event
 
     def _day(self, text: str, words: Translation) -> Any:
         try:
             requested = date.fromisoformat(text)
         except ValueError as error:
             raise BridgeError("There are no logs of this day.") from error
-        day = self._past.read(requested, self._state.never_tell)
+        day = self._past.read(requested, self._state.hidden_classes)
         moment, zone = day.moment, self._home.zone
         microphones = [*day.state.microphones.values()]
         given = self._state.corrections.of_day(day.marks)
@@ -334,13 +334,13 @@ class HomePage:
         shown = shown._replace(
             common_names=day.state.common_names,
             uncounted=uncounted_ids(microphones, events),
-            hidden=self._state.never_tell,
+            hidden=self._state.hidden_classes,
             is_past=True,
         )
         return picture_of(home) | {"events": [shown.describe(b) for b in every[:_MOST_OF_DAY]]}
 
     def _past_bouts(self, day: PastDay, events: Sequence[SoundEvent]) -> list[Bout]:
-        microphones, hidden = day.state.microphones.values(), self._state.never_tell
+        microphones, hidden = day.state.microphones.values(), self._state.hidden_classes
         unsure = doubtful(microphones, events)
         return bouts(events, events_to_review(day.doubts, unsure, events, hidden))
 
@@ -392,7 +392,7 @@ class HomePage:
 def _classes_key(update: OutputUpdate) -> Any:
     """Return a key that changes whenever the shown classes change."""
     microphones = update.state.microphones.values()
-    return update.state.never_tell, [(each.name, each.classes) for each in microphones]
+    return update.state.hidden_classes, [(each.name, each.classes) for each in microphones]
 
 
 def _events_key(update: OutputUpdate) -> Any:
@@ -400,7 +400,7 @@ def _events_key(update: OutputUpdate) -> Any:
     return (
         update.today.midnight,
         update.today.night,
-        update.state.never_tell,
+        update.state.hidden_classes,
         [
             (each.name, [(n, each.last_event(n), len(each.events(n, 0))) for n in each.labels()])
             for each in update.state.microphones.values()

@@ -61,7 +61,7 @@ class PastDays:
         """Return the days that have logs, the newest first; an evening is of the next day."""
         return sorted(self._days_of(self._logs()), reverse=True)
 
-    def read(self, day: date, never_tell: frozenset[str]) -> PastDay:
+    def read(self, day: date, hidden_classes: frozenset[str]) -> PastDay:
         """Read a day, unless it was read in the last five minutes.
 
         Raise `BridgeError` if there are no logs of the day.
@@ -77,7 +77,7 @@ class PastDays:
             self._days.move_to_end(day)
             while len(self._days) > _MOST_DAYS:
                 self._days.popitem(last=False)
-            found.state.never_tell = never_tell
+            found.state.hidden_classes = hidden_classes
             return found
 
     def find_event(self, identifier: str) -> tuple[PastDay, SoundEvent] | None:

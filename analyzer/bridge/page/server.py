@@ -99,8 +99,8 @@ class PageAdmission:
         if origins and not self._is_own(origins[0].lower(), host):
             return words.text("refusal.origin")
         cookies = self._cookies(fields["Cookie"])
-        is_known = has_pass or has_token(target, self.token) or any(map(self.is_pass, cookies))
-        if self.ingress or is_known:
+        is_admitted = has_pass or has_token(target, self.token) or any(map(self.is_pass, cookies))
+        if self.ingress or is_admitted:
             return ""
         reasons = ["refusal.address"]
         if target.startswith("/?token="):

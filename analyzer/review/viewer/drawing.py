@@ -200,7 +200,7 @@ class RequestedSpan(DrawnLane):
         super().__init__(f"{REQUESTED}/selected", *_SELECTED_PLACE)
         self._number, self._span, self._text = 0, (0, 0), ""
 
-    def ask(self, start: int, end: int, question: Question, canvas: Canvas) -> None:
+    def show_question(self, start: int, end: int, question: Question, canvas: Canvas) -> None:
         """Draw the span (ns of UTC) and its question, in place of the previous ones."""
         if self._number:
             canvas.hide(self._entity)
@@ -427,9 +427,9 @@ def _axis() -> rrb.TimeAxis:
 
 
 def review_layout(
-    timeline: Timeline, *, marking: bool = False, close_up: bool = False, asks: bool = False
+    timeline: Timeline, *, marking: bool = False, close_up: bool = False, has_question: bool = False
 ) -> TimelineBlueprint:
-    """Lay out the views of a review; with `asks`, the question of a span is above all.
+    """Lay out the views of a review; with `has_question`, the question of a span is above all.
 
     Raise `DataError` if the timeline's time zone is unknown.
     """
@@ -465,7 +465,7 @@ def review_layout(
     )
     height = max(sum(height for height, _ in rows) for rows in stacks.values())
     words = rrb.Horizontal(text_view(QUESTION), text_view(ANSWERS), column_shares=_QUESTION_COLUMNS)
-    question: list[Row] = [(_QUESTION_HEIGHT, words)] if asks else []
+    question: list[Row] = [(_QUESTION_HEIGHT, words)] if has_question else []
     question.append((_REQUESTED_HEIGHT, _requested_view()))
     homes = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []

@@ -168,8 +168,8 @@ class Viewer(ABC):
         self._process.wait_until_it_listens()
         rr.set_strict_mode(True)
         self._sent = True
-        asks = close_up and not self.address  # a page has the question next to its buttons
-        layout = review_layout(timeline, marking=True, close_up=close_up, asks=asks)
+        has_question = close_up and not self.address  # a page has the question next to its buttons
+        layout = review_layout(timeline, marking=True, close_up=close_up, has_question=has_question)
         self._lanes_share = layout.lanes_share
         self._recording.connect_grpc(self._process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
@@ -206,11 +206,11 @@ class Viewer(ABC):
         self._close = joined(np.append(starts, grid.start), np.append(ends, grid.end))
         self._flush()
 
-    def ask(self, start: int, end: int, question: Question) -> None:
+    def show_question(self, start: int, end: int, question: Question) -> None:
         """Draw the requested span, in place of the previous one."""
         if not self.address:
             question = question._replace(keys_in="Press in the terminal")
-        self._requested.ask(start, end, question, self._canvas)
+        self._requested.show_question(start, end, question, self._canvas)
         self._flush()
 
     def clear_question(self) -> None:

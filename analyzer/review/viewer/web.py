@@ -127,7 +127,7 @@ class Relay:
     size: ViewerSize | None = None  # of the viewer in the page
     _numbers: Iterator[int] = field(default_factory=lambda: count(1))
 
-    def ask(self, request: bytes) -> bytes:
+    def request(self, request: bytes) -> bytes:
         """Send a request to the page, and wait for its answer.
 
         Raise `TimeoutError` if there is no answer within 15 seconds. Raise `ConnectionError` if the
@@ -287,7 +287,7 @@ class _PageViewer(Viewer):
         server.start()
 
     def state(self) -> ViewerState:
-        state = self._ask(_STATE)
+        state = self._request(_STATE)
         views, active = _messages(state, 5), _text(state, 2)
         reports = [(_text(view, 3), each) for view in views for each in _messages(view, 6)]
         errors = [f"{view}: {_text(report, 2)}" for view, report in reports]
@@ -303,8 +303,8 @@ class _PageViewer(Viewer):
     ) -> None:
         self._relay.keys, self._relay.press, self._relay.sound = keys, press, sound
 
-    def ask(self, start: int, end: int, question: Question) -> None:
-        super().ask(start, end, question)
+    def show_question(self, start: int, end: int, question: Question) -> None:
+        super().show_question(start, end, question)
         self._relay.texts.put(question)
 
     def announce(self, text: str) -> None:
@@ -318,22 +318,22 @@ class _PageViewer(Viewer):
         return self._relay.size
 
     def _blueprint(self) -> Blueprint:
-        blueprint: Any = json.loads(_text(self._ask(_BLUEPRINT), 2))
+        blueprint: Any = json.loads(_text(self._request(_BLUEPRINT), 2))
         return blueprint if isinstance(blueprint, dict) else {}
 
     def _set_blueprint(self, blueprint: Blueprint) -> None:
         text = json.dumps(blueprint).encode()
-        self._ask(_SET_BLUEPRINT, _field(2, text) + _field(_ON_RECORDING, b""))
+        self._request(_SET_BLUEPRINT, _field(2, text) + _field(_ON_RECORDING, b""))
 
     def _set_time(self, nanoseconds: int, *, play: bool) -> None:
         timeline = _field(2, _field(1, self._clock.name.encode()))
         time = _field(3, _field(1, nanoseconds))
         state = _field(5, _PLAYING if play else _PAUSED)
-        self._ask(_SET_TIME, timeline + time + state)
+        self._request(_SET_TIME, timeline + time + state)
 
-    def _ask(self, operation: int, request: bytes = b"") -> bytes:
+    def _request(self, operation: int, request: bytes = b"") -> bytes:
         """Let the viewer in the page do an operation; return its answer."""
-        return _message(self._relay.ask(_field(operation, request)), operation)
+        return _message(self._relay.request(_field(operation, request)), operation)
 
 
 def open_page(port: int | None = None, data: str | None = None) -> Viewer:

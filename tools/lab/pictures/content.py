@@ -83,11 +83,11 @@ def queue_text(logs: Path) -> str:
     start, end = grid.start + 10 * NANOSECONDS, grid.start + 13 * NANOSECONDS
     drawn = Drawn()
     canvas = Canvas(drawn, timeline.clock)
-    drawn.add_layout(review_layout(timeline, marking=True, close_up=True, asks=True))
+    drawn.add_layout(review_layout(timeline, marking=True, close_up=True, has_question=True))
     draw(timeline, canvas)
     draw_close_up(read_timeline([logs], start - _MARGIN, end + _MARGIN), NONE, canvas)
     question = Question("Music?", "1 of 10", [Key("a", "yes"), Key("n", "skip")])
-    RequestedSpan().ask(start, end, question, canvas)
+    RequestedSpan().show_question(start, end, question, canvas)
     return drawn.text()
 
 

@@ -89,9 +89,11 @@ class TypeChecks:
             for end in ends:
                 theirs = str(end.topic_type_hash)
                 if theirs.startswith("RIHS01_") and theirs != expected:
-                    self._tell(topic, end.node_name, end.topic_type, theirs, expected)
+                    self._report_mismatch(topic, end.node_name, end.topic_type, theirs, expected)
 
-    def _tell(self, topic: str, node: str, name: str, theirs: str, expected: str) -> None:
+    def _report_mismatch(
+        self, topic: str, node: str, name: str, theirs: str, expected: str
+    ) -> None:
         if (topic, node, theirs) in self._reported:
             return
         self._reported.add((topic, node, theirs))
