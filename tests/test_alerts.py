@@ -562,9 +562,9 @@ def test_a_replay_prints_each_ring_and_how_often_each_rule_rings(two_days, heart
             "33 % of that time was recorded"
         ),
         "",
-        "name       rule       rings  a week  not known",
-        "coughs     more_than      1     3.6          0",
-        "no speech  none_by        2     7.1          1",
+        "name       rule       alerts  a week  not known",
+        "coughs     more_than       1     3.6          0",
+        "no speech  none_by         2     7.1          1",
         "2 days, 2026-03-02 02:00 to 2026-03-04 01:00, Europe/Vienna",
     ]
 

@@ -246,7 +246,7 @@ class PrometheusSettings(_Table):
 class PageSettings(_Table):
     """A page of the home, for a browser."""
 
-    port: _Port = Field(default=8380, description="Where it is.")
+    port: _Port = Field(default=8380, description="TCP port of the page.")
     bind: Annotated[str, AfterValidator(_check_bind)] = Field(
         default="127.0.0.1",
         description="Address of this machine to listen on; may be other than loopback.",

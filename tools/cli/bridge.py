@@ -248,7 +248,7 @@ def _print(
         for rule in rules
         for own in [found[rule.name]]
     ]
-    print_table(("name", "rule", "rings", "a week", "not known"), rows, words=2)
+    print_table(("name", "rule", "alerts", "a week", "not known"), rows, words=2)
     print(f"{_days(weeks)}, {_local(span[0], zone)} to {_local(span[1], zone)}, {zone}")
 
 

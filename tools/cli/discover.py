@@ -58,7 +58,7 @@ def discover(
     ] = "all",
     start: Start = None,
     end: End = None,
-    least: Annotated[int, typer.Option(help="Sounds of a group, at least.", min=2)] = 8,
+    least: Annotated[int, typer.Option(help="Minimum number of sounds in a group.", min=2)] = 8,
     groups: Annotated[
         Path | None,
         typer.Option(
@@ -76,7 +76,10 @@ def discover(
         list[int] | None,
         typer.Option(help="Remove the name of a group, and its marks; may be repeated."),
     ] = None,
-    reviewer: Annotated[str | None, typer.Option(help="Who names.", show_default="you")] = None,
+    reviewer: Annotated[
+        str | None,
+        typer.Option(help="Name recorded as the reviewer of the marks.", show_default="you"),
+    ] = None,
     timezone: Timezone = None,
     as_json: Json = False,
 ) -> None:

@@ -61,12 +61,14 @@ def scenes(
     *,
     data: Clips,
     scenes: Annotated[int, typer.Option(min=1, max=100, help="Number of scenes.")] = 3,
-    minutes: Annotated[float, typer.Option(min=0.25, max=60, help="Length of each.")] = 30.0,
+    minutes: Annotated[
+        float, typer.Option(min=0.25, max=60, help="Length of a scene in minutes.")
+    ] = 30.0,
     floor: Annotated[
         float, typer.Option(min=-120, max=0, help="Level of the noise in dBFS.")
     ] = -70.0,
     colour: Annotated[
-        Literal["white", "pink", "brown"], typer.Option(help="Of the noise.")
+        Literal["white", "pink", "brown"], typer.Option(help="Spectrum of the noise.")
     ] = "white",
     gain: Annotated[float, typer.Option(min=-60, max=60, help="Level of the clips in dB.")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the scenes.")] = 10,

@@ -157,7 +157,10 @@ def diff(
     *,
     queue: Annotated[
         bool,
-        typer.Option("--queue", help="List spans of a worth a review: unsure, differing, novel."),
+        typer.Option(
+            "--queue",
+            help="List the spans of labelling A to review first: unsure, differing, novel.",
+        ),
     ] = False,
     spans: Annotated[
         int | None,

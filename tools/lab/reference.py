@@ -14,33 +14,37 @@ _HEAD = """\
     hearthlog config --config home.toml
     hearthlog config check home.toml
 
-A configuration is a TOML file of the keys below, all of which may be left out. `HEARTHLOG_` and
-the name of a key is a variable of the environment, with lists and tables as JSON. An option of
-the command line goes before the environment, that before the file, and that before the default.
+The configuration is a TOML file with the keys below. All keys are optional. An environment variable
+`HEARTHLOG_` plus the name of a key in capitals sets that key; lists and tables are written as JSON.
+Command-line options take precedence over environment variables, these over the file, and the file
+over the defaults.
 
-`hearthlog config` prints all values in force, and where each comes from: the line of the file, a
-variable, or the default. Passwords of addresses are left out. `hearthlog config check` starts
-nothing, and says all that is wrong, each in a line with what to write: exit status 2 if a value
-makes no sense, 1 if a model, the folder, a file or a package that is named cannot be used, 3 if
-everybody on this machine may read a file with secrets, a file is not here that may be a credential
-of the service, an [alert](alerts.md) cannot ring, nobody reads a `text_file`, or something is
-deprecated.
-`hearthlog config schema > home.schema.json` writes a JSON schema, by which editors check and
+`hearthlog config` prints the values in force and the origin of each: a line of the file, a
+variable, or the default. It omits passwords in addresses. `hearthlog config check` starts nothing
+and prints one line for each problem, with the remedy. Its exit status is
+
+- 2 if a value is invalid;
+- 1 if a model, a folder, a file or a package cannot be used;
+- 3 if everybody on this machine may read a file with secrets, a file is missing that may be a
+  credential of the service, an [alert](alerts.md) can never trigger, nobody reads a `text_file`, or
+  something is deprecated.
+
+`hearthlog config schema > home.schema.json` writes a JSON schema. Editors use it to check and
 complete the file if its first line is `#:schema ./home.schema.json`.
 
-At SIGHUP the recorder reads the file again. If the configuration has changed it completes its log
-and starts again, with a gap of a second or two that says so; if it is wrong, a line on standard
-error says why, and it goes on as before.
+On SIGHUP the recorder reads the file again. If the configuration has changed, the recorder
+completes its log and restarts, with a recorded gap of a second or two. If the file is invalid, the
+recorder prints the error to standard error and continues unchanged.
 """
 
 
 _BRIDGE = """
 ## The bridge
 
-The tables of [the bridge](bridge.md) may stand in the same file: the recorder ignores them,
-and writes none of them into a log. Each is an output; without one nothing is sent.
-`state`, in the table `[bridge]` itself, is the folder of what the bridge has to remember: by
-default that of systemd, or `bridge` beside the logs. The tables `[[bridge.alert]]` are
+The tables of [the bridge](bridge.md) may be in the same file: the recorder ignores them,
+and writes none of them into a log. Each table is an output; without one nothing is sent.
+`state`, in the table `[bridge]` itself, is the folder of the persistent state of the bridge: by
+default that of systemd, or `bridge` next to the logs. The tables `[[bridge.alert]]` are
 [the rules of alerts](alerts.md#rules).
 """
 _TABLES = ("mqtt", "prometheus", "page", "ping", "delivery")
@@ -58,7 +62,7 @@ def configuration_page() -> str:
             "",
             "## A microphone",
             "",
-            "Each table `[[microphone]]` is one. Without any there is the default one: `mic`.",
+            "Each table `[[microphone]]` is a microphone. The default is one microphone, `mic`.",
             "",
             *_table(microphone["properties"]),
             _BRIDGE,
