@@ -319,7 +319,8 @@ def _digest(path: Path) -> str:
 def _check_folder(folder: Path) -> None:
     if not folder.is_dir():
         raise ModelError(
-            f"{folder}: no such folder of models; create it, and put model files there"
+            f"{folder}: no such folder of models; `hearthlog train -o {folder}/NAME.safetensors` "
+            "makes it"
         )
 
 

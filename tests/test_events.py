@@ -14,7 +14,7 @@ import pytest
 import sounddevice
 import soundfile
 from conftest import HEARTHLOG
-from homelife import GENERAL, at, midnight, write_day
+from homelife import BATHROOM, GENERAL, at, midnight, write_day
 from log_fixtures import run
 from waiting import wait_for
 
@@ -178,6 +178,12 @@ def test_a_sound_that_two_rooms_hear_is_one_and_names_both(home, hearthlog):
     ("words", "output"),
     [
         (["--label", "cugh"], "no class 'cugh' in these logs; there is coughing"),
+        (["--label", "cugh"], "No model here has it: mark some of these sounds"),
+        (
+            ["--label", "shower"],
+            "bathroom-embedding labels it in what is recorded with",
+        ),
+        (["--label", "flushing_water"], "bathroom-embedding labels it in"),  # not by bathroom
         (["--day", "2026-04-01"], "no logs of 2026-04-01"),
         (["--day", "soon"], "--day soon: not a day such as 2026-03-01"),
         (["--labels", "none"], "no labelling 'none' beside these logs"),
@@ -192,6 +198,13 @@ def test_bad_input_is_one_line(home, hearthlog, words, output):
     assert output in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert not result.stdout
+
+
+def test_a_class_that_another_model_has_can_be_relabelled(tmp_path, hearthlog):
+    about = {"node": "bathroom", "microphone": "bathroom", "classes": BATHROOM}
+    write_day(tmp_path, DAY, [(at("09:00"), 40.0, "shower", 0.95)], **about)
+    result = hearthlog("events", tmp_path, "--label", "cough")
+    assert "`hearthlog relabel LOGS --model general` labels it" in result.stderr
 
 
 def test_sound_that_was_not_kept_cannot_be_played_and_is_said_so(home, hearthlog):
@@ -211,7 +224,7 @@ def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path, hearthlog):
     assert json.loads(found.stdout)["counts"]["phone_ring"] == {
         "counted": 2, "television": 0, "unsure": 1,
     }  # fmt: skip
-    assert "telephone ringing 1 (+1 not sure)" in hearthlog("info", tmp_path).stdout
+    assert "telephone ringing 1 (+1?)" in hearthlog("info", tmp_path).stdout
 
 
 def test_time_that_nobody_listened_to_is_said(tmp_path, hearthlog):

@@ -158,6 +158,11 @@ def test_models_are_listed_as_a_table_and_as_json(folder, capfd):
     result = run(capfd, "models", "list", "--folder", folder)
     assert (result.returncode, result.stderr) == (0, "")
     head, *rows = result.stdout.splitlines()
+    assert head.split() == ["name", "alias", "network", "classes", "macro", "F1"]
+    assert [row.split()[0] for row in rows if row[0] != " "] == ["broad", "one", "two", *STARTERS]
+    assert "talking, music, telephone ringing" in " ".join(result.stdout.split())
+    result = run(capfd, "models", "list", "--verbose", "--folder", folder)
+    head, *rows = result.stdout.splitlines()
     assert head.split() == [
         "name",
         "alias",

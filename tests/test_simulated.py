@@ -46,7 +46,7 @@ def test_the_recorder_says_that_a_model_knows_simulated_sounds_alone(
 def test_its_card_and_the_list_of_models_say_so_too(hearthlog, simulated, model_file):
     folder = simulated.parent
     (folder / "real.safetensors").write_bytes(model_file.read_bytes())
-    lines = hearthlog("models", "list", "--folder", folder).stdout.splitlines()
+    lines = hearthlog("models", "list", "--verbose", "--folder", folder).stdout.splitlines()
     made_up, real = (next(x for x in lines if name in x) for name in ("made_up", "real"))
     assert (" simulated " in made_up, " simulated " in real) == (True, False)
     entries = json.loads(hearthlog("models", "list", "--folder", folder, "--json").stdout)

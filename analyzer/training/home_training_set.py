@@ -105,7 +105,10 @@ def read_home_training_set(
         segments = cut_recordings([], learned, features)
     nothing = "none of the marks can be learned from" if counts.marks else "nothing is marked"
     if marked_as == {TELEVISION}:
-        nothing = "only a television is marked so far, and nothing is learned from that"
+        nothing = (
+            "a television is all that is marked; that takes sounds out of the counts, and teaches "
+            "no class. Mark sounds of the home as what they are"
+        )
     return HomeTrainingSet(segments, notes, "" if len(segments) else nothing)
 
 

@@ -19,6 +19,7 @@ from hearthlog.tools.cli.options import (
     Start,
     Timezone,
     home_and_zone,
+    models_folder,
     parse_span,
     read_date,
     read_day,
@@ -204,11 +205,35 @@ def _chosen_classes(
         if len(meant) != 1:
             there = ", ".join(in_words(name).lower() for name in sounds)
             raise DataError(
-                f"no class {label[:64]!r} in these logs; there is {there}. Another model may know "
-                "it: `hearthlog models list`, then `hearthlog relabel`"
+                f"no class {label[:64]!r} in these logs; there is {there}{_hint(label)}"
             )
         chosen += meant
     return list(dict.fromkeys(chosen))
+
+
+def _hint(label: str) -> str:
+    """Return how a class that the logs lack can be labelled."""
+    from hearthlog.analyzer.logs.hidden_classes import common_names
+    from hearthlog.models.classes import meant_by
+    from hearthlog.models.registry import list_models
+
+    models = [entry.model for entry in list_models(models_folder()) if entry.model is not None]
+    for model in sorted(models, key=lambda one: one.description.embedding is not None):
+        about = model.description
+        apart = set(about.classes) - common_names(about.model_dump()).keys()
+        if not meant_by(label, sorted(apart)):
+            continue
+        if about.embedding is None:
+            return f". `hearthlog relabel LOGS --model {model.name}` labels it"
+        network = about.embedding.network
+        return (
+            f". {model.name} labels it in what is recorded with the network {network}: "
+            f"`hearthlog models fetch {network}`"
+        )
+    return (
+        ". No model here has it: mark some of these sounds (`hearthlog review`), then "
+        "`hearthlog train --home LOGS`"
+    )
 
 
 def _not_listened(

@@ -60,7 +60,7 @@ def info(
     from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.models.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
-    from hearthlog.tools.cli.info_summary import Overview, day_line, next_step
+    from hearthlog.tools.cli.info_summary import Overview, day_lines, next_step
 
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
@@ -91,7 +91,7 @@ def info(
         print_lines(overview.lines(following))
         _print_amounts(overview)
         if day is not None:
-            print_lines([day_line(*day)])
+            print_lines(day_lines(*day))
         print_lines(_stream_lines(summary))
         print_lines(_model_lines(summary, path, logs, scenarios))
         print_lines(() if accuracy is None else accuracy.lines())

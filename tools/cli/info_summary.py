@@ -202,19 +202,22 @@ def _hours(seconds: float) -> str:
 
 def _minutes(minutes: float) -> str:
     if minutes < 1:
-        return f"{60 * minutes:.0f} s"
+        return f"{60 * minutes:.0f} s" if 60 * minutes >= 1 or not minutes else "under 1 s"
     return f"{minutes:.1f} min" if minutes < _HOUR else Duration.show(minutes)
 
 
-def day_line(day: date, totals: Mapping[str, EventTotal]) -> str:
-    """Return how often each sound occurred on a day; apart: not sure, beside a television."""
-    parts = []
+def day_lines(day: date, totals: Mapping[str, EventTotal]) -> Iterator[str]:
+    """Yield how often each sound occurred on a day, and what is left out beside a television."""
+    parts, apart = [], []
     for name, (counted, television, unsure) in totals.items():
-        notes = [f"+{unsure} not sure"] * bool(unsure)
-        notes += [f"+{television} beside a television"] * bool(television)
-        text = f"{in_words(name).lower()} {counted - unsure or 'none'}"
-        parts.append(f"{text} ({', '.join(notes)})" if notes else text)
-    return f"Labelled on {day:%A, %Y-%m-%d}, counted as in the report: {listed(parts, 'and')}"
+        word = in_words(name).lower()
+        parts.append(f"{word} {counted - unsure or 'none'}{f' (+{unsure}?)' * bool(unsure)}")
+        apart += [f"{word} {television}"] * bool(television)
+    note = "; of those with ? the model is not sure" * any(one.unsure for one in totals.values())
+    counts = listed(parts, "and")
+    yield f"Labelled on {day:%A, %Y-%m-%d}, counted as in the report: {counts}{note}"
+    if apart:
+        yield f"and beside a television, not counted: {listed(apart, 'and')}"
 
 
 def next_step(summary: LogSummary, path: Path) -> str | None:

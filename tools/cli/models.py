@@ -149,8 +149,8 @@ models = typer.Typer(
 )
 models.command()(fetch)
 
-_HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "MB")
-_WORDS = _HEAD.index("macro F1")
+_HEAD = ("name", "alias", "network", "classes", "macro F1")
+_LONG_HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "MB")
 
 
 class _ClassShare(NamedTuple):
@@ -172,18 +172,28 @@ _Folder = Annotated[
 
 
 @models.command("list")
-def list_(folder: _Folder = None, as_json: Json = False) -> None:
-    """List the models and the starters; exit status 3: one of them cannot be used."""
+def list_(
+    folder: _Folder = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Also show inputs, calibration, digest and size.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """List the models and the starters with their classes of sound.
+
+    Exit status 3: one of them cannot be used.
+    """
     from hearthlog.models.registry import list_models
 
     place = models_folder(folder)
     entries = list_models(place)
     if not place.is_dir():
-        print_notice(f"{place}: no such folder of models; these models come with hearthlog")
+        print_notice(f"{place}: no such folder yet; these models come with hearthlog")
     if as_json:
         print(json.dumps([_as_json(entry) for entry in entries], indent=2))
     else:
-        print_table(_HEAD, map(_row, entries), words=_WORDS)
+        head, row = (_LONG_HEAD, _long_row) if verbose else (_HEAD, _row)
+        print_table(head, map(row, entries), words=head.index("macro F1"))
     end_with_warnings([entry.problem for entry in entries if entry.model is None])
 
 
@@ -531,24 +541,48 @@ def _is_here(network: str) -> bool:
 
 
 def _row(entry: "ModelEntry") -> tuple[str, ...]:
-    alias = ", ".join((*entry.aliases, *["starter"] * entry.starter))
-    size = f"{entry.size / 1e6:.2f}"
+    from hearthlog.models.classes import OF_EVERY_SCENARIO, in_words
+
+    name, alias = ascii(entry.name)[1:-1], _aliases(entry)
+    if entry.model is None:
+        return name, alias, "", "cannot be used", ""
+    classes = entry.model.description.classes
+    sounds = ", ".join(in_words(one).lower() for one in classes if one not in OF_EVERY_SCENARIO)
+    return name, alias, _network_and_presence(entry.model), sounds, _macro_f1(entry.model)
+
+
+def _long_row(entry: "ModelEntry") -> tuple[str, ...]:
+    alias, size = _aliases(entry), f"{entry.size / 1e6:.2f}"
     if entry.model is None:
         return ascii(entry.name)[1:-1], alias, "cannot be used", "", "", "", "", size
     description = entry.model.description
     more = ", directions" if description.direction_microphones else ""
-    if network := _network(entry.model):
-        more += f", {network}" if _is_here(network) else f", {network} (not here)"
+    if network := _network_and_presence(entry.model):
+        more += f", {network}"
     return (
         entry.name,
         alias,
         f"{description.scenario_name} ({len(description.classes)})",
         f"{description.feature_set} {description.inputs}{more}",
-        f"{description.metrics.macro_f1:.3f}{' simulated' * description.training_data.simulated}",
+        _macro_f1(entry.model),
         f"{description.metrics.expected_calibration_error:.3f}",
         entry.model.sha256[:12],
         size,
     )
+
+
+def _aliases(entry: "ModelEntry") -> str:
+    return ", ".join((*entry.aliases, *["starter"] * entry.starter))
+
+
+def _network_and_presence(model: "Model") -> str:
+    network = _network(model)
+    return f"{network} (not here)" if network and not _is_here(network) else network
+
+
+def _macro_f1(model: "Model") -> str:
+    simulated = " simulated" * model.description.training_data.simulated
+    return f"{model.description.metrics.macro_f1:.3f}{simulated}"
 
 
 def _as_json(entry: "ModelEntry") -> dict[str, object]:

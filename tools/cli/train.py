@@ -361,7 +361,7 @@ def _adapted(base: Path, home: list[Path], scenario: str) -> tuple["Model", "Dat
     if not len(segments):
         reasons = [f"{count} recordings: {why}" for why, count in segments.skipped.items()]
         why = "; ".join(reasons) or nothing
-        raise DataError(f"the home has no segments of a class of the model ({why})")
+        raise DataError(f"nothing to learn from this home: {why}")
     if not is_moved(model):
         print_notice(
             f"{model.name} is of kind {model.description.kind}: landmarks first learn its "

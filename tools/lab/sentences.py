@@ -56,7 +56,7 @@ from hearthlog.models.classes import (
     UNKNOWN,
     in_words,
 )
-from hearthlog.tools.cli.info_summary import Overview, day_line
+from hearthlog.tools.cli.info_summary import Overview, day_lines
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.true_day import NEAR, TrueDay, TrueSound, read_sounds, true_day
 
@@ -599,7 +599,7 @@ def info_statements(
     truth = true_day(sounds, day)
     true = truth.everywhere
     totals = event_totals(day.home, int(day.span.starts[0]), int(day.span.ends[0]))
-    line = day_line(day.day, totals)
+    line = " ".join(day_lines(day.day, totals))
     for name, total in totals.items():
         if name in _sounds_of(day):
             stated = (total.counted, total.counted)
