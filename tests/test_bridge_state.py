@@ -13,7 +13,7 @@ from hearthlog.analyzer.activity import ANY_SOUND, ActiveClasses, EventRecord
 from hearthlog.analyzer.activity.event_counts import events_of
 from hearthlog.analyzer.bridge.bridge import ProblemReporter
 from hearthlog.analyzer.bridge.home_state import Health, HomeState, LiveMicrophone
-from hearthlog.analyzer.bridge.mqtt.topics import Place, Topics, identifier
+from hearthlog.analyzer.bridge.mqtt.topics import TopicKey, Topics, identifier
 from hearthlog.analyzer.bridge.output import Total, Totals
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.bridge.state import BridgeState
@@ -153,7 +153,7 @@ def test_a_class_of_any_name_has_a_topic_of_its_own(label):
     assert not {"+", "#", "\x00"} & set(topic)
     assert topic.count("/") == 5
     if label.isprintable():
-        for place in (Place("told", label=label), Place("on", "mic", label)):
+        for place in (TopicKey("told", label=label), TopicKey("on", "mic", label)):
             assert topics.parse(topics.at(*place)) == place
         assert topic.split("/")[-2] == topics.at("told", label=label).split("/")[-1]
 

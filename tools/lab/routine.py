@@ -163,9 +163,9 @@ def _judged(
     methods: Sequence[Method],
 ) -> Float64 | None:
     first = number - SPAN + 1
-    earlier = [day for day in days[max(first - 7 * weeks, 0) : first] if day.is_known]
-    span = [day for day in days[first : number + 1] if day.is_known]
-    if not days[number].is_known or len(earlier) < FEWEST:
+    earlier = [day for day in days[max(first - 7 * weeks, 0) : first] if day.is_comparable]
+    span = [day for day in days[first : number + 1] if day.is_comparable]
+    if not days[number].is_comparable or len(earlier) < FEWEST:
         return None
     compared = compare(span, earlier, profiles.figures, profiles.classes)
     return np.array([method(compared) for method in methods])

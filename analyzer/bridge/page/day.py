@@ -164,13 +164,13 @@ def _missing_classes(home: HomeDay) -> str:
     if not home.microphones or not all(each.names for each in home.microphones):
         return ""
     words = home.words
-    covered = {
+    detectable = {
         each.common_names.get(name, name) for each in home.microphones for name in each.names
     }
     hidden = frozenset[str]().union(*(each.hidden_classes for each in home.microphones))
-    missing = _EXPECTED - covered - hidden
+    missing = _EXPECTED - detectable - hidden
     notes = []
-    if RUNNING_WATER in covered and (joined_classes := missing & {*WATER}):
+    if RUNNING_WATER in detectable and (joined_classes := missing & {*WATER}):
         missing -= {*WATER}
         water = words.inside(words.class_words(RUNNING_WATER))
         classes = _listed_classes(joined_classes, words)
@@ -348,8 +348,8 @@ def _sentence_of_day(home: HomeDay) -> str:
     when = "" if home.is_past else words.text("since", time=clock(start, home.zone))
     if any(name in IMPORTANT for name in found):
         return _sentence(when, found, home)
-    covered = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
-    names = [words.inside(words.class_words(name)) for name in ordered(covered)]
+    detectable = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
+    names = [words.inside(words.class_words(name)) for name in ordered(detectable)]
     if not names:
         return _sentence(when, found, home) if found else ""
     key = "day.past none" if home.is_past else "day.none"
