@@ -330,7 +330,7 @@ def test_scenes_of_which_the_truth_is_known_are_asked_by_the_queue_and_by_chance
     for spans in (queue.by_queue(scene.logs, 5), queue.by_chance(scene.logs, 5, [0])):
         assert len(spans) == 5
         assert all(scene.truth.starts[0] <= s.start < s.end <= scene.truth.ends[-1] for s in spans)
-    recorded = queue.heard(scene, load_model(conditions.model))
+    recorded = queue.read_evaluation_set(scene, load_model(conditions.model))
     assert len(recorded.inputs) == len(recorded.quiet) == len(recorded.true) > 200
     silent = recorded.true[recorded.quiet] == "silence"
     assert silent.mean() > 0.8  # the gate is silent where nothing sounds

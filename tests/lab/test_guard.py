@@ -16,7 +16,15 @@ from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.tools.home.clips import SHIPPED
 from hearthlog.tools.lab import guard
-from hearthlog.tools.lab.guard import FAR, NEAR, WAYS, heard_clip, maskers_of, measure, unheard
+from hearthlog.tools.lab.guard import (
+    FAR,
+    NEAR,
+    WAYS,
+    clip_at_microphone,
+    maskers_of,
+    measure,
+    unheard,
+)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +63,7 @@ def test_coughing_that_nobody_talks_over_is(clips, classifier):
 def test_a_clip_is_heard_at_its_level_between_two_seconds_of_the_room(clips):
     (clip, *_) = of(clips, "speech")
     for way, loudest in ((NEAR, -18), (FAR, -38)):
-        piece = heard_clip(clip, way, [], np.random.default_rng(0))
+        piece = clip_at_microphone(clip, way, [], np.random.default_rng(0))
         levels = np.array([level(frame) for frame in piece.frames])
         assert levels.max() == pytest.approx(loudest, abs=0.2)
         assert levels[:40].max() < -60
@@ -67,8 +75,8 @@ def test_what_it_is_heard_over_is_ten_decibels_below_its_loud_frames(clips):
     (clip, *_) = of(clips, "speech")
     steady = np.random.default_rng(1).standard_normal(16_000)
     over_water = next(way for way in WAYS if "water" in way.name)
-    piece = heard_clip(clip, over_water, [steady], np.random.default_rng(0))
-    alone = heard_clip(clip, NEAR, [], np.random.default_rng(0))
+    piece = clip_at_microphone(clip, over_water, [steady], np.random.default_rng(0))
+    alone = clip_at_microphone(clip, NEAR, [], np.random.default_rng(0))
     assert level(alone.frames[alone.loud]) - level(piece.frames[:40]) == pytest.approx(10, abs=0.3)
 
 

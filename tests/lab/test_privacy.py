@@ -88,8 +88,8 @@ def test_words_that_are_wrong_missing_or_too_many_are_errors():
 
 
 def test_a_recogniser_hears_sentences_and_of_digits_only_digits(sentences):
-    assert len(Recogniser(digits=False).hear(sentences[0]).split()) > 5
-    assert Recogniser(digits=True).hear(sentences[0]) in {"", *privacy.DIGITS}
+    assert len(Recogniser(digits=False).recognise(sentences[0]).split()) > 5
+    assert Recogniser(digits=True).recognise(sentences[0]) in {"", *privacy.DIGITS}
 
 
 def spoken_as(text, pitch, speaker):

@@ -149,8 +149,8 @@ def _learned(base: Model, logs: Sequence[RecentLog], marks: Sequence[Mark]) -> M
             (folder / log.path.name).symlink_to(log.path.resolve())
         if marks:
             name = marks[0].microphone
-            looked_at = ReviewedSpan(name, logs[0].start, marks[-1].end)
-            write_review(find_coverage(folder)[name], marks, looked_at)
+            reviewed = ReviewedSpan(name, logs[0].start, marks[-1].end)
+            write_review(find_coverage(folder)[name], marks, reviewed)
         return adapt_model(base, read_home_training_set([folder], base).segments)
 
 

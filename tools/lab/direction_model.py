@@ -46,8 +46,8 @@ from hearthlog.tools.lab.direction_room import (
     Room,
     Scene,
     add_noise,
+    convolved_with,
     draw_room,
-    heard_with,
     laid_out,
     room_noise,
 )
@@ -148,7 +148,7 @@ def _recorded(
     chosen = [_clip(kind, clips, rng) for kind in kinds]
     echoes = room.echoes(corner)
     echoed = [
-        heard_with(echoes if source is corner else room.echoes(source), clip)
+        convolved_with(echoes if source is corner else room.echoes(source), clip)
         for source, clip in zip(sources, chosen, strict=True)
     ]
     scene = laid_out(room, sources, chosen, echoed)

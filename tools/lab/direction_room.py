@@ -106,7 +106,7 @@ def draw_room(places: Float64, rt60: float, rng: np.random.Generator) -> Room:
     return Room(size, centre, microphones, gains, rt60)
 
 
-def heard_with(echoes: Float64, clip: Float64) -> Float64:
+def convolved_with(echoes: Float64, clip: Float64) -> Float64:
     """Return what microphones hear of a clip, of a mean square of 1 in its seconds.
 
     Parameters
@@ -139,7 +139,9 @@ def room_scene(
     """
     room = draw_room(places, rt60, rng)
     sources = [room.anywhere(rng) for _ in clips]
-    echoed = [heard_with(room.echoes(at), clip) for at, clip in zip(sources, clips, strict=True)]
+    echoed = [
+        convolved_with(room.echoes(at), clip) for at, clip in zip(sources, clips, strict=True)
+    ]
     return laid_out(room, sources, clips, echoed)
 
 
@@ -154,7 +156,7 @@ def laid_out(
     sources : sequence of np.ndarray [shape=(3,)], float64
         Where each is.
     clips, echoed : sequence of np.ndarray
-        Without the room, and as `heard_with` returns them.
+        Without the room, and as `convolved_with` returns them.
     """
     sounds, at, channels = [], int(_BEFORE * SAMPLE_RATE), len(room.microphones)
     pause = np.zeros((int(_PAUSE * SAMPLE_RATE), channels))

@@ -132,7 +132,7 @@ def measure(
         If a clip cannot be read.
     """
     rng = np.random.default_rng(_SEED)
-    pieces = [_settling(rng), *(heard_clip(clip, way, maskers, rng) for clip in clips)]
+    pieces = [_settling(rng), *(clip_at_microphone(clip, way, maskers, rng) for clip in clips)]
     kept = _kept([piece.frames for piece in pieces], classifier, embedder)
     counts = []
     start = 0
@@ -146,10 +146,10 @@ def measure(
 
 def _settling(rng: np.random.Generator) -> Piece:
     nothing = np.zeros(_SETTLING * FRAME_SAMPLES)
-    return Piece(_heard(nothing, rng), np.zeros(_SETTLING, bool))
+    return Piece(_at_microphone(nothing, rng), np.zeros(_SETTLING, bool))
 
 
-def heard_clip(
+def clip_at_microphone(
     clip: LabelledClip, way: Way, maskers: Sequence[Float64], rng: np.random.Generator
 ) -> Piece:
     """Make what is heard of a clip: between two seconds of the room, or of the masker.
@@ -182,7 +182,7 @@ def heard_clip(
         masker = _looped(maskers[int(rng.integers(len(maskers)))], len(sound), rng)
         below = np.square(sound.reshape(-1, FRAME_SAMPLES)[loud]).mean()
         sound += masker * np.sqrt(below / np.square(masker).mean()) * 10 ** (-_ABOVE_MASKER / 20)
-    return Piece(_heard(sound, rng), loud)
+    return Piece(_at_microphone(sound, rng), loud)
 
 
 def _levels(sound: Float64) -> Float64:
@@ -195,7 +195,7 @@ def _looped(masker: Float64, count: int, rng: np.random.Generator) -> Float64:
     return np.resize(np.roll(masker, -int(rng.integers(len(masker)))), count)
 
 
-def _heard(sound: Float64, rng: np.random.Generator) -> Float32:
+def _at_microphone(sound: Float64, rng: np.random.Generator) -> Float32:
     """Return the frames of a sound in the noise of the room, as a microphone gives them."""
     seconds, seed = (len(sound) + 1) / SAMPLE_RATE, int(rng.integers(1 << 31))
     heard = sound + background(seconds, _FLOOR_DBFS, "pink", seed)[: len(sound)]

@@ -269,8 +269,8 @@ def _write(folder: Path, logs: Sequence[RecentLog], marks: Sequence[Sequence[Mar
     for log, own in zip(logs, marks, strict=False):
         if own:
             name = own[0].microphone
-            looked_at = ReviewedSpan(name, log.start, own[-1].end)
-            write_review(find_coverage(folder)[name], own, looked_at)
+            reviewed = ReviewedSpan(name, log.start, own[-1].end)
+            write_review(find_coverage(folder)[name], own, reviewed)
 
 
 def lines_of(outcome: Outcome) -> Iterator[str]:

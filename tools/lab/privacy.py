@@ -76,7 +76,7 @@ def privacy(
     if not digits or not sentences:
         raise DataError(f"{manifest}: needs digits, with a column text, and sentences")
     digit_words, words = Recogniser(digits=True), Recogniser(digits=False)
-    sentences = [each._replace(text=each.text or words.hear(each.sound)) for each in sentences]
+    sentences = [each._replace(text=each.text or words.recognise(each.sound)) for each in sentences]
     count = sum(len(each.text.split()) for each in sentences)
     print(
         f"{len(digits)} digits of {_speakers(digits)} speakers, {len(sentences)} sentences of "
@@ -88,10 +88,10 @@ def privacy(
 
     def score(make: Callable[[Float64], Float64]) -> str:
         made = [make(each.sound) for each in sentences]
-        heard = [words.hear(sound) for sound in made]
+        heard = [words.recognise(sound) for sound in made]
         wrong = word_errors([each.text for each in sentences], heard)
         estoi = intelligibility([each.sound for each in sentences], made)
-        of_digits = [digit_words.hear(make(each.sound)) for each in digits]
+        of_digits = [digit_words.recognise(make(each.sound)) for each in digits]
         digits_wrong = word_errors([each.text for each in digits], of_digits)
         return f"{estoi:5.2f} {digits_wrong:6.0%} {wrong:7.0%}"
 

@@ -140,10 +140,10 @@ def _f1(
 def _line(name: str, grade: _Grade, verdict: Verdict) -> str:
     random = None if verdict.evidence is None else verdict.evidence.random
     right = "" if random is None else f"{random.after} of {random.sounds}, not {random.before}"
-    says = "; ".join(verdict.judgement.reasons) or "may label"
+    verdict_text = "; ".join(verdict.judgement.reasons) or "may label"
     (macro, silence), (macro_now, silence_now) = grade
     f1 = f"{macro:.3f} -> {macro_now:.3f}, silence {silence:.3f} -> {silence_now:.3f}"
-    return f"{name:32} {grade.truth:6} {f1}  {right:20} {says}"
+    return f"{name:32} {grade.truth:6} {f1}  {right:20} {verdict_text}"
 
 
 def _review_at_random(

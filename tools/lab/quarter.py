@@ -137,14 +137,14 @@ def _learn(folder: Path) -> tuple[bool, bool, list[str]]:
     """Learn a model of the home, and let it label; return whether both came to pass."""
     models, champion = folder / "models", _champion(folder)
     before = {*models.glob("home-*.safetensors")}
-    lines = _said(folder, "train", "--home", "logs")
+    lines = _run_command(folder, "train", "--home", "logs")
     made = {*models.glob("home-*.safetensors")} - before
     for model in made:
-        lines += _said(folder, "models", "promote", model.stem)
+        lines += _run_command(folder, "models", "promote", model.stem)
     return bool(made), _champion(folder) != champion, lines
 
 
-def _said(folder: Path, *arguments: str) -> list[str]:
+def _run_command(folder: Path, *arguments: str) -> list[str]:
     """Run the command in a folder, as a person there would, and return its lines."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("HEARTHLOG_")}
     done = subprocess.run(  # noqa: S603  ours
@@ -178,16 +178,16 @@ def plan_quarter(weeks: int, library: ClipLibrary, seed: int) -> list[list[Part]
     SimulationError
         If there is no week.
     """
-    whole = plan_days(7 * weeks, library, Habits(seed))
-    labels: list[set[str]] = [set() for _ in range(whole.frames // _STRETCH)]
-    for sound in whole.sounds:
+    period = plan_days(7 * weeks, library, Habits(seed))
+    labels: list[set[str]] = [set() for _ in range(period.frames // _STRETCH)]
+    for sound in period.sounds:
         labels[sound.start // _STRETCH].add(sound.clip.label)
     count = 7 * DAY_FRAMES // _STRETCH
     quarter = []
     for begin in range(0, len(labels), count):
         pairs = combinations(range(begin, begin + count), 2)
         best = max(pairs, key=lambda pair: len(labels[pair[0]] | labels[pair[1]]))
-        quarter.append([((at - begin) * _STRETCH, _part(whole, at * _STRETCH)) for at in best])
+        quarter.append([((at - begin) * _STRETCH, _part(period, at * _STRETCH)) for at in best])
     return quarter
 
 
@@ -219,13 +219,13 @@ def quarter(
     library = ClipLibrary(manifest)
     start = round(datetime(2026, 3, 1, tzinfo=UTC).timestamp()) * NANOSECONDS
     home = Home(folder, plan_quarter(weeks, library, seed), library, seed, start)
-    lived = []
+    done = []
     for week in live(home):
-        lived.append(week)
+        done.append(week)
         with (folder / "quarter.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(asdict(week)) + "\n")
         print(line_of(week), flush=True)
-    save_picture(folder / "quarter.png", lived)
+    save_picture(folder / "quarter.png", done)
 
 
 if __name__ == "__main__":

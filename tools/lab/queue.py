@@ -48,7 +48,7 @@ from hearthlog.tools.lab.home.person import Person
 
 _SCENARIO = BUILTIN["general"]
 _START = 1_772_323_200 * NANOSECONDS
-_ASKED = (20, 60)
+_SPAN_COUNTS = (20, 60)
 _EVERY = 8  # windows
 _FIELDS = ("header.stamp", "frame", "values")
 _FEWEST_RUNS = 12
@@ -86,7 +86,7 @@ class Recorded(NamedTuple):
     truth: Labelling
 
 
-class Heard(NamedTuple):
+class EvaluationSet(NamedTuple):
     """Windows of a scene."""
 
     inputs: Float32
@@ -165,14 +165,14 @@ def outcomes(conditions: Conditions, room: int, seed: int) -> Iterator[Outcome]:
             for way, place in enumerate(places)
         ]
         for way in (0, 1):
-            asked, other = scenes[way], heard(scenes[1 - way], base)
+            scene, other = scenes[way], read_evaluation_set(scenes[1 - way], base)
             run = f"{name} {room} {seed} {way}"
-            for count in _ASKED:
-                spans = by_queue(asked.logs, count)
-                yield Outcome(run, count, _QUEUE, *_learned(spans, asked, other, base))
+            for count in _SPAN_COUNTS:
+                spans = by_queue(scene.logs, count)
+                yield Outcome(run, count, _QUEUE, *_learned(spans, scene, other, base))
                 for draw in range(conditions.draws):
-                    spans = by_chance(asked.logs, count, [seed, room, way, draw])
-                    yield Outcome(run, count, _CHANCE, *_learned(spans, asked, other, base))
+                    spans = by_chance(scene.logs, count, [seed, room, way, draw])
+                    yield Outcome(run, count, _CHANCE, *_learned(spans, scene, other, base))
 
 
 def table_of(results: Sequence[Outcome]) -> Table:
@@ -184,7 +184,7 @@ def table_of(results: Sequence[Outcome]) -> Table:
         At least one of each kind in every run.
     """
     rows = []
-    for count in _ASKED:
+    for count in _SPAN_COUNTS:
         some = [one for one in results if one.spans == count]
         runs = sorted({one.run for one in some})
         by = {
@@ -291,20 +291,20 @@ def _items(starts: Int64, ends: Int64) -> list[ReviewItem]:
 
 
 def _learned(
-    items: Sequence[ReviewItem], asked: Recorded, other: Heard, base: Model
+    items: Sequence[ReviewItem], scene: Recorded, other: EvaluationSet, base: Model
 ) -> tuple[float, float, float]:
     """Correct spans and learn again; return seconds, macro F1 and F1 of silence."""
-    for layer in asked.logs.rglob("*.review.mcap"):
+    for layer in scene.logs.rglob("*.review.mcap"):
         layer.unlink()
-    Person(asked.truth).go_through(items, asked.logs, _START + 86_400 * NANOSECONDS)
-    segments = read_home_training_set([asked.logs], base)[0]
+    Person(scene.truth).go_through(items, scene.logs, _START + 86_400 * NANOSECONDS)
+    segments = read_home_training_set([scene.logs], base)[0]
     scores = _scores(adapt_model(base, segments), other)
     seconds = sum(item.end - item.start for item in items) / NANOSECONDS
     known = [score for name, score in scores.items() if name != UNKNOWN]
     return seconds, float(np.mean(known)), scores[SILENCE]
 
 
-def heard(scene: Recorded, model: Model) -> Heard:
+def read_evaluation_set(scene: Recorded, model: Model) -> EvaluationSet:
     """Return every eighth window of a scene, and what is true in its middle.
 
     Parameters
@@ -326,7 +326,7 @@ def heard(scene: Recorded, model: Model) -> Heard:
     middles = recorded["header.stamp"][-count:] - (window // 2) * FRAME_NANOSECONDS
     some = slice(None, None, _EVERY)
     true = scene.truth.labels[rows_at(scene.truth, middles[some])]
-    return Heard(inputs[some], quiet[some], *_embedded(scene, model, middles[some]), true)
+    return EvaluationSet(inputs[some], quiet[some], *_embedded(scene, model, middles[some]), true)
 
 
 def _embedded(scene: Recorded, model: Model, middles: Int64) -> tuple[Int8, Bool]:
@@ -343,21 +343,21 @@ def _embedded(scene: Recorded, model: Model, middles: Int64) -> tuple[Int8, Bool
     return embeddings.values[row], middles - starts[row] < HOP_FRAMES * FRAME_NANOSECONDS
 
 
-def _scores(model: Model, heard: Heard) -> dict[str, float]:
+def _scores(model: Model, data: EvaluationSet) -> dict[str, float]:
     """Return the F1 of each class that is there."""
     classes = np.array(model.classes, object)
-    labels = np.full(len(heard.inputs), SILENCE, object)
-    loud = ~heard.quiet
+    labels = np.full(len(data.inputs), SILENCE, object)
+    loud = ~data.quiet
     classifier, by_heads = Classifier(model), None
     if classifier.embedding_heads is not None:
-        by_heads = classifier.embedding_heads.log_probabilities(heard.embedded[loud])
-        by_heads[~heard.is_embedded[loud]] = np.nan
-    probabilities, _ = classifier.classify(heard.inputs[loud], None, by_heads)
+        by_heads = classifier.embedding_heads.log_probabilities(data.embedded[loud])
+        by_heads[~data.is_embedded[loud]] = np.nan
+    probabilities, _ = classifier.classify(data.inputs[loud], None, by_heads)
     labels[loud] = classes[probabilities.argmax(axis=1)]
     return {
-        name: 2.0 * float(((labels == name) & (heard.true == name)).sum())
-        / float((labels == name).sum() + (heard.true == name).sum())
-        for name in sorted(set(heard.true))
+        name: 2.0 * float(((labels == name) & (data.true == name)).sum())
+        / float((labels == name).sum() + (data.true == name).sum())
+        for name in sorted(set(data.true))
     }  # fmt: skip
 
 

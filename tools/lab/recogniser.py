@@ -32,7 +32,7 @@ class Recogniser:
             self._decoder.add_jsgf_string("digits", grammar)
             self._decoder.activate_search("digits")
 
-    def hear(self, sound: Float64) -> str:
+    def recognise(self, sound: Float64) -> str:
         """Return the words in a sound, as loud as speech is.
 
         Parameters
@@ -40,34 +40,34 @@ class Recogniser:
         sound : np.ndarray [shape=(n,)], float64
             Samples at 16 kHz.
         """
-        heard = np.concatenate([_PAUSE, sound, _PAUSE])
-        heard = heard * (_LOUDEST / max(np.abs(heard).max(), 1e-9))
-        heard += np.random.default_rng(0).standard_normal(len(heard)) * _NOISE
+        recognised = np.concatenate([_PAUSE, sound, _PAUSE])
+        recognised = recognised * (_LOUDEST / max(np.abs(recognised).max(), 1e-9))
+        recognised += np.random.default_rng(0).standard_normal(len(recognised)) * _NOISE
         self._decoder.start_utt()
-        self._decoder.process_raw((heard * 32767).astype("<i2").tobytes(), full_utt=True)
+        self._decoder.process_raw((recognised * 32767).astype("<i2").tobytes(), full_utt=True)
         self._decoder.end_utt()
-        said = self._decoder.hyp()
-        return said.hypstr if said else ""
+        spoken = self._decoder.hyp()
+        return spoken.hypstr if spoken else ""
 
 
-def word_errors(said: Sequence[str], heard: Sequence[str]) -> float:
+def word_errors(spoken: Sequence[str], recognised: Sequence[str]) -> float:
     """Return the words that are wrong, missing or too many, as a share of those that were said.
 
     Parameters
     ----------
-    said, heard : sequence of str
+    spoken, recognised : sequence of str
         Texts of the same sounds.
     """
-    wrong = sum(_distance(a.split(), b.split()) for a, b in zip(said, heard, strict=True))
-    return wrong / max(sum(len(text.split()) for text in said), 1)
+    wrong = sum(_distance(a.split(), b.split()) for a, b in zip(spoken, recognised, strict=True))
+    return wrong / max(sum(len(text.split()) for text in spoken), 1)
 
 
-def _distance(said: Sequence[str], heard: Sequence[str]) -> int:
+def _distance(spoken: Sequence[str], recognised: Sequence[str]) -> int:
     """Count the least insertions, deletions and substitutions from one text to the other."""
-    row = list(range(len(heard) + 1))
-    for number, word in enumerate(said, start=1):
+    row = list(range(len(recognised) + 1))
+    for number, word in enumerate(spoken, start=1):
         before, row[0] = row[0], number
-        for place, other in enumerate(heard, start=1):
+        for place, other in enumerate(recognised, start=1):
             before, row[place] = (
                 row[place],
                 min(row[place] + 1, row[place - 1] + 1, before + (word != other)),
@@ -75,7 +75,7 @@ def _distance(said: Sequence[str], heard: Sequence[str]) -> int:
     return row[-1]
 
 
-def intelligibility(sounds: Sequence[Float64], heard: Sequence[Float64]) -> float:
+def intelligibility(sounds: Sequence[Float64], recognised: Sequence[Float64]) -> float:
     """Return the mean extended short-time objective intelligibility (ESTOI), 0 to 1.
 
     It is that of Jensen and Taal, "An algorithm for predicting the intelligibility of speech masked
@@ -83,8 +83,10 @@ def intelligibility(sounds: Sequence[Float64], heard: Sequence[Float64]) -> floa
 
     Parameters
     ----------
-    sounds, heard : sequence of np.ndarray [shape=(n,)], float64
+    sounds, recognised : sequence of np.ndarray [shape=(n,)], float64
         Samples at 16 kHz, as they were and as they are heard; short ones do not count.
     """
-    pairs = [(a, b) for a, b in zip(sounds, heard, strict=True) if len(a) > _SHORTEST * SAMPLE_RATE]
+    pairs = [
+        (a, b) for a, b in zip(sounds, recognised, strict=True) if len(a) > _SHORTEST * SAMPLE_RATE
+    ]
     return float(np.mean([stoi(a, b, SAMPLE_RATE, extended=True) for a, b in pairs]))

@@ -242,7 +242,7 @@ def report_statements(
         title, labelled, _ = full.partition(", as labelled")
         heads = [head + labelled for head in plain]
         if title == "What was heard":
-            yield from _heard(heads, cells, day, truth)
+            yield from _sound_counts(heads, cells, day, truth)
         elif (title, cells[0]) in figures:
             yield from _figure(figures[title, cells[0]].value(truth.metrics), title, heads, cells)
         elif title.startswith("For the interRAI"):
@@ -253,7 +253,7 @@ def _paragraph(kind: str, text: str, day: DayMetrics, truth: TrueDay) -> Iterato
     if kind == "headline":
         yield from _headline(text, truth)
     elif kind == "gist":
-        yield from _gist(text, day, truth)
+        yield from _summary(text, day, truth)
     elif text.startswith("The longest quiet stretch"):
         yield _quiet(text, truth)
     elif text.startswith(("Coughing in the night", "Bouts of coughing in the night")):
@@ -352,7 +352,7 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
                     yield _at_times(surface, part, name, clocks, truth, modest=modest)
 
 
-def _gist(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
+def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
     true, modest = truth.metrics, is_modest(text)
     if match := re.search(r"Most of the sound[^:]*: (.*)\.", text):
         names = [name for name in day.home.classes if name != SILENCE]
@@ -442,7 +442,7 @@ def _night_coughs(text: str, truth: TrueDay) -> Iterator[Statement]:
         yield _at_times(REPORT, text, COUGHING, _CLOCK.findall(text)[-16:], truth, modest=modest)
 
 
-def _heard(
+def _sound_counts(
     heads: Sequence[str], cells: Sequence[str], day: DayMetrics, truth: TrueDay
 ) -> Iterator[Statement]:
     """Check a row of the table of sounds: how often, when and how long."""

@@ -61,31 +61,33 @@ def speakers(
     clips = clips_of_voices(manifest)
     if len(clips) < _ENROLLED:
         raise DataError(f"{manifest}: {len(clips)} voices; it takes {_ENROLLED}")
-    told: list[_Told] = []
+    turns: list[_LabelledTurn] = []
     for draw in range(draws):
         with tempfile.TemporaryDirectory(prefix="hearthlog-speakers-") as folder:
-            told += _told(clips, seconds, 1000 * seed + draw, Path(folder))
+            turns += _label_turns(clips, seconds, 1000 * seed + draw, Path(folder))
     title = f"speakers: {draws} draws of {_ENROLLED} of {len(clips)} voices"
-    print(Table(title, [*_rows(told), *_mixed(clips, seed)]))
+    print(Table(title, [*_rows(turns), *_mixed(clips, seed)]))
 
 
-class _Told(NamedTuple):
+class _LabelledTurn(NamedTuple):
     """A turn: whose it is, empty for somebody who is not enrolled, and who is said to speak."""
 
     voice: str
     label: str
 
 
-def _told(clips: Mapping[str, Clips], seconds: float, seed: int, folder: Path) -> list[_Told]:
+def _label_turns(
+    clips: Mapping[str, Clips], seconds: float, seed: int, folder: Path
+) -> list[_LabelledTurn]:
     rng = np.random.default_rng(seed)
     names = sorted(rng.choice(sorted(clips), _ENROLLED, replace=False).tolist())
     unseen = {name: _enrol(name, clips[name], folder, seed, rng) for name in names}
     model = _learned(folder)
-    told = _turns(unseen, seconds, seed + 500, model, folder / "enrolled_ones", set(names))
+    turns = _turns(unseen, seconds, seed + 500, model, folder / "enrolled_ones", set(names))
     strangers = {name: clips[name] for name in clips if name not in unseen}
     if strangers:
-        told += _turns(strangers, _STRANGERS, seed + 600, model, folder / "strangers", set())
-    return told
+        turns += _turns(strangers, _STRANGERS, seed + 600, model, folder / "strangers", set())
+    return turns
 
 
 def _enrol(
@@ -126,7 +128,7 @@ def _turns(
     model: Path,
     folder: Path,
     enrolled: set[str],
-) -> list[_Told]:
+) -> list[_LabelledTurn]:
     """Return who is said to speak in each turn of a conversation."""
     samples, turns = converse(clips, seconds, seed)
     segments = read_columns(find_logs(record_samples(samples, folder, _START, model)))[
@@ -135,7 +137,7 @@ def _turns(
     starts = (segments["header.stamp"] - _START) / NANOSECONDS
     ends = starts + segments["duration"] / NANOSECONDS
     return [
-        _Told(
+        _LabelledTurn(
             turn.voice if turn.voice in enrolled else "",
             _label(turn, starts, ends, segments["label"]),
         )
@@ -151,9 +153,9 @@ def _label(turn: Turn, starts: Float64, ends: Float64, labels: NDArray[np.object
     return best if sums.get(best, 0.0) > 0.0 else SILENCE
 
 
-def _rows(told: Sequence[_Told]) -> list[Row]:
-    known = [each for each in told if each.voice]
-    other = [each for each in told if not each.voice]
+def _rows(turns: Sequence[_LabelledTurn]) -> list[Row]:
+    known = [each for each in turns if each.voice]
+    other = [each for each in turns if not each.voice]
     nobody = {UNKNOWN, SILENCE}
     rows = [
         _row("turns of the enrolled told right", known, [t.label == t.voice for t in known]),
@@ -191,17 +193,17 @@ def _is_of_two(samples: Float32) -> bool:
     return is_of_two(DEFAULT.features.extractor()(frames), DEFAULT.features)
 
 
-def _row(what: str, told: Sequence[_Told], is_so: Sequence[bool]) -> Row:
+def _row(what: str, turns: Sequence[_LabelledTurn], is_so: Sequence[bool]) -> Row:
     """Make a row of a share, with its 95 % interval by drawing voices again."""
-    voices = sorted({each.voice for each in told})
-    of = np.array([voices.index(each.voice) for each in told])
+    voices = sorted({each.voice for each in turns})
+    of = np.array([voices.index(each.voice) for each in turns])
     hits = np.bincount(of, np.array(is_so, float), len(voices))
     counts = np.bincount(of, minlength=len(voices))
     rng = np.random.default_rng(0)
     drawn = rng.integers(len(voices), size=(_DRAWS, len(voices)))
     shares = hits[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     low, high = np.quantile(shares, (0.025, 0.975))
-    note = f"{low:.2f} to {high:.2f}; {len(told)} turns of {len(voices)} voices"
+    note = f"{low:.2f} to {high:.2f}; {len(turns)} turns of {len(voices)} voices"
     return Row(what, float(np.mean(is_so)), note=note)
 
 

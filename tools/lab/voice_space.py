@@ -34,7 +34,7 @@ def voice_space(
 ) -> None:
     """Learn from voices where voices lie apart."""
     voices, described = [], []
-    for voice, values in _heard(manifest):
+    for voice, values in _voice_features(manifest):
         loud = np.percentile(values[:, _ENERGY], 90) * _QUIET
         windows = describe_speech(values[values[:, _ENERGY] > loud], DEFAULT.feature_names)
         described.append(windows)
@@ -45,7 +45,7 @@ def voice_space(
     print(f"{output}: of {len(np.unique(np.concatenate(voices)))} voices")
 
 
-def _heard(manifest: Path) -> Iterator[tuple[int, Float32]]:
+def _voice_features(manifest: Path) -> Iterator[tuple[int, Float32]]:
     numbers: dict[str, int] = {}
     rng = np.random.default_rng(_SEED)
     for clip in read_manifest(manifest, LABELS):

@@ -45,25 +45,25 @@ def voices(
     if len(clips) < _MOST_VOICES:
         raise DataError(f"{manifest}: {len(clips)} voices; it takes {_MOST_VOICES}")
     with tempfile.TemporaryDirectory(prefix="hearthlog-voices-") as folder:
-        heard = [
-            _heard(clips, number, seconds, seed, Path(folder) / str(number))
+        analysed = [
+            _analyse(clips, number, seconds, seed, Path(folder) / str(number))
             for number in range(conversations)
         ]
     title = f"voices: {conversations} conversations of {seconds:.0f} s by {len(clips)} voices"
-    print(Table(title, _rows(heard)))
+    print(Table(title, _rows(analysed)))
 
 
 class _Conversation(NamedTuple):
-    """What is true of a conversation, and what is told of it."""
+    """The true and the predicted speakers of a conversation."""
 
     truth: Annotation
-    told: Annotation
-    told_of_speech: Annotation  # where it is known when somebody speaks
+    predicted: Annotation
+    predicted_in_speech: Annotation  # with the true times of speech
     span: Timeline
     counted: int
 
 
-def _heard(
+def _analyse(
     clips: dict[str, list[Float32]], number: int, seconds: float, seed: int, folder: Path
 ) -> _Conversation:
     rng = np.random.default_rng([seed, number])
@@ -75,9 +75,11 @@ def _heard(
     logs = record_samples(samples, folder, start, starter_file(GENERAL))
     speech = read_speech(find_home_logs([logs]))
     found, of = find_voices(speech, None)
-    told = _annotation(speech, of, start)
+    predicted = _annotation(speech, of, start)
     span = Timeline([Segment(0, seconds)])
-    return _Conversation(_truth(turns), told, _of_speech(samples, turns), span, len(found.numbers))
+    return _Conversation(
+        _truth(turns), predicted, _of_speech(samples, turns), span, len(found.numbers)
+    )
 
 
 def _truth(turns: Sequence[Turn]) -> Annotation:
@@ -88,11 +90,11 @@ def _truth(turns: Sequence[Turn]) -> Annotation:
 
 
 def _annotation(speech: HomeSpeech, of: Int64, start: int) -> Annotation:
-    told = Annotation()
+    predicted = Annotation()
     times = (speech.starts - start) / NANOSECONDS, (speech.ends - start) / NANOSECONDS
     for track, (first, last, voice) in enumerate(zip(*times, of[speech.voice], strict=True)):
-        told[Segment(float(first), float(last)), track] = str(voice)
-    return told
+        predicted[Segment(float(first), float(last)), track] = str(voice)
+    return predicted
 
 
 def _of_speech(samples: Float32, turns: Sequence[Turn]) -> Annotation:
@@ -104,40 +106,48 @@ def _of_speech(samples: Float32, turns: Sequence[Turn]) -> Annotation:
     for turn in turns:
         is_speech |= (turn.start <= middle) & (middle < turn.end)
     values = DEFAULT.extractor()(frames)[is_speech]
-    told = Annotation()
+    predicted = Annotation()
     *spans, _ = speech_voices(stamps[is_speech], values, DEFAULT.feature_names)
     for track, (first, last, voice) in enumerate(zip(*spans, strict=True)):
-        told[Segment(first / NANOSECONDS, last / NANOSECONDS), track] = str(voice)
-    return told
+        predicted[Segment(first / NANOSECONDS, last / NANOSECONDS), track] = str(voice)
+    return predicted
 
 
-def _rows(heard: Sequence[_Conversation]) -> list[Row]:
+def _rows(conversations: Sequence[_Conversation]) -> list[Row]:
     rows = []
     for name, collar in (("no collar", 0.0), (f"{_COLLAR} s", _COLLAR)):
-        told = [_errors(each.truth, each.told, each.span, collar) for each in heard]
-        speech = [_errors(each.truth, each.told_of_speech, each.span, collar) for each in heard]
-        one = [_errors(each.truth, _one_voice(each.told), each.span, collar) for each in heard]
-        missed, false, other, total = np.sum(told, axis=0)
+        predicted = [
+            _errors(each.truth, each.predicted, each.span, collar) for each in conversations
+        ]
+        speech = [
+            _errors(each.truth, each.predicted_in_speech, each.span, collar)
+            for each in conversations
+        ]
+        one = [
+            _errors(each.truth, _one_voice(each.predicted), each.span, collar)
+            for each in conversations
+        ]
+        missed, false, other, total = np.sum(predicted, axis=0)
         parts = f"{missed / total:.3f} missed, {false / total:.3f} false, {other / total:.3f} other"
         rows += [
-            Row(f"error rate, {name}", _rate(told), note=f"{_interval(told)}; {parts}"),
+            Row(f"error rate, {name}", _rate(predicted), note=f"{_interval(predicted)}; {parts}"),
             Row("  one voice for all", _rate(one), note=_interval(one)),
             Row("  times of speech known", _rate(speech), note=_interval(speech)),
         ]
-    wrong = np.array([each.counted - len(each.truth.labels()) for each in heard])
+    wrong = np.array([each.counted - len(each.truth.labels()) for each in conversations])
     note = ", ".join(f"{n:+d}: {(wrong == n).sum()}" for n in np.unique(wrong).tolist())
     return [*rows, Row("number of voices right", float((wrong == 0).mean()), note=note)]
 
 
-def _one_voice(told: Annotation) -> Annotation:
-    return told.rename_labels(dict.fromkeys(told.labels(), "0")).support()
+def _one_voice(predicted: Annotation) -> Annotation:
+    return predicted.rename_labels(dict.fromkeys(predicted.labels(), "0")).support()
 
 
 def _errors(
-    truth: Annotation, told: Annotation, span: Timeline, collar: float
+    truth: Annotation, predicted: Annotation, span: Timeline, collar: float
 ) -> tuple[float, float, float, float]:
     # pyannote.metrics divides a collar between both sides of a border
-    parts = DiarizationErrorRate(collar=2 * collar).compute_components(truth, told, uem=span)
+    parts = DiarizationErrorRate(collar=2 * collar).compute_components(truth, predicted, uem=span)
     return parts["missed detection"], parts["false alarm"], parts["confusion"], parts["total"]
 
 

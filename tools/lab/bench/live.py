@@ -28,7 +28,7 @@ from hearthlog.tools.lab.bench.workload import Workload
 _SECONDS = 60.0
 _SETTLE_SECONDS = 5.0
 _START_SECONDS = 30.0
-_HEARD_SECONDS = 10  # again and again; the device keeps them in memory
+_LOOP_SECONDS = 10  # again and again; the device keeps them in memory
 _CPU = Target(0.5, at_most=True)
 _WITH_NETWORK = Target(1.0, at_most=True)
 _PROCESSES = ("recorder", "capture")
@@ -85,7 +85,7 @@ def _live(work: Workload) -> list[Row]:
     env = make_microphone(work.folder, most_sounding(work.samples))
     recorders = [
         _Recorder("hearthlog", work.model_file),
-        _Recorder("with a candidate", _beside_candidate(work)),
+        _Recorder("with a candidate", _with_candidate(work)),
         *(_Recorder(f"with {count} microphones", work.model_file, count) for count in _MANY),
     ]
     if find_network(YAMNET.name) is not None:
@@ -144,7 +144,7 @@ class _Recorder:
         return [*HEARTHLOG, "record", *files]
 
 
-def _beside_candidate(work: Workload) -> Path:
+def _with_candidate(work: Workload) -> Path:
     """Copy the model to a folder with a candidate; the same model would not label twice."""
     folder = work.folder / "on-trial"
     folder.mkdir()
@@ -156,8 +156,8 @@ def most_sounding(samples: NDArray[np.int16]) -> NDArray[np.int16]:
     """Return the ten seconds in which most seconds are loud: in quiet a model is hardly asked."""
     seconds = samples[: len(samples) // SAMPLE_RATE * SAMPLE_RATE].reshape(-1, SAMPLE_RATE)
     levels = np.log10(np.einsum("ij,ij->i", seconds, seconds, dtype=np.float64) + 1.0)
-    sums = np.convolve(levels, np.ones(min(_HEARD_SECONDS, len(levels))), "valid")
-    return seconds[sums.argmax() :][:_HEARD_SECONDS].ravel()
+    sums = np.convolve(levels, np.ones(min(_LOOP_SECONDS, len(levels))), "valid")
+    return seconds[sums.argmax() :][:_LOOP_SECONDS].ravel()
 
 
 def _rows(

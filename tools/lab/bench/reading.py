@@ -54,7 +54,7 @@ def measure(work: Workload) -> Table:
     """
     live = work.live
     hours = {"finished": live.finished, "chunks of 0.5 s": live.completed}
-    rows = [row for name, log in hours.items() for row in _beside_peers(name, log)]
+    rows = [row for name, log in hours.items() for row in _against_peers(name, log)]
     rows += _alone("unfinished", [live.unfinished])
     days = {"a day finished": work.day, "a day, chunks of 0.5 s": work.completed_day}
     for name, folder in days.items():
@@ -95,7 +95,7 @@ def _rows_of_ours(name: str, best: Mapping[str, Seconds]) -> list[Row]:
     ]
 
 
-def _beside_peers(name: str, log: Path) -> list[Row]:
+def _against_peers(name: str, log: Path) -> list[Row]:
     ours = _ours(log)
     count = len(ours[0])
     best = _ours_and_least([log])

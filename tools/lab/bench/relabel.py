@@ -120,10 +120,10 @@ def _best(logs: Path, model: Path, workers: int) -> _Run:
 def _ours(logs: Path, model: Path, workers: int) -> _Run:
     for layer in logs.rglob("*.relabel-*.mcap"):
         layer.unlink()
-    asked = ["relabel", logs, "--model", model, "--workers", workers, "--json"]
+    arguments = ["relabel", logs, "--model", model, "--workers", workers, "--json"]
     began = time.perf_counter()
     done = subprocess.run(  # noqa: S603  ours
-        [sys.executable, "-c", _RUN, *HEARTHLOG, *map(str, asked)],
+        [sys.executable, "-c", _RUN, *HEARTHLOG, *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,

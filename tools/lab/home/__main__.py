@@ -66,7 +66,7 @@ def home(
             return
     settings = Settings(output=output / "logs", model=model, timezone="UTC")
     begin = round(start.timestamp()) * NANOSECONDS
-    record_composition(composition, settings, begin, progress=_say)
+    record_composition(composition, settings, begin, progress=_print_progress)
 
 
 def _write_hours(composition: Composition, folder: Path, start: datetime) -> None:
@@ -76,10 +76,10 @@ def _write_hours(composition: Composition, folder: Path, start: datetime) -> Non
         at = start + timedelta(seconds=first * FRAME_SECONDS)
         path = folder / f"home_{at:%Y%m%dT%H%M%SZ}.flac"
         write_sound(composition, path, first, min(_HOUR_FRAMES, frames - first))
-        _say(min(1.0, (first + _HOUR_FRAMES) / frames))
+        _print_progress(min(1.0, (first + _HOUR_FRAMES) / frames))
 
 
-def _say(share: float) -> None:
+def _print_progress(share: float) -> None:
     if sys.stderr.isatty():
         print(f"\r{share:4.0%}", end="" if share < 1.0 else "\n", file=sys.stderr, flush=True)
 

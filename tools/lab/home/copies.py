@@ -335,11 +335,11 @@ def copies(
     output: Annotated[Path, typer.Option("--output", "-o", help="New folder.")],
 ) -> None:
     """Make a month of a home from a day: its logs and layers, again and again, as of other days."""
-    written = copy_logs(logs, output, days, progress=_say)
+    written = copy_logs(logs, output, days, progress=_print_progress)
     print(f"{len(written)} files in {output}")
 
 
-def _say(share: float) -> None:
+def _print_progress(share: float) -> None:
     if sys.stderr.isatty():
         print(f"\r{share:4.0%}", end="" if share < 1.0 else "\n", file=sys.stderr, flush=True)
 

@@ -137,9 +137,9 @@ class Person:
                 break
             origin = (self.name, made, LIVE)
             marks = [Mark(microphone, *label, *origin) for label in labels]
-            looked_at = ReviewedSpan(microphone, item.start, item.end, *origin, item.chosen)
-            write_review(coverage, marks, looked_at)
-            done = Review([*done.marks, *marks], [*done.reviewed, looked_at], seconds)
+            reviewed = ReviewedSpan(microphone, item.start, item.end, *origin, item.chosen)
+            write_review(coverage, marks, reviewed)
+            done = Review([*done.marks, *marks], [*done.reviewed, reviewed], seconds)
         return done
 
     def corrections(
@@ -227,7 +227,7 @@ def _seconds(item: ReviewItem, marks: int) -> float:
     return length + (_MARK_SECONDS * marks if length >= _MINUTE else _LOOK_SECONDS)
 
 
-def write_review(coverage: Coverage, marks: Sequence[Mark], looked_at: ReviewedSpan) -> None:
+def write_review(coverage: Coverage, marks: Sequence[Mark], reviewed: ReviewedSpan) -> None:
     """Write what came of a span to the layers of the logs that it is in.
 
     Parameters
@@ -235,14 +235,14 @@ def write_review(coverage: Coverage, marks: Sequence[Mark], looked_at: ReviewedS
     coverage : Coverage
         Of the microphone.
     marks : sequence of Mark
-    looked_at : ReviewedSpan
+    reviewed : ReviewedSpan
 
     Raises
     ------
     LogError
         If marks cannot be written.
     """
-    for log, first, last in coverage.split(looked_at.start, looked_at.end):
+    for log, first, last in coverage.split(reviewed.start, reviewed.end):
         inside = [mark for mark in marks if mark.start < last and mark.end > first]
         cut = [m._replace(start=max(m.start, first), end=min(m.end, last)) for m in inside]
-        write_marks(log, cut, reviewed=[looked_at._replace(start=first, end=last)])
+        write_marks(log, cut, reviewed=[reviewed._replace(start=first, end=last)])
