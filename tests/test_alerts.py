@@ -639,7 +639,7 @@ def test_a_replay_with_a_damaged_log_uses_the_others_and_ends_with_status_3(
     done = hearthlog("alerts", "replay", tmp_path / "home" / "logs", *options)
     assert done.returncode == 3
     assert str(log) in done.stderr
-    assert "coughs     more_than      1" in done.stdout
+    assert "coughs     more_than       1" in done.stdout
 
 
 @pytest.mark.parametrize(
