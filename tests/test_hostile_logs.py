@@ -322,6 +322,21 @@ def test_a_message_index_that_lies_is_not_used(tmp_path, hearthlog):
     assert "message indexes that do not belong to their chunks are not used" in done.stderr
 
 
+def test_a_message_index_that_lists_a_message_in_the_place_of_another_is_not_used(
+    tmp_path, hearthlog
+):
+    path = numbers(tmp_path / "x.mcap")
+    with LogFile(path) as file:
+        row = file.chunks[1]
+    data = bytearray(path.read_bytes())
+    first = int(row["offset"] + row["length"]) + HEAD.size + 6
+    data[first + 32 : first + 64] = data[first : first + 32]  # entries 0 and 1, for 2 and 3
+    path.write_bytes(data)
+    done = hearthlog("cat", path)
+    assert (done.returncode, printed(done)) == (3, list(range(30)))
+    assert "message indexes that do not belong to their chunks are not used" in done.stderr
+
+
 def test_a_chunk_that_the_index_puts_into_another_time_is_read_in_its_own(tmp_path, hearthlog):
     path = numbers(tmp_path / "x.mcap", enable_crcs=False)
     data = bytearray(path.read_bytes())

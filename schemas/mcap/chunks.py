@@ -552,8 +552,11 @@ class _Batch(NamedTuple):
         )
         if not sound.all():
             raise self._damaged(number[sound.argmin()], _WRONG_INDEX)
-        if (heads["length"] + HEAD.size).sum() > len(self.buffer):
-            raise self._damaged(number[0], _WRONG_INDEX)  # two entries point at one message
+        repeated = np.zeros(0, bool)  # entries that point at the message of another one
+        if (starts[1:] <= starts[:-1]).any():
+            repeated = np.diff(np.sort(starts)) == 0
+        if repeated.any() or (heads["length"] + HEAD.size).sum() > len(self.buffer):
+            raise self._damaged(number[0], _WRONG_INDEX)
         offsets = starts + MESSAGE_HEAD.itemsize
         schema = self.file.schemas.get(channel.schema_id)
         return RawMessages(channel, schema, self.buffer, offsets, heads, self.file.path)
