@@ -9,8 +9,14 @@ export function say(key, values = {}) {
   return texts[`page.${key}`].replace(/\{(\w+)\}/g, (_, name) => values[name]);
 }
 
-export function count(key, number) {
-  return say(`${key}.${number === 1 ? "one" : "other"}`, { count: number.toLocaleString(language) });
+export function count(key, number, unsure = 0) {
+  return say(`${key}.${number === 1 ? "one" : "other"}`, { count: counted(number, unsure) });
+}
+
+// A count, those apart that are not sure: 2 (+3?), or 3? if none is sure.
+export function counted(value, unsure) {
+  if (!unsure) return value.toLocaleString(language);
+  return unsure === value ? `${value}?` : `${value - unsure}\u202F(+${unsure}?)`;
 }
 
 const BREAKS = texts["page.breaks"].split(" ").map((word) => [word.replaceAll("|", ""), word.replaceAll("|", "\u00ad")]);
