@@ -237,10 +237,13 @@ def test_the_sentence_tells_what_is_sure_from_what_may_be(sounds, english, germa
         ),
         (
             [*coughs_at(1, 2, 3, 4), *coughs_at(1.5, 2.5, 3.5, sure=False)],
-            "coughing 4 times (01:00, 02:00, 03:00 and 04:00), perhaps 3 more (01:30, 02:30 and 03:30)",
             (
-                "4\N{NON-BREAKING HYPHEN}mal Husten (01:00, 02:00, 03:00 und 04:00), vielleicht noch "
-                "3\N{NON-BREAKING HYPHEN}mal (01:30, 02:30 und 03:30)"
+                "coughing 4 times (01:00, 02:00, 03:00 and 04:00), perhaps 3 more (01:30, 02:30 and "
+                "03:30)"
+            ),
+            (
+                "4\N{NON-BREAKING HYPHEN}mal Husten (01:00, 02:00, 03:00 und 04:00), vielleicht "
+                "noch 3\N{NON-BREAKING HYPHEN}mal (01:30, 02:30 und 03:30)"
             ),
         ),
     ],
@@ -253,7 +256,10 @@ def test_the_sentence_names_a_minute_once_and_times_once(sounds, english, german
 
 def test_a_count_with_what_is_not_sure_is_one_grammar_in_the_day_and_beside_other_classes():
     rings = [(hour, 4, "phone_ring", 0.6) for hour in (9, 9.5, 10, 11.1)]
-    coughs = [*coughs_at(8, 8.5, 9.1, 10.1), *coughs_at(*(12 + n / 2 for n in range(11)), sure=False)]
+    coughs = [
+        *coughs_at(8, 8.5, 9.1, 10.1),
+        *coughs_at(*(12 + n / 2 for n in range(11)), sure=False),
+    ]
     home = home_at(19, tiled((-3, 19), *coughs, *rings))
     assert picture_of(home)["sentence"] == (
         "Since 07:00: coughing 4 times, perhaps 11 more, by the sound of it."
@@ -313,8 +319,8 @@ def test_a_sentence_about_several_classes_is_short_and_begins_with_the_most_impo
     home = home_at(23, tiled((-3, 23), *sounds[:-1], *rings))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "phone_ring"]
     assert picture_of(home)["sentence"] == (
-        "Coughing 4 times (08:00, 08:30, 09:06 and 10:06), perhaps once more (12:00), by the sound of "
-        "it."
+        "Coughing 4 times (08:00, 08:30, 09:06 and 10:06), perhaps once more (12:00), by the sound "
+        "of it."
     )
     crying = [(hour, 3, "crying", 0.9) for hour in (13, 14, 15)]
     home = home_at(23, tiled((-3, 23), *sounds, *crying))._replace(is_past=True)
@@ -1157,7 +1163,8 @@ def test_a_dark_class_is_lighter_on_a_dark_ground_and_what_does_not_count_is_hol
         phone.open(lived, 390, 844, scheme)
         phone.until(lane("Coughing"))
         element = lane("Coughing")
-        assert phone.of(drawn.format(element, ".marks:not(.pale, .unsure)", "fill")) == "rgb(210, 94, 1)"
+        fill = phone.of(drawn.format(element, ".marks:not(.pale, .unsure)", "fill"))
+        assert fill == "rgb(210, 94, 1)"
         assert float(phone.of(drawn.format(element, ".pale", "fill-opacity"))) < 0.3
         phone.of(
             "import('./elements.js').then(({ swatch }) => { const it = swatch([139, 69, 19]);"
