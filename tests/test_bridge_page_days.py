@@ -238,8 +238,8 @@ def test_the_sentence_tells_what_is_sure_from_what_may_be(sounds, english, germa
         (
             [*coughs_at(1, 2, 3, 4), *coughs_at(1.5, 2.5, 3.5, sure=False)],
             (
-                "coughing 4 times (01:00, 02:00, 03:00 and 04:00), perhaps 3 more (01:30, 02:30 and "
-                "03:30)"
+                "coughing 4 times (01:00, 02:00, 03:00 and 04:00), perhaps 3 more (01:30, 02:30 "
+                "and 03:30)"
             ),
             (
                 "4\N{NON-BREAKING HYPHEN}mal Husten (01:00, 02:00, 03:00 und 04:00), vielleicht "
