@@ -47,7 +47,7 @@ function fill(element, attributes, children) {
 
 // A number stays on the line of what it counts, and a range of hours on one.
 export function write(element, text) {
-  const glued = text.replace(/(\d) (?=\p{L})/gu, "$1\u00a0").replace(/(\d–)(?=\d)/g, "$1\u2060");
+  const glued = text.replace(/([\d½]) (?=\p{L})/gu, "$1\u00a0").replace(/(\d–)(?=\d)/g, "$1\u2060");
   if (element.textContent !== glued) element.textContent = glued;
 }
 
