@@ -102,8 +102,9 @@ def _sounds_of_week(recorded: Sequence[DayMetrics], number: int) -> Iterator[str
         if not counts:
             continue
         total = sum((count for count, _ in counts), Count())
-        text = amount(name, total, when=f"on {_several(len(counts), 'day')}")
         most, day = max(counts, key=lambda pair: pair[0].labelled)
+        when = f"{len(counts)} days" if len(counts) > 1 else short_day(day.day)
+        text = amount(name, total, f"on {when}")
         if len(counts) > 1 and most.labelled > total.labelled / number:
             text += f"; most on {short_day(day.day)}: {most.labelled}"
         yield text
@@ -275,10 +276,6 @@ def _when(day: DayMetrics, starts: Int64) -> str:
     number, before = int((starts < day.span.starts[0]).sum()), day.day - timedelta(days=1)
     which = f"{number} of them" if number < len(starts) else "all"
     return f"{which} on {weekday(before)}" if number else ""
-
-
-def _several(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def _sentence(text: str) -> str:

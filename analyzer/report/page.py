@@ -275,7 +275,7 @@ def _apart(figure: ReportFigure, days: Sequence[DayMetrics]) -> str:
     number = sum(day.uncounted_events(figure.name) for day in days) if figure.counts else 0
     minutes = sum(day.uncounted_minutes(figure.name) for day in days) if figure.lasts else 0.0
     amount = f"{number}" if number else Duration(minutes).text.replace(" ", _SPACE)
-    return f"{amount} {_BESIDE}" if number or minutes else ""
+    return f"{amount} {_BESIDE}" if number or minutes >= 1 else ""
 
 
 def _times(day: DayMetrics, starts: Int64) -> str:
