@@ -373,9 +373,8 @@ def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
         names = [name for name in day.home.classes if name != SILENCE]
         lasting = sorted(names, key=lambda name: -_counted_minutes(true, name))
         stated = [name for name in names if _mentions(match[1], name)]
-        shown = ", ".join(
-            f"{in_words(n)} {_counted_minutes(true, n):.0f}" for n in lasting[: len(stated)]
-        )
+        most = lasting[: len(stated)]
+        shown = ", ".join(f"{in_words(n)} {_counted_minutes(true, n):.0f}" for n in most)
         yield _judged(REPORT, text, shown, right={*stated} == {*most}, modest=modest)
     elif "It was quiet." in text:
         yield _judged(
