@@ -40,7 +40,6 @@ from hearthlog.analyzer.logs.spans import (
     single_span,
 )
 from hearthlog.models.classes import (
-    APART_IN_REPORT,
     ON_TELEVISION,
     SILENCE,
     TELEVISION,
@@ -258,6 +257,7 @@ class DayMetrics:
     night: Spans
     coverage: Spans  # covered spans of the day
     logged: Spans  # the part of the day from the first log to the last one; may have no length
+    apart: Collection[str] = ON_TELEVISION  # classes that do not count beside a television
 
     @property
     def before_logs(self) -> int:
@@ -299,8 +299,8 @@ class DayMetrics:
 
     @property
     def counting(self) -> HomeMinutes:
-        """Minutes of the home in which `APART_IN_REPORT` does not count beside a television."""
-        return replace(self.home.minutes, apart=APART_IN_REPORT)
+        """Minutes of the home in which the classes `apart` do not count beside a television."""
+        return replace(self.home.minutes, apart=self.apart)
 
     def joined_events(self, name: str) -> tuple[Spans, Spans]:
         """Return the spans of the events of a class that count, and of those that do not."""
@@ -436,7 +436,11 @@ class DayMetrics:
 
 
 def day_of(
-    home: HomeMetrics, day: date, zone: tzinfo, logged: tuple[int, int] | None = None
+    home: HomeMetrics,
+    day: date,
+    zone: tzinfo,
+    logged: tuple[int, int] | None = None,
+    apart: Collection[str] = ON_TELEVISION,
 ) -> DayMetrics:
     """Return the figures of a local day; its night is from 22:00 on the day before to 07:00.
 
@@ -449,7 +453,8 @@ def day_of(
     coverage = intersection(near.coverage, span)
     first, last = (start, end) if logged is None else (min(max(t, start), end) for t in logged)
     first, last = start if first - start < MINUTE else first, end if end - last < MINUTE else last
-    return DayMetrics(day, near, zone, span, night, coverage, single_span(first, last))
+    logs = single_span(first, last)
+    return DayMetrics(day, near, zone, span, night, coverage, logs, apart)
 
 
 def _share(covered: Spans, span: Spans) -> float:

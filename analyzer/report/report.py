@@ -125,9 +125,9 @@ def read_report_data(
     checks = replace(checked.of_model(model), apart=APART_IN_REPORT)
     metrics = metrics_of_home(home, checks)
     routines = Routines(Profiles(home_sound(home, metrics), zone, night_after=False))
-    past = [day_of(metrics, day, zone) for day in earlier]
+    past = [day_of(metrics, day, zone, apart=APART_IN_REPORT) for day in earlier]
     logged = _logged(logs, metrics.coverage)
-    shown = [day_of(metrics, day, zone, logged) for day in days]
+    shown = [day_of(metrics, day, zone, logged, APART_IN_REPORT) for day in days]
     span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
     data = ReportData(
         nodes=home.nodes,

@@ -59,7 +59,16 @@ def _draw_lanes(axes: Any, timelines: Sequence[DayTimeline]) -> None:
             middle = (block.left + block.width / 2) * timeline.steps / 100
             if block.width >= _WRITTEN:
                 level = top + max(each, 1) / 2
-                axes.text(middle, level, text, ha="center", va="center", fontsize=8.5, color=_HATCH)
+                axes.text(
+                    middle,
+                    level,
+                    text,
+                    ha="center",
+                    va="center",
+                    fontsize=8.5,
+                    color=_HATCH,
+                    backgroundcolor="white",
+                )
         for place, lane in enumerate(timeline.lanes):
             _draw_gaps(axes, timeline, lane.gaps, (top + place, 1))
             _draw_lane(axes, lane, top + place)
