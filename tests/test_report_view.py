@@ -178,7 +178,7 @@ def test_no_text_leaves_its_place_on_a_narrow_screen(browser, days, tmp_path):
     for width in (360, 390, 600, 768):
         set_size(browser, width, 844, mobile=width < 600)
         browser.open(address)
-        assert browser.evaluate("document.documentElement.scrollWidth") == width
+        assert browser.evaluate("document.documentElement.scrollWidth") <= width
         assert json.loads(browser.evaluate(_OUTSIDE)) == [], width
 
 
