@@ -482,10 +482,54 @@ def test_a_mark_that_cannot_be_shown_is_made_once_and_undone_once(home):
     sitting.screen.marked = (START + 15 * SECOND, START + 19 * SECOND)
     sitting.screen.draws = False
     sitting.session.press("3")
-    assert "saved, but not shown" in sitting.output[-1]
+    assert sitting.output[-1] == "saved, but not shown, as the viewer did not answer"
     sitting.session.press("z")
-    assert "saved, but not shown" in sitting.output[-1]
+    assert sitting.output[-1] == "undone, but not shown, as the viewer did not answer"
     assert [mark.label for mark in layers(home)] == ["speech"]
+
+
+def test_before_the_first_key_nothing_is_called_saved_and_a_skip_saves_nothing(home):
+    sitting = Sitting(home, items_of(2))
+
+    def silent(*_):
+        raise TimeoutError
+
+    sitting.screen.draws, sitting.session.look_closely = False, silent
+    sitting.run("n")
+    loading, hint, first, skipped, second, _ = sitting.output
+    assert loading == "The picture is still loading; you can answer already."
+    assert hint.startswith("press a")
+    assert skipped == "not shown, as the viewer did not answer"
+    assert (first[:8], second[:8]) == ("1 of 2: ", "2 of 2: ")
+
+
+def test_what_plays_plays_although_the_viewer_does_not_answer(home):
+    def silent(_):
+        raise TimeoutError
+
+    sitting = Sitting(home)
+    sitting.screen.marked = (START, START + SECOND)
+    sitting.screen.play = silent
+    sitting.session.press("p")
+    assert sitting.output == ["playing"]
+
+
+def test_a_queue_of_which_nothing_can_be_heard_says_so_once(home):
+    sitting = Sitting(home, [one._replace(is_audible=False) for one in items_of(2)])
+    sitting.run("n")
+    first, *others = sitting.output
+    assert first.startswith("None of these can be heard: record with `--keep-audio unsure` (see ")
+    assert not any("hear" in line for line in others)
+    assert all("hear" not in one[2].place for one in sitting.screen.requested if one)
+
+
+def test_the_classes_come_first_and_yes_names_the_class(home):
+    day, queue = Sitting(home).session, Sitting(home, items_of(1))
+    assert [one.key for one in day.keys][:7] == [*"123tuc", "."]
+    assert [one.key for one in queue.session.keys][:7] == [*"a123tu", "."]
+    queue.run("")
+    ((*_, question),) = filter(None, queue.screen.requested)
+    assert question.keys[0][:2] == ("a", "yes, music")
 
 
 def test_a_queue_goes_on_by_itself_and_ends_after_the_last_span(home):
