@@ -424,7 +424,7 @@ class ReviewSession:
     def _answers(self) -> list[Key]:
         """Return the keys that answer the question of the current item."""
         item, labels = self.items[self._at], self._labels()
-        yes = Key("a", f"yes, {_words(item.label)}")
+        yes = Key("a", "yes")
         if self._in_minute:
             yes = Key(_RIGHT, "yes, or the rest is right", shown=_CAPS[_RIGHT])
         others = [key for key, label in labels.items() if self._in_minute or label != item.label]

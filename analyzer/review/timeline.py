@@ -341,6 +341,11 @@ class Timeline:
     losses: list[str] = field(default_factory=list)
 
     @property
+    def has_sound(self) -> bool:
+        """Whether some sound was kept."""
+        return any(microphone.clips for microphone in self.microphones.values())
+
+    @property
     def clock(self) -> HomeClock:
         """Clock of the home.
 
