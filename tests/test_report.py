@@ -262,10 +262,7 @@ def text_beside_picture(page):
 def test_what_is_missing_of_a_day_is_stated_once_and_why_below(tmp_path):
     write_day(tmp_path, DAY, [(at("10:30"), 60, "speech", 0.8)], hours=[10])
     text = text_beside_picture(page_of(tmp_path, tmp_path))
-    assert (
-        "Sunday from 10:00 to 11:00: talking. There are no logs before 10:00 and none after 11:00 "
-        "yet." in text
-    )
+    assert "Sunday from 10:00 to 11:00: talking. There are logs only from 10:00 to 11:00." in text
     for again in (
         "Recorded:",
         "ot recorded",
@@ -308,8 +305,8 @@ def test_of_a_day_that_was_hardly_heard_nothing_is_said_not_to_have_been(tmp_pat
     assert text.count("Too little was recorded to tell anything.") == 1, "of the night"
     assert "was quiet" not in text
     assert (
-        "Sunday from 12:00 to 13:00: talking. 1 bout of coughing by day (12:05). There are no logs "
-        "before 12:00 and none after 13:00 yet."
+        "Sunday from 12:00 to 13:00: talking. 1 bout of coughing by day (12:05). There are "
+        "logs only from 12:00 to 13:00."
     ) in text
 
 
@@ -495,8 +492,8 @@ def test_a_day_is_quiet_if_at_most_six_of_its_hours_have_five_minutes_of_sound(
         (
             range(6, 18),
             (
-                "Sunday from 06:00 to 18:00: nothing but quiet. There are no logs before 06:00 and "
-                "none after 18:00 yet."
+                "Sunday from 06:00 to 18:00: nothing but quiet. There are logs only from 06:00 "
+                "to 18:00."
             ),
         ),
         (
@@ -527,7 +524,7 @@ _CLATTER = (at("23:20"), 40, "objects_activity", 0.9)
         ),
         ([22, 23], [(at("22:10"), 20, "speech", 0.9)], "from 22:00 to 24:00: under 1 min of sound"),
         ([22, 23], [(at("22:10"), 240, "unknown", 0.4)], "from 22:00 to 24:00: 4 min of sound."),
-        ([3, 22], [_TALK], "In the recorded 2 h 00 min of Sunday: talking. There are no logs"),
+        ([3, 22], [_TALK], "In the recorded 2 h 00 min of Sunday: talking. There are logs only"),
     ],
 )
 def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
@@ -540,10 +537,10 @@ def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
 @pytest.mark.parametrize(
     ("hours", "hatched", "text"),
     [
-        (range(10), 0, "from 00:00 to 10:00: nothing but quiet. There are no logs after 10:00 yet"),
-        (range(8, 10), 0, "There are no logs before 08:00 and none after 10:00 yet."),
+        (range(10), 0, "from 00:00 to 10:00: nothing but quiet. There are logs only up to 10:00."),
+        (range(8, 10), 0, "There are logs only from 08:00 to 10:00."),
         (range(20), 0, "Sunday until 20:00 was quiet."),
-        ([*range(8), 9], 90, "no logs after 10:00 yet. 1 h 00 min of the rest were not recorded."),
+        ([*range(8), 9], 90, "logs only up to 10:00. 1 h 00 min of the rest were not recorded."),
     ],
 )
 def test_hours_without_logs_at_the_ends_are_not_called_not_recorded(tmp_path, hours, hatched, text):
@@ -562,14 +559,14 @@ def test_the_days_of_a_week_before_the_first_log_and_after_the_last_are_not_hatc
     page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
     assert re.findall(r'class="unlogged".*?><span>(.*?)</span>', page) == [
         *["before the first log"] * 3,
-        *["no logs yet"] * 2,
+        *["after the last log"] * 2,
     ]
     assert 'class="gap"' not in page
     assert 'class="alert"' not in page
     text = text_of(page)
     assert "Both of the two recorded days" in text
     assert "there are no logs of the other five days." in text
-    assert "There are no logs before Thu 26 Feb and none after Fri 27 Feb yet." in text
+    assert "There are logs only from Thu 26 Feb to Fri 27 Feb." in text
 
 
 def test_a_minute_of_a_day_is_no_hour_and_leaves_the_rest_of_the_day(tmp_path):
@@ -782,8 +779,7 @@ def test_the_picture_has_a_title_and_tells_in_words_what_it_shows(tmp_path):
     assert page.count('role="img"') == 1
     assert 'aria-label="The sounds of Sunday, 1 March 2026"' in page
     assert (
-        ">Coughing 2. There are no logs after 21:00 yet. Not recorded: 18:00 to 20:00.</desc>"
-        in page
+        ">Coughing 2. There are logs only up to 21:00. Not recorded: 18:00 to 20:00.</desc>" in page
     )
     assert page.count('aria-hidden="true"') == 1, "its words and strips are not read one by one"
 

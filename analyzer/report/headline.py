@@ -221,10 +221,13 @@ def unlogged(days: Sequence[DayMetrics], *, with_day: bool = False) -> str:
         edge_of_week(edge, zone, is_end=is_end) if with_day else clock_text(edge, zone)
         for edge, is_end in zip(edges, (False, True), strict=True)
     )
-    parts = [f"no logs before {first}"] * bool(days[0].before_logs)
-    if days[-1].after_logs:
-        parts.append(f"{'none' if parts else 'no logs'} after {last} yet")
-    return f"There are {listed(parts, 'and')}." if parts else ""
+    begins, ends = bool(days[0].before_logs), bool(days[-1].after_logs)
+    span = {
+        (True, True): f"from {first} to {last}",
+        (True, False): f"from {first} on",
+        (False, True): f"up to {last}",
+    }.get((begins, ends))
+    return "" if span is None else f"There are logs only {span}."
 
 
 def _is_covered(day: DayMetrics) -> bool:

@@ -23,7 +23,7 @@ from hearthlog.schemas.arrays import Bool, Float64, Int64
 
 PHONE_LANES = 12
 LOW = 0.5  # height of a mark of which the model is not sure
-BEFORE_LOGS, AFTER_LOGS = "before the first log", "no logs yet"
+BEFORE_LOGS, AFTER_LOGS = "before the first log", "after the last log"
 _LEAST_HATCHED = 2  # minutes
 # Marks are at least three pixels wide: of the widest page 5.5 steps, of the narrowest 16.
 _TOUCHING, _SHORT, _LONG = 5, 16.0, 2.0  # steps
