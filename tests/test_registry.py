@@ -163,17 +163,8 @@ def test_models_are_listed_as_a_table_and_as_json(folder, capfd):
     assert "talking, music, telephone ringing" in " ".join(result.stdout.split())
     result = run(capfd, "models", "list", "--verbose", "--folder", folder)
     head, *rows = result.stdout.splitlines()
-    assert head.split() == [
-        "name",
-        "alias",
-        "classes",
-        "inputs",
-        "macro",
-        "F1",
-        "ECE",
-        "sha256",
-        "MB",
-    ]
+    assert head.split()[-6:] == ["macro", "F1", "inputs", "ECE", "sha256", "MB"]
+    rows = [row for row in rows if row[0] != " "]  # classes go on in the next line
     assert [row.split()[0] for row in rows] == ["broad", "one", "two", *STARTERS]
     assert rows[3].split()[1] == "starter"
     assert "champion" in rows[1]

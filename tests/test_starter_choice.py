@@ -181,13 +181,13 @@ def test_a_starter_is_promoted_for_the_network_that_is_there(yamnet, capfd):
 
 def test_the_network_of_a_model_is_named_and_whether_it_is_here(yamnet, capfd):
     def inputs():
-        rows = run(capfd, "models", "list", "--verbose").stdout.splitlines()
+        rows = run(capfd, "models", "list").stdout.splitlines()
         return next(row for row in rows if row.startswith("general-embedding"))
 
-    assert "home33 above_floor, yamnet  " in inputs()
+    assert "yamnet  " in inputs()
     assert run(capfd, "models", "show", "general-embedding").stderr == ""
     yamnet.unlink()
-    assert "home33 above_floor, yamnet (not here)" in inputs()
+    assert "yamnet (not here)" in inputs()
     shown = run(capfd, "models", "show", "general-embedding").stderr
     assert shown == ("hearthlog: the network yamnet is not here: hearthlog models fetch yamnet\n")
 

@@ -150,7 +150,7 @@ models = typer.Typer(
 models.command()(fetch)
 
 _HEAD = ("name", "alias", "network", "classes", "macro F1")
-_LONG_HEAD = ("name", "alias", "classes", "inputs", "macro F1", "ECE", "sha256", "MB")
+_LONG_HEAD = (*_HEAD, "inputs", "ECE", "sha256", "MB")
 
 
 class _ClassShare(NamedTuple):
@@ -543,46 +543,28 @@ def _is_here(network: str) -> bool:
 def _row(entry: "ModelEntry") -> tuple[str, ...]:
     from hearthlog.models.classes import OF_EVERY_SCENARIO, in_words
 
-    name, alias = ascii(entry.name)[1:-1], _aliases(entry)
+    name = ascii(entry.name)[1:-1]
+    alias = ", ".join((*entry.aliases, *["starter"] * entry.starter))
     if entry.model is None:
         return name, alias, "", "cannot be used", ""
-    classes = entry.model.description.classes
-    sounds = ", ".join(in_words(one).lower() for one in classes if one not in OF_EVERY_SCENARIO)
-    return name, alias, _network_and_presence(entry.model), sounds, _macro_f1(entry.model)
+    about, network = entry.model.description, _network(entry.model)
+    if network and not _is_here(network):
+        network += " (not here)"
+    sounds = [in_words(one).lower() for one in about.classes if one not in OF_EVERY_SCENARIO]
+    figure = f"{about.metrics.macro_f1:.3f}{' simulated' * about.training_data.simulated}"
+    return name, alias, network, ", ".join(sounds), figure
 
 
 def _long_row(entry: "ModelEntry") -> tuple[str, ...]:
-    alias, size = _aliases(entry), f"{entry.size / 1e6:.2f}"
+    size = f"{entry.size / 1e6:.2f}"
     if entry.model is None:
-        return ascii(entry.name)[1:-1], alias, "cannot be used", "", "", "", "", size
-    description = entry.model.description
-    more = ", directions" if description.direction_microphones else ""
-    if network := _network_and_presence(entry.model):
-        more += f", {network}"
-    return (
-        entry.name,
-        alias,
-        f"{description.scenario_name} ({len(description.classes)})",
-        f"{description.feature_set} {description.inputs}{more}",
-        _macro_f1(entry.model),
-        f"{description.metrics.expected_calibration_error:.3f}",
-        entry.model.sha256[:12],
-        size,
+        return *_row(entry), "", "", "", size
+    about = entry.model.description
+    inputs = (
+        f"{about.feature_set} {about.inputs}{', directions' * bool(about.direction_microphones)}"
     )
-
-
-def _aliases(entry: "ModelEntry") -> str:
-    return ", ".join((*entry.aliases, *["starter"] * entry.starter))
-
-
-def _network_and_presence(model: "Model") -> str:
-    network = _network(model)
-    return f"{network} (not here)" if network and not _is_here(network) else network
-
-
-def _macro_f1(model: "Model") -> str:
-    simulated = " simulated" * model.description.training_data.simulated
-    return f"{model.description.metrics.macro_f1:.3f}{simulated}"
+    error = f"{about.metrics.expected_calibration_error:.3f}"
+    return *_row(entry), inputs, error, entry.model.sha256[:12], size
 
 
 def _as_json(entry: "ModelEntry") -> dict[str, object]:
