@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 from homelife import GENERAL, at, write_day
-from livehome import LiveHome
+from livehome import LiveHome, midday_zone
 from pydantic import ValidationError
 from servedhome import JSON, PALE_TEXTS, Phone, proxying, serving
 from viewers import browsing, patiently
@@ -489,11 +489,14 @@ def lived(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lived")
     now = datetime.now(UTC)
     days = [(now - timedelta(days=back)).date() for back in (4, 3)]
-    sounds = [(at("13:10"), 5.0, "coughing", 0.9), (at("13:40"), 90.0, "speech", 0.8)]
+    # The zone of the home depends on the hour of the test: it is always 13:10 there.
+    shift = int(midday_zone().utcoffset(now).total_seconds())
+    cough, talk = ((at(clock) - shift) % 86_400 for clock in ("13:10", "13:40"))
+    sounds = [(cough, 5.0, "coughing", 0.9), (talk, 90.0, "speech", 0.8)]
     for day in days:
         write_day(folder / "logs", day, sounds)
     begin = int(datetime(days[1].year, days[1].month, days[1].day, tzinfo=UTC).timestamp())
-    start = round(begin + at("13:10")) * NANOSECONDS
+    start = round(begin + cough) * NANOSECONDS
     keep_sound(folder / "logs", "mic", start, 5)
     with serving(folder, {"sound": True}) as home:
         home.coughed = start
