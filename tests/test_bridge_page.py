@@ -33,7 +33,7 @@ from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
-from hearthlog.analyzer.bridge.wording import ENGLISH
+from hearthlog.analyzer.bridge.wording import ENGLISH, translation_for
 from hearthlog.analyzer.http import HttpServer, free_port
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import Mark, write_marks
@@ -669,9 +669,13 @@ def test_times_and_lengths_are_said_in_words():
         "yesterday 23:00",
         "3 May 00:00",
     ]
-    output = [ENGLISH.length(seconds) for seconds in (0.4, 1, 89, 91, 5400, 7260)]
-    expected = "less than a second,1 second,89 seconds,2 minutes,1 hour 30 minutes,2 hours 1 minute"
+    output = [ENGLISH.length(seconds) for seconds in (0.4, 1, 59.6, 84, 200, 320, 5040, 7260)]
+    expected = (
+        "less than a second,1 second,1 minute,1½ minutes,3½ minutes,5 minutes,1 hour 24 minutes,"
+        "2 hours 1 minute"
+    )
     assert output == expected.split(",")
+    assert translation_for("de").length(84) == "1½ Minuten"
 
 
 def test_a_day_of_thousands_of_sounds_is_small():

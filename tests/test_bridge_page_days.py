@@ -194,8 +194,8 @@ def coughs_at(*hours, sure=True):
         ),
         (
             [*coughs_at(3), *coughs_at(4, sure=False), (5, 3, "crying", 0.9)],
-            "coughing twice (1 not sure) and crying once",
-            "zweimal Husten (1 unsicher) und einmal Weinen",
+            "coughing once, perhaps once more; crying once",
+            "einmal Husten, vielleicht noch einmal; einmal Weinen",
         ),
         (
             [*coughs_at(1, 2, 2.5, 3), (5, 3, "crying", 0.9)],
@@ -219,24 +219,114 @@ def test_the_sentence_tells_what_is_sure_from_what_may_be(sounds, english, germa
         assert sentence == f"{start}{what}{end}"
 
 
+@pytest.mark.parametrize(
+    ("sounds", "english", "german"),
+    [
+        (
+            coughs_at(2.07, 2.08, 2.62),
+            "coughing 3 times (02:04 twice, 02:37)",
+            "3\N{NON-BREAKING HYPHEN}mal Husten (02:04 zweimal, 02:37)",
+        ),
+        (
+            [*coughs_at(2.67), *coughs_at(1.07, 1.075, 1.08, sure=False)],
+            "coughing once (02:40), perhaps 3 more times (01:04 3 times)",
+            (
+                "einmal Husten (02:40), vielleicht noch 3\N{NON-BREAKING HYPHEN}mal "
+                "(01:04 3\N{NON-BREAKING HYPHEN}mal)"
+            ),
+        ),
+        (
+            [*coughs_at(1, 2, 3, 4), *coughs_at(1.5, 2.5, 3.5, sure=False)],
+            (
+                "coughing 4 times (01:00, 02:00, 03:00 and 04:00), perhaps 3 more (01:30, 02:30 "
+                "and 03:30)"
+            ),
+            (
+                "4\N{NON-BREAKING HYPHEN}mal Husten (01:00, 02:00, 03:00 und 04:00), vielleicht "
+                "noch 3\N{NON-BREAKING HYPHEN}mal (01:30, 02:30 und 03:30)"
+            ),
+        ),
+    ],
+)
+def test_the_sentence_names_a_minute_once_and_times_once(sounds, english, german):
+    for language, what in (("en", english), ("de", german)):
+        home = home_at(9, tiled((-3, 9), *sounds), language=language)
+        assert what in picture_of(home)["sentence"]
+
+
+def test_a_count_with_what_is_not_sure_is_one_grammar_in_the_day_and_beside_other_classes():
+    rings = [(hour, 4, "phone_ring", 0.6) for hour in (9, 9.5, 10, 11.1)]
+    coughs = [
+        *coughs_at(8, 8.5, 9.1, 10.1),
+        *coughs_at(*(12 + n / 2 for n in range(11)), sure=False),
+    ]
+    home = home_at(19, tiled((-3, 19), *coughs, *rings))
+    assert picture_of(home)["sentence"] == (
+        "Since 07:00: coughing 4 times, perhaps 11 more, by the sound of it."
+    )
+    german = home._replace(words=translation_for("de"))
+    assert picture_of(german)["sentence"] == (
+        "Seit 07:00: 4\N{NON-BREAKING HYPHEN}mal Husten, vielleicht noch "
+        "11\N{NON-BREAKING HYPHEN}mal, dem Klang nach."
+    )
+
+
+def test_the_picture_has_what_is_sure_apart_from_what_is_not_and_what_does_not_count():
+    talking = [(13 + n / 60, 3, "speech") for n in range(60)]
+    coughs = [*coughs_at(9.26), *coughs_at(10.51, sure=False), *coughs_at(13.409)]
+    home = home_at(15, tiled((-3, 15), *talking, *coughs))
+    (lane,) = (e for e in picture_of(home)["rooms"][0]["lanes"] if e["label"] == "coughing")
+    marked = [
+        [n // 30 for n, bar in enumerate(lane[key], -60) if bar != "0"]
+        for key in ("bars", "sure_bars", "unsure_bars", "pale")
+    ]
+    assert marked == [[9, 10], [9], [10], [13]]
+    assert (lane["uncounted"], lane["uncounted_times"]) == (1, "13:24")
+
+
+def test_an_entry_says_in_few_words_how_many_of_it_are_not_sure_or_not_counted():
+    home = home_at(9, tiled((-3, 9), *coughs_at(2, 2.01, sure=False), *coughs_at(2.02)))
+    (bout,) = bouts(home.microphones[0].events("coughing", 0))
+    for language, texts in {
+        "en": ("2 not sure", "one beside a television, not counted"),
+        "de": ("2 unsicher", "eines neben einem Fernseher, nicht mitgezählt"),
+    }.items():
+        shown = ShownBouts(home.moment.now, UTC, translation_for(language), lambda _: "", True)
+        about = shown._replace(uncounted=[bout.first.id]).describe(bout)
+        assert (about["sure"], about["beside"]) == texts
+        assert about["unsure"] == 2
+
+
+@pytest.mark.parametrize("language", sorted(languages()))
+def test_no_text_promises_that_the_box_learns_by_itself(language):
+    texts = translation_for(language).texts
+    promises = re.compile(r"\b(learns?|teach|lern\w*|beibring\w*|beizubringen)\b")
+    assert [key for key, text in texts.items() if promises.search(text)] == []
+    training = [key for key, text in texts.items() if re.search(r"[Tt]raining", text)]
+    assert training == ["missing", "page.hint", "page.recurring hint"]
+
+
 def test_a_sentence_about_several_classes_is_short_and_begins_with_the_most_important():
     rings = [(hour, 4, "phone_ring", 0.6 if hour > 11 else 0.9) for hour in (9, 9.5, 10, 11.1)]
     sounds = [*coughs_at(8, 8.5, 9.1, 10.1), *coughs_at(12, sure=False), (11, 3, "yelling", 0.9)]
     home = home_at(23, tiled((-3, 23), *sounds, *rings))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "yelling", "phone_ring"]
     assert picture_of(home)["sentence"] == (
-        "Coughing 5 times (1 not sure) and shouting once, by the sound of it."
+        "Coughing 4 times, perhaps once more; shouting once, by the sound of it."
     )
     counts = {lane["label"]: lane["count"] for lane in picture_of(home)["rooms"][0]["lanes"]}
     assert counts["phone_ring"] == 4, "the rest is below"
     home = home_at(23, tiled((-3, 23), *sounds[:-1], *rings))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "phone_ring"]
-    assert picture_of(home)["sentence"] == "Coughing 5 times (1 not sure), by the sound of it."
+    assert picture_of(home)["sentence"] == (
+        "Coughing 4 times (08:00, 08:30, 09:06 and 10:06), perhaps once more (12:00), by the sound "
+        "of it."
+    )
     crying = [(hour, 3, "crying", 0.9) for hour in (13, 14, 15)]
     home = home_at(23, tiled((-3, 23), *sounds, *crying))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "crying", "yelling"]
     assert picture_of(home)["sentence"] == (
-        "Coughing 5 times (1 not sure), crying 3 times and shouting once, by the sound of it."
+        "Coughing 4 times, perhaps once more; crying 3 times; shouting once, by the sound of it."
     ), "none that worries is left out"
 
 
@@ -279,7 +369,7 @@ def test_the_sentence_the_times_and_the_list_call_the_same_sounds_not_sure(tmp_p
     sentence, times, entries = shown()
     assert "coughing twice (02:12 and 05:00), perhaps twice more (02:10 and 06:13)" in sentence
     assert times == {"06:13": "not sure", "05:00": "", "02:12": "", "02:10": "not sure"}
-    assert entries == ["not sure", "", "1 of them not sure"]
+    assert entries == ["not sure", "", "one not sure"]
     home = home._replace(sureness=Sureness(0.55))  # as the checked minutes of the home have it
     sentence, times, entries = shown()
     assert "coughing 4 times (02:10, 02:12, 05:00 and 06:13), by" in sentence
@@ -397,7 +487,7 @@ def test_the_page_says_which_sounds_that_people_ask_about_it_does_not_know():
     (microphone,) = home.microphones
     microphone.hidden_classes = frozenset({"yelling"})
     note = picture_of(home)["missing"]
-    assert ": telephone ringing, toilet flush, shower and water tap. To teach" in note
+    assert ": telephone ringing, toilet flush, shower and water tap. Where one was heard" in note
     microphone.names = ["silence", "coughing", "crying", "speech", "phone_ring", "running_water"]
     assert picture_of(home)["missing"] == (
         "It does not tell toilet flush, shower and water tap apart: all of them are running water "
@@ -1076,7 +1166,8 @@ def test_a_dark_class_is_lighter_on_a_dark_ground_and_what_does_not_count_is_hol
         phone.open(lived, 390, 844, scheme)
         phone.until(lane("Coughing"))
         element = lane("Coughing")
-        assert phone.of(drawn.format(element, ".marks:not(.pale)", "fill")) == "rgb(210, 94, 1)"
+        fill = phone.of(drawn.format(element, ".marks:not(.pale, .unsure)", "fill"))
+        assert fill == "rgb(210, 94, 1)"
         assert float(phone.of(drawn.format(element, ".pale", "fill-opacity"))) < 0.3
         phone.of(
             "import('./elements.js').then(({ swatch }) => { const it = swatch([139, 69, 19]);"

@@ -36,7 +36,8 @@ from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
 from hearthlog.analyzer.logs.spans import Spans, cut, difference, intersection, joined, lengths
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
-from hearthlog.analyzer.report.report import Period, make_report
+from hearthlog.analyzer.report.headline import day_headline
+from hearthlog.analyzer.report.report import Period, make_report, read_report_data
 from hearthlog.analyzer.report.timeline_plot import save_timelines
 from hearthlog.models.classes import colour, ordered
 from hearthlog.schemas.frames import NANOSECONDS
@@ -157,10 +158,7 @@ def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path):
     write_day(tmp_path / "logs", DAY, [*coughs, *rings])
     page = page_of(tmp_path / "logs", tmp_path)
     text = re.sub(r"\s+", " ", re.sub("<[^>]*>", " ", page))
-    assert (
-        "one bout of something like coughing in the night (01:30) and two (perhaps four) by day"
-        in text
-    )
+    assert "Perhaps 1 bout of coughing in the night (01:30); 2 by day, perhaps 2 more." in text
     assert re.search(r"Coughing 2 \(\+3\?\) .*Telephone ringing 1 \(\+1\?\) 15:00, 16:00", text)
     assert "A question mark, as in 3? or in 4 (+3?), is at those that the model is not" in text
 
@@ -264,18 +262,23 @@ def text_beside_picture(page):
 def test_what_is_missing_of_a_day_is_stated_once_and_why_below(tmp_path):
     write_day(tmp_path, DAY, [(at("10:30"), 60, "speech", 0.8)], hours=[10])
     text = text_beside_picture(page_of(tmp_path, tmp_path))
-    assert "Sunday from 10:00 to 11:00: talking. The other 23 hours were not recorded." in text
-    assert "In the rest of the day the recorder was off, or its logs are not here." in text
-    for again in ("Recorded:", "Not recorded:", "The report knows nothing", "Most of the sound"):
+    assert "Sunday from 10:00 to 11:00: talking. There are logs only from 10:00 to 11:00." in text
+    for again in (
+        "Recorded:",
+        "ot recorded",
+        "recorder was off",
+        "knows nothing",
+        "Most of the sound",
+    ):
         assert again not in text
 
 
 def test_the_reason_of_a_gap_is_below_the_headline_that_counts_its_hours(tmp_path):
     gap = (at("10:00"), 2 * HOUR, "silent")
-    write_day(tmp_path, DAY, hours=range(8, 14), gaps=[gap])
+    write_day(tmp_path, DAY, hours=[0, *range(8, 14), 23], gaps=[gap])
     text = text_beside_picture(page_of(tmp_path, tmp_path))
-    assert "In the 4 recorded hours of Sunday: nothing but quiet. The other 20 hours were" in text
-    assert "The recorder was off for 18 h 00 min of the time not recorded, or its logs" in text
+    assert "In the 6 recorded hours of Sunday: nothing but quiet. The other 18 hours were" in text
+    assert "The recorder was off for 16 h 00 min of the time not recorded, or its logs" in text
     assert "2 h 00 min, once (10:00 to 12:00)" in text
     assert "Not recorded:" not in text
 
@@ -302,8 +305,8 @@ def test_of_a_day_that_was_hardly_heard_nothing_is_said_not_to_have_been(tmp_pat
     assert text.count("Too little was recorded to tell anything.") == 1, "of the night"
     assert "was quiet" not in text
     assert (
-        "Sunday from 12:00 to 13:00: talking. By the sound of it, one bout of coughing by day "
-        "(12:05). The other 23 hours were not recorded."
+        "Sunday from 12:00 to 13:00: talking. 1 bout of coughing by day (12:05). There are "
+        "logs only from 12:00 to 13:00."
     ) in text
 
 
@@ -457,8 +460,8 @@ def test_the_headline_of_a_quiet_day_names_its_coughs(tmp_path):
     coughs = [(at(t), 2, "coughing", 0.9) for t in ("06:13", "15:26", "15:30")]
     write_day(tmp_path / "logs", DAY, [*coughs, (at("16:00"), 5, "yelling", 0.9)])
     assert headline(tmp_path / "logs", tmp_path) == (
-        "Sunday was quiet. By the sound of it, one bout of coughing in the night (06:13) and two "
-        "by day (15:26 and 15:30); shouting once by day (16:00)."
+        "Sunday was quiet. 1 bout of coughing in the night (06:13); 2 by day (15:26, 15:30). "
+        "Shouting once by day (16:00)."
     )
 
 
@@ -482,10 +485,16 @@ def test_a_day_is_quiet_if_at_most_six_of_its_hours_have_five_minutes_of_sound(
 @pytest.mark.parametrize(
     ("hours", "text"),
     [
-        (range(5, 24), "Sunday was quiet (19 of 24 hours recorded)."),
+        ([0, *range(6, 24)], "Sunday was quiet (19 of 24 hours recorded)."),
+        (range(5, 24), "Sunday from 05:00 was quiet."),
+        (range(5, 23), "Sunday from 05:00 to 23:00 was quiet."),
+        ([0, 1, *range(4, 20)], "Sunday until 20:00 was quiet (18 of 20 hours recorded)."),
         (
             range(6, 18),
-            "Sunday from 06:00 to 18:00: nothing but quiet. The other 12 hours were not recorded.",
+            (
+                "Sunday from 06:00 to 18:00: nothing but quiet. There are logs only from 06:00 "
+                "to 18:00."
+            ),
         ),
         (
             [*range(8), *range(13, 24)],
@@ -508,10 +517,14 @@ _CLATTER = (at("23:20"), 40, "objects_activity", 0.9)
 @pytest.mark.parametrize(
     ("hours", "sounds", "text"),
     [
-        ([22, 23], [_TALK, _SONG, _CLATTER], "from 22:00 to 24:00: music, talking and household"),
+        (
+            [22, 23],
+            [_TALK, _SONG, _CLATTER],
+            "from 22:00 to 24:00: talking, household sounds and something",
+        ),
         ([22, 23], [(at("22:10"), 20, "speech", 0.9)], "from 22:00 to 24:00: under 1 min of sound"),
         ([22, 23], [(at("22:10"), 240, "unknown", 0.4)], "from 22:00 to 24:00: 4 min of sound."),
-        ([3, 22], [_TALK], "In the recorded 2 h 00 min of Sunday: talking. The other 22 hours"),
+        ([3, 22], [_TALK], "In the recorded 2 h 00 min of Sunday: talking. There are logs only"),
     ],
 )
 def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
@@ -522,44 +535,44 @@ def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
 
 
 @pytest.mark.parametrize(
-    ("hours", "now", "hatched", "text"),
+    ("hours", "hatched", "text"),
     [
-        (
-            range(10),
-            "10:12",
-            0,
-            "from 00:00 to 10:00: nothing but quiet. The rest of the day is not",
-        ),
-        (
-            range(8, 10),
-            "12:00",
-            100,  # of three hours
-            "nothing but quiet. 10 h 00 min before 12:00 were not recorded. The rest of the day is",
-        ),
-        (range(20), "20:30", 0, "Sunday until 20:00 was quiet."),
-        (
-            range(5, 20),
-            "20:30",
-            21,  # of a day
-            "from 05:00 to 20:00: nothing but quiet. 5 h 00 min before 20:00 were not recorded.",
-        ),
+        (range(10), 0, "from 00:00 to 10:00: nothing but quiet. There are logs only up to 10:00."),
+        (range(8, 10), 0, "There are logs only from 08:00 to 10:00."),
+        (range(20), 0, "Sunday until 20:00 was quiet."),
+        ([*range(8), 9], 90, "logs only up to 10:00. 1 h 00 min of the rest were not recorded."),
     ],
 )
-def test_hours_to_come_are_not_called_not_recorded(tmp_path, hours, now, hatched, text):
+def test_hours_without_logs_at_the_ends_are_not_called_not_recorded(tmp_path, hours, hatched, text):
     write_day(tmp_path / "logs", DAY, hours=hours)
-    page = tmp_path / "page.html"
-    moment = day_span(DAY, UTC)[0] + int(at(now)) * NANOSECONDS
-    make_report(find_home_logs([tmp_path / "logs"]), Period(DAY, 1, UTC), page, now=moment)
-    shown = text_of(page.read_text())
-    assert text in shown
-    assert "other" not in shown.partition("As labelled by")[0]
-    gaps = re.findall(r'class="gap" style="left: ([\d.]+)%; width: ([\d.]+)%', page.read_text())
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert text in text_of(page)
+    assert "other" not in text_of(page).partition("Labelled by")[0]
+    assert 'class="alert"' not in page, "nothing to have looked at"
+    gaps = re.findall(r'class="gap" style="left: ([\d.]+)%; width: ([\d.]+)%', page)
     assert max((float(left) + float(width) for left, width in gaps), default=0) <= hatched
+
+
+def test_the_days_of_a_week_before_the_first_log_and_after_the_last_are_not_hatched(tmp_path):
+    for ago in (3, 2):
+        write_day(tmp_path / "logs", DAY - timedelta(days=ago))
+    page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
+    assert re.findall(r'class="unlogged".*?><span>(.*?)</span>', page) == [
+        *["before the first log"] * 3,
+        *["after the last log"] * 2,
+    ]
+    assert 'class="gap"' not in page
+    assert 'class="alert"' not in page
+    text = text_of(page)
+    assert "Both of the two recorded days" in text
+    assert "there are no logs of the other five days." in text
+    assert "There are logs only from Thu 26 Feb to Fri 27 Feb." in text
 
 
 def test_a_minute_of_a_day_is_no_hour_and_leaves_the_rest_of_the_day(tmp_path):
     rest = [(at("10:00") + edge, 1500, "gone") for edge in (0, 2100)]
-    write_day(tmp_path / "logs", DAY, hours=[10], gaps=rest)
+    rest += [(at(hour), HOUR, "gone") for hour in ("00:00", "23:00")]
+    write_day(tmp_path / "logs", DAY, hours=[0, 10, 23], gaps=rest)
     assert headline(tmp_path / "logs", tmp_path) == (
         "Sunday from 10:25 to 10:35: nothing but quiet. The rest of the day was not recorded."
     )
@@ -569,7 +582,9 @@ def test_what_is_beside_a_television_does_not_describe_the_recorded_time(tmp_pat
     talking = [(at("22:10") + 20 * i, 15, "speech", 0.9) for i in range(60)]
     clatter = [(second + 15, 5, "objects_activity", 0.9) for second, *_ in talking[10:40]]
     write_day(tmp_path / "logs", DAY, [*talking, *clatter], hours=[22])
-    assert headline(tmp_path / "logs", tmp_path).startswith("Sunday from 22:00 to 23:00: talking.")
+    assert headline(tmp_path / "logs", tmp_path).startswith(
+        "Sunday from 22:00 to 23:00: something like a television."
+    )
 
 
 def test_a_week_has_a_headline_of_its_days(tmp_path):
@@ -579,15 +594,15 @@ def test_a_week_has_a_headline_of_its_days(tmp_path):
         write_day(tmp_path / "logs", DAY - timedelta(days=ago), coughs, hours=hours)
     first = DAY - timedelta(days=6)
     assert headline(tmp_path / "logs", tmp_path, first=first, days=7) == (
-        "All of the five recorded days were quiet; too little was recorded of the other two. By "
-        "the sound of it, 18 bouts of coughing on four days, most on Mon 23 Feb (6)."
+        "All of the five recorded days were quiet; of the other two days there is too little. "
+        "18 bouts of coughing on 4 days; most on Mon 23 Feb: 6."
     )
 
 
 def test_a_week_of_which_one_day_was_recorded_is_headed_by_that_day(tmp_path):
     write_day(tmp_path / "logs", DAY)
     assert headline(tmp_path / "logs", tmp_path, first=DAY - timedelta(days=6), days=7) == (
-        "Sunday was quiet; too little was recorded of the other six days."
+        "Sunday was quiet; there are no logs of the other six days."
     )
 
 
@@ -598,27 +613,27 @@ def test_what_the_night_has_of_the_evening_before_is_named_so_that_counts_add_up
     coughs = [(at(time), 2, "coughing", 0.9) for time in times]
     write_day(tmp_path / "logs", DAY, coughs)
     page = page_of(tmp_path / "logs", tmp_path)
-    assert "four bouts of coughing in the night (one of them on Saturday) and one by day" in page
+    assert "4 bouts of coughing in the night (1 of them on Saturday); 1 by day (14:00)." in page
     assert rows_of(page)["Coughing"][0] == "4", "of which three are in the night"
-    assert "as labelled, at Saturday 23:28, 01:51, 02:16, 06:01." in page
+    assert "in the night at Saturday 23:28, 01:51, 02:16, 06:01." in page
     other = tmp_path / "other"
     other.mkdir()
     write_day(other / "logs", DAY - timedelta(days=1), before)
     write_day(other / "logs", DAY, coughs[:1])
-    assert "in the night (Saturday 23:28 and 01:51)." in headline(other / "logs", other)
+    assert "in the night (Saturday 23:28, 01:51)." in headline(other / "logs", other)
 
 
 def test_how_long_a_sound_lasted_is_apart_from_a_television(tmp_path):
     talking = [(at("13:00") + 60 * number, 30, "speech", 0.9) for number in range(60)]
     write_day(tmp_path / "logs", DAY, [*talking, (at("18:00"), 5, "coughing", 0.9)])
     page = page_of(tmp_path / "logs", tmp_path)
-    apart = "+\N{NO-BREAK SPACE}30\N{NO-BREAK SPACE}min beside a television"
-    assert f'<span class="unit">none</span><small>{apart}</small>' in page
-    assert f'<td data-head="Count, as labelled">0 min<small>{apart}</small>' in page
+    apart = "30\N{NO-BREAK SPACE}min beside a television"
+    assert f'<span class="unit">0 min</span><small>{apart}</small>' in page
+    assert f'<td data-head="Count">0 min<small>{apart}</small>' in page
     other = tmp_path / "other"
     other.mkdir()
     week = page_of(tmp_path / "logs", other, first=DAY - timedelta(days=6), days=7)
-    assert "television:\N{NO-BREAK SPACE}30\N{NO-BREAK SPACE}min" in week
+    assert f"<small>{apart}</small></th>" in week
 
 
 def test_a_name_that_nobody_gave_is_not_shown(tmp_path):
@@ -630,6 +645,108 @@ def test_a_name_that_nobody_gave_is_not_shown(tmp_path):
     assert "Home: anna. Microphone: kitchen. Times" in page_of(other / "logs", other)
 
 
+def test_talking_and_music_beside_a_television_are_in_no_count_no_length_and_no_sure_mark(tmp_path):
+    evening = [(at("19:00") + 20 * n, 15, ("speech", "music")[n % 2], 0.9) for n in range(120)]
+    write_day(tmp_path / "logs", DAY, [*evening, (at("08:00"), 120, "speech", 0.9)])
+    page = page_of(tmp_path / "logs", tmp_path)
+    rows = rows_of(page)
+    minutes = "15\N{NO-BREAK SPACE}min beside a television".replace("\N{NO-BREAK SPACE}", " ")
+    assert rows["Talking"] == ["1 60 beside a television", "08:00", f"2 min {minutes}"]
+    assert rows["Music"] == ["0 60 beside a television", "", f"0 min {minutes}"]
+    assert "Talking 1, and 60 beside a television; Music 0, and 60 beside a television." in page
+    assert "Most of the sound, a television aside: talking." in page
+    assert "are neither counted nor in the lengths; they are shown pale." in page
+    other = tmp_path / "other"
+    other.mkdir()
+    week = rows_of(page_of(tmp_path / "logs", other, DAY - timedelta(days=6), 7))
+    assert week["Talking 60 beside a television"][-2:] == ["1", "1"]
+    assert week[f"Talking {minutes}"][-2:] == ["2 min", "2 min"]
+    assert week[f"Music {minutes}"][-2:] == ["0 min", "0 min"]
+
+
+def test_water_and_a_sound_of_the_home_itself_count_beside_a_television_in_number_and_length(
+    tmp_path,
+):
+    talking = [(at("10:00") + 20 * n, 15, "speech", 0.9) for n in range(60)]
+    own = [(at("10:05:15"), 4, "flushing_water", 0.9), (at("10:10:15"), 4, "doorbell", 0.9)]
+    classes = [*GENERAL, "flushing_water", "doorbell"]
+    write_day(tmp_path / "logs", DAY, [*talking, *own], classes=classes)
+    page = page_of(tmp_path / "logs", tmp_path)
+    rows = rows_of(page)
+    assert rows["Toilet flush"] == ["1", "10:05", "under 1 min"]
+    assert rows["Doorbell"] == ["1", "10:10", "under 1 min"]
+    assert "Counted there, too: toilet flush and doorbell." in page
+
+
+def test_an_event_of_a_sound_that_begins_before_a_television_is_counted_and_measured_as_one(
+    tmp_path,
+):
+    talking = [(at("10:00") + 20 * n, 15, "speech", 0.9) for n in range(60)]
+    write_day(tmp_path / "logs", DAY, [(at("09:50"), 660, "objects_activity", 0.9), *talking[3:]])
+    rows = rows_of(page_of(tmp_path / "logs", tmp_path))
+    assert rows["Household sounds"] == ["1", "09:50", "11 min"]
+
+
+def test_marks_of_which_the_model_is_not_sure_are_half_as_high(tmp_path):
+    coughs = [(at("10:00"), 5, "coughing", 0.9), (at("15:00"), 5, "coughing", 0.5)]
+    write_day(tmp_path / "logs", DAY, [*coughs, (at("18:00"), 1800, "objects_activity", 0.5)])
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert '<path class="short" d="M600 0v1"/>' in page
+    assert '<path class="short low" d="M900 0.5v0.5"/>' in page
+    assert '<path class="long low" d="M1080 0.5h30v0.5h-30z"/>' in page
+    assert "half as high: not sure" in page
+    assert ">Coughing 2; Household sounds 1.</desc>" in page
+
+
+def test_sounds_of_one_minute_are_named_once_with_their_number(tmp_path):
+    coughs = [(at(time), 2, "coughing", 0.9) for time in ("23:04:01", "23:04:40", "23:37")]
+    write_day(tmp_path / "logs", DAY, coughs)
+    assert headline(tmp_path / "logs", tmp_path).endswith(
+        "3 bouts of coughing after 22:00 (23:04 twice, 23:37)."
+    )
+
+
+def test_the_first_sentence_of_a_headline_is_a_part_and_not_cut_at_a_full_stop(tmp_path):
+    write_day(tmp_path / "logs", DAY, [(at("12:05"), 2, "coughing", 0.9)])
+    data, _ = read_report_data(find_home_logs([tmp_path / "logs"]), Period(DAY, 1, UTC))
+    assert day_headline(data.days[0]) == ("Sunday was quiet.", "1 bout of coughing by day (12:05).")
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert '<p class="headline">Sunday was quiet. <span class="second">1 bout' in page
+
+
+@pytest.mark.parametrize(
+    ("sounds", "text"),
+    [
+        ([], "Nothing was labelled until 08:00"),
+        ([(at("06:00"), 3, "music", 0.9)], "Only short sounds until 08:00"),
+    ],
+)
+def test_short_sounds_before_the_first_lively_minutes_are_not_denied(tmp_path, sounds, text):
+    write_day(tmp_path / "logs", DAY, [*sounds, (at("08:00"), 300, "music", 0.9)])
+    assert text in text_of(page_of(tmp_path / "logs", tmp_path))
+
+
+def test_a_week_of_one_recorded_day_has_the_sentence_of_that_day(tmp_path):
+    write_day(tmp_path / "logs", DAY, [(at("19:20"), 600, "music", 0.9)])
+    week = {"first": DAY - timedelta(days=6), "days": 7}
+    assert headline(tmp_path / "logs", tmp_path, **week).startswith(
+        "Sunday was quiet but for 19:00 to 20:00; there are no logs of the other six days."
+    )
+    write_day(tmp_path / "logs", DAY - timedelta(days=1))
+    write_day(tmp_path / "logs", DAY - timedelta(days=2), hours=[12])
+    other = tmp_path / "other"
+    other.mkdir()
+    assert headline(tmp_path / "logs", other, **week).startswith(
+        "Both of the two recorded days were quiet but for a few hours; of the other five days"
+    )
+
+
+def test_without_a_time_zone_the_page_says_what_to_set(tmp_path):
+    write_day(tmp_path / "logs", DAY)
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert "Times are those of UTC; for those of the home, set <code>timezone</code>" in page
+
+
 # The page
 
 
@@ -639,7 +756,7 @@ def test_times_of_up_to_five_sounds_are_written_and_of_more_the_first_and_the_la
     coughs = [(at("11:00") + second, 5, "coughing", 0.9) for second in (0, 30)]
     write_day(tmp_path / "logs", DAY, [*rings, *words, *coughs])
     rows = rows_of(page_of(tmp_path / "logs", tmp_path))
-    assert rows["Coughing"] == ["2", "11:00 (twice)", "under 1 min"]
+    assert rows["Coughing"] == ["2", "11:00 twice", "under 1 min"]
     assert rows["Telephone ringing"] == ["3", "09:58, 10:08, 15:26", "under 1 min"]
     assert rows["Talking"] == ["6", "08:00 to 08:50", "under 1 min"]
     assert list(rows)[1:4] == ["Coughing", "Telephone ringing", "Talking"], (
@@ -657,11 +774,13 @@ def test_a_hidden_class_is_not_among_those_that_a_model_does_not_know(tmp_path):
 
 def test_the_picture_has_a_title_and_tells_in_words_what_it_shows(tmp_path):
     coughs = [(at("10:00"), 5, "coughing", 0.9), (at("15:00"), 5, "coughing", 0.9)]
-    write_day(tmp_path / "logs", DAY, coughs, hours=range(20))
+    write_day(tmp_path / "logs", DAY, coughs, hours=[*range(18), 20])
     page = page_of(tmp_path / "logs", tmp_path)
     assert page.count('role="img"') == 1
     assert 'aria-label="The sounds of Sunday, 1 March 2026"' in page
-    assert ">Coughing 2. Not recorded: 20:00 to 00:00.</desc>" in page
+    assert (
+        ">Coughing 2. There are logs only up to 21:00. Not recorded: 18:00 to 20:00.</desc>" in page
+    )
     assert page.count('aria-hidden="true"') == 1, "its words and strips are not read one by one"
 
 
@@ -695,19 +814,19 @@ def test_sounds_two_minutes_apart_are_two_marks_on_an_evening_and_stripes_on_a_d
 
 
 def test_the_png_of_an_evening_is_as_wide_as_its_hours(tmp_path):
-    events = [(at("18:00"), HOUR, "music", 1.0), (at("20:00"), HOUR, "crying", 1.0)]
+    events = [(at("18:00"), HOUR, "objects_activity", 1.0), (at("20:00"), HOUR, "crying", 1.0)]
     write_day(tmp_path / "logs", DAY, events, hours=[18, 19, 20])
     page_of(tmp_path / "logs", tmp_path)
     with Image.open(next(tmp_path.glob("*.png"))) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     lefts = {
         name: np.nonzero((abs(pixels - colour(name)) <= 3).all(axis=2).sum(axis=0) > 10)[0]
-        for name in ("music", "crying")
+        for name in ("objects_activity", "crying")
     }
     for columns in lefts.values():
         assert 360 < np.ptp(columns) < 520, "an hour of three"
-    assert lefts["crying"][0] - lefts["music"][0] == pytest.approx(
-        2 * np.ptp(lefts["music"]), rel=0.02
+    assert lefts["crying"][0] - lefts["objects_activity"][0] == pytest.approx(
+        2 * np.ptp(lefts["objects_activity"]), rel=0.02
     )
 
 
@@ -779,10 +898,10 @@ def test_a_page_needs_nothing_but_itself(flat_page):
     assert "url(" not in flat_page
     assert "@import" not in flat_page
     assert outline.headings == [
-        "What was heard, as labelled",
-        "Bathroom, as labelled",
-        "Night, as labelled",
-        "Quiet and activity, as labelled",
+        "What was heard",
+        "Bathroom",
+        "Night",
+        "Quiet and activity",
         "For the interRAI Home Care assessment",
         "How to read this",
     ]
@@ -799,8 +918,8 @@ def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
     assert "The microphone bathroom did not record for 10 h 00 min" in text
     assert "Nothing was recorded" not in text, "the gap says why"
     assert "living room: the model is gone: 30 min, once (14:10 to 14:40)" in text
-    assert "Toilet flushes, as labelled, at 02:00." in text
-    assert "Showers, as labelled, at 07:30." in text
+    assert "Toilet flushes at 02:00." in text
+    assert "Showers at 07:30." in text
     assert "diagnosis" in text
 
 
@@ -853,19 +972,39 @@ def test_names_from_a_log_cannot_become_markup(tmp_path):
     assert "&lt;/script&gt; &amp; more" in page
 
 
+def test_the_picture_draws_half_as_high_what_is_not_sure_and_pale_what_is_beside_a_television(
+    tmp_path,
+):
+    talking = [(at("20:00") + 60 * n, 55, "speech", 0.9) for n in range(120)]
+    events = [(at("06:00"), HOUR, "crying", 1.0), (at("12:00"), HOUR, "yelling", 0.5), *talking]
+    write_day(tmp_path / "logs", DAY, events)
+    page_of(tmp_path / "logs", tmp_path)
+    with Image.open(next(tmp_path.glob("*.png"))) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    found = {
+        name: (abs(pixels[:, 150:] - colour(name)) <= 3).all(axis=2).sum(axis=1) > 20
+        for name in ("crying", "yelling", "speech")
+    }
+    high, low, pale = (int(rows.sum()) for rows in found.values())
+    assert low == pytest.approx(high / 2, abs=2)
+    assert not pale
+
+
 def test_the_picture_has_the_colours_of_the_classes_where_they_were_heard(tmp_path):
-    events = [(at("06:00"), HOUR, "music", 1.0), (at("18:00"), HOUR, "crying", 1.0)]
+    events = [(at("06:00"), HOUR, "objects_activity", 1.0), (at("18:00"), HOUR, "crying", 1.0)]
     write_day(tmp_path / "logs", DAY, events, gaps=[(at("12:00"), HOUR, "gone")])
     page_of(tmp_path / "logs", tmp_path)
     with Image.open(next(tmp_path.glob("*.png"))) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     places = {}
-    for name in ("music", "crying"):
+    for name in ("objects_activity", "crying"):
         rows, columns = np.nonzero((abs(pixels - colour(name)) <= 3).all(axis=2))
         assert len(rows) > 500
         places[name] = np.median(rows), np.median(columns)
-    assert places["crying"][0] < places["music"][0], "a line for each, the most important first"
-    hour = (places["crying"][1] - places["music"][1]) / 12
+    assert places["crying"][0] < places["objects_activity"][0], (
+        "a line for each, the most important first"
+    )
+    hour = (places["crying"][1] - places["objects_activity"][1]) / 12
     assert 45 < hour < 65, "twelve hours of a day that is as wide as the page"
 
 
@@ -966,8 +1105,8 @@ def test_the_headline_tells_night_day_and_evening_apart_with_the_times_of_rare_s
     write_day(tmp_path, DAY, [(at(time), 2, "coughing", 0.9) for time in times.split()])
     page = page_of(tmp_path, tmp_path)
     assert text_of(page).count(
-        "By the sound of it, two bouts of coughing in the night (02:10 and 06:13), one by day "
-        "(12:00) and two after 22:00 (22:30 and 23:15)."
+        "2 bouts of coughing in the night (02:10, 06:13); 1 by day (12:00); 2 after 22:00 "
+        "(22:30, 23:15)."
     )
 
 

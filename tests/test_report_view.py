@@ -156,6 +156,67 @@ def test_on_a_phone_a_page_is_as_wide_as_the_screen_and_its_picture_can_be_read(
     assert all(width > PHONE[0] * 0.85 for _, _, width, _ in boxes(browser, ".strip"))
 
 
+_TELEVISION = [(at("19:00") + 20 * n, 15, ("speech", "music")[n % 2], 0.9) for n in range(480)]
+_DOUBTFUL = [
+    (at("08:00") + 1200 * n, 2, name, 0.5 + 0.4 * (n % 3 == 0))
+    for n in range(30)
+    for name in ("coughing", "objects_activity")
+]
+_OUTSIDE = """JSON.stringify([...document.querySelectorAll("th, td, p, h1, h2, li, .name, .entry")]
+    .filter(e => e.checkVisibility()).filter(e => {
+        const range = document.createRange(), box = e.getBoundingClientRect();
+        range.selectNodeContents(e);
+        return [...range.getClientRects()].some(r => r.right > Math.min(innerWidth, box.right) + 1
+            || r.left < box.left - 1 || r.bottom > box.bottom + 8);
+    }).map(e => e.textContent.trim()))"""
+
+
+@pytest.mark.parametrize("days", [1, 7], ids=["day", "week"])
+def test_no_text_leaves_its_place_on_a_narrow_screen(browser, days, tmp_path):
+    write_day(tmp_path / "logs", DAY, [*_TELEVISION, *_DOUBTFUL])
+    address = report_of(tmp_path / "logs", tmp_path, days, DAY - timedelta(days=days - 1))
+    for width in (360, 390, 600, 768):
+        set_size(browser, width, 844, mobile=width < 600)
+        browser.open(address)
+        assert browser.evaluate("document.documentElement.scrollWidth") <= width
+        assert json.loads(browser.evaluate(_OUTSIDE)) == [], width
+
+
+def test_a_phone_has_a_block_for_each_class_without_the_days_that_were_not_recorded(
+    browser, tmp_path
+):
+    write_day(tmp_path / "logs", DAY, [*_TELEVISION, *_DOUBTFUL])
+    set_size(browser, *PHONE, mobile=True)
+    browser.open(report_of(tmp_path / "logs", tmp_path, 7, DAY - timedelta(days=6)))
+    found = boxes(browser, "table.wide td")
+    assert found
+    assert not {"", "\N{EN DASH}"} & {text for text, *_ in found}
+    assert not boxes(browser, "table.wide thead")
+    after = (
+        "getComputedStyle(document.querySelector('table.wide tr[data-rest]'), '::after').content"
+    )
+    assert browser.evaluate(after) == '"others not recorded"'
+    day = tmp_path / "day"
+    day.mkdir()
+    browser.open(report_of(tmp_path / "logs", day))
+    assert not boxes(browser, "table.sounds thead")
+    lefts = {
+        round(left) for _, left, *_ in boxes(browser, "table.sounds tbody th, table.sounds td")
+    }
+    assert len(lefts) == 1, "below each other"
+
+
+def test_no_table_of_a_printed_week_is_broken(browser, tmp_path):
+    write_day(tmp_path / "logs", DAY, [*_TELEVISION, *_DOUBTFUL])
+    browser.open(report_of(tmp_path / "logs", tmp_path, 7, DAY - timedelta(days=6)))
+    browser.call("Emulation.setEmulatedMedia", media="print")
+    try:
+        breaks = "[...document.querySelectorAll('table')].map(e => getComputedStyle(e).breakInside)"
+        assert {*json.loads(browser.evaluate(f"JSON.stringify({breaks})"))} == {"avoid"}
+    finally:
+        browser.call("Emulation.setEmulatedMedia", media="")
+
+
 def test_a_phone_shows_twelve_lanes_and_those_that_were_heard(browser, tmp_path):
     classes = [*GENERAL, *(f"thing_{number}" for number in range(9))]
     write_day(tmp_path / "logs", DAY, [(at("10:00"), 5, "thing_8", 0.9)], classes=classes)
@@ -198,9 +259,9 @@ def test_what_sounded_beside_a_television_is_pale_and_the_table_says_so(browser,
     assert np.ptp(columns) <= 4, "only the cough that counts has the full colour"
     assert abs(columns.mean() - report.place(at("16:00"))) < 4
     text = browser.evaluate("document.body.textContent")
-    assert "beside a television: not counted" in text
-    assert "not counted:\N{NO-BREAK SPACE}1" in text
-    assert "By the sound of it, one bout of coughing by day (16:00)." in text
+    assert "pale: beside a television, not counted" in text
+    assert "1 beside a television" in text
+    assert "1 bout of coughing by day (16:00)." in text
 
 
 @pytest.fixture(scope="module")

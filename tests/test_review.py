@@ -26,17 +26,19 @@ from log_fixtures import run
 from lossy_source import LossySource
 from viewers import Window, browsing, display, find_ruler, patiently, reviewing
 
+from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
+from hearthlog.analyzer.review.lanes import timeline_lanes
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_list import ReviewSpan as Listed
 from hearthlog.analyzer.review.review_list import write_spans
 from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
 from hearthlog.analyzer.review.session import ReviewSession, length_text, sound_file
-from hearthlog.analyzer.review.timeline import SoundClip, sound_of
+from hearthlog.analyzer.review.timeline import SoundClip, labelled_spans, sound_of
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.classes import colour
 from hearthlog.recorder.config import Settings
@@ -45,6 +47,7 @@ from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES
+from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer
 
 __all__ = ["display"]  # a fixture
@@ -170,6 +173,26 @@ def test_a_mark_says_who_made_it_when_and_what_it_corrects(home):
     assert mark[:6] == ("mic", START + SECOND, START + 2 * SECOND, "yelling", "Ann", mark.made)
     assert began <= mark.made <= time.time_ns()
     assert mark.corrects == "live"
+
+
+def test_what_the_model_doubts_is_paler_in_its_lane_unless_a_person_reviewed_it(home):
+    segments = read_columns(find_logs(home))["/mic/segment"]
+    doubted = segments["confidence"] < UNSURE_BELOW
+    timeline = read_timeline([home])
+    live = timeline.microphones["mic"].labellings[0]
+    assert live.unsure.starts.tolist() == segments["header.stamp"][doubted].tolist()
+    live.unsure = live.spans.where(live.spans.texts == "speech")
+    start, end = int(live.unsure.starts[0]), int(live.unsure.ends[0])
+
+    def lane():
+        lanes = timeline_lanes(timeline)
+        found = next(one for one in lanes if (one.labelling, one.name) == ("live", "Talking"))
+        return [found.colours[text] for text in found.spans.texts]
+
+    pale = tuple((part + 13) // 2 for part in colour("speech"))
+    assert lane() == [pale] * len(live.unsure)
+    timeline.microphones["mic"].reviewed = labelled_spans([(start, end, "person")])
+    assert lane() == [colour("speech")] + [pale] * (len(live.unsure) - 1)
 
 
 def test_a_span_across_logs_is_a_mark_in_each_of_them(home):
@@ -482,10 +505,51 @@ def test_a_mark_that_cannot_be_shown_is_made_once_and_undone_once(home):
     sitting.screen.marked = (START + 15 * SECOND, START + 19 * SECOND)
     sitting.screen.draws = False
     sitting.session.press("3")
-    assert "saved, but not shown" in sitting.output[-1]
+    assert sitting.output[-1] == "saved, but not shown, as the viewer did not answer"
     sitting.session.press("z")
-    assert "saved, but not shown" in sitting.output[-1]
+    assert sitting.output[-1] == "undone, but not shown, as the viewer did not answer"
     assert [mark.label for mark in layers(home)] == ["speech"]
+
+
+def test_before_the_first_key_nothing_is_called_saved_and_a_skip_saves_nothing(home):
+    sitting = Sitting(home, items_of(2))
+
+    def silent(*_):
+        raise TimeoutError
+
+    sitting.screen.draws, sitting.session.look_closely = False, silent
+    sitting.run("n")
+    loading, hint, first, skipped, second, _ = sitting.output
+    assert loading == "The picture is still loading; you can answer already."
+    assert hint.startswith("press a")
+    assert skipped == "not shown, as the viewer did not answer"
+    assert (first[:8], second[:8]) == ("1 of 2: ", "2 of 2: ")
+
+
+def test_what_plays_plays_although_the_viewer_does_not_answer(home):
+    def silent(_):
+        raise TimeoutError
+
+    sitting = Sitting(home)
+    sitting.screen.marked = (START, START + SECOND)
+    sitting.screen.play = silent
+    sitting.session.press("p")
+    assert sitting.output == ["playing"]
+
+
+def test_a_queue_of_which_nothing_can_be_heard_says_so_once(home):
+    sitting = Sitting(home, [one._replace(is_audible=False) for one in items_of(2)])
+    sitting.run("n")
+    first, *others = sitting.output
+    assert first.startswith("None of these can be heard: record with `--keep-audio unsure` (see ")
+    assert not any("hear" in line for line in others)
+    assert all("hear" not in one[2].place for one in sitting.screen.requested if one)
+
+
+def test_the_classes_come_first(home):
+    day, queue = Sitting(home).session, Sitting(home, items_of(1)).session
+    assert [one.key for one in day.keys][:7] == [*"123tuc", "."]
+    assert [one.key for one in queue.keys][:7] == [*"a123tu", "."]
 
 
 def test_a_queue_goes_on_by_itself_and_ends_after_the_last_span(home):
@@ -1111,6 +1175,8 @@ def test_the_page_shows_the_line_before_and_the_last_one_whole_above_the_buttons
 def test_on_a_phone_the_page_has_the_question_and_large_buttons_of_its_answers(home, tmp_path):
     buttons = """[...document.querySelectorAll("button")].filter((b) => b.offsetHeight)
         .map((b) => [b.dataset.key, b.offsetHeight, b.getBoundingClientRect().right])"""
+    tops = """[...document.querySelectorAll("button")]
+        .map((b) => b.getBoundingClientRect().top)"""
     options = ("--web", "--port", free_port(), "--queue", "uncertain")
     with reviewing(home, *options, BROWSER="true") as review:
         line = review.wait_for("http://127.0.0.1:")
@@ -1119,7 +1185,8 @@ def test_on_a_phone_the_page_has_the_question_and_large_buttons_of_its_answers(h
             review.wait_for("1 of ")
             patiently(page.text, lambda text: text.startswith("1 of "))
             every = page.evaluate(buttons)
-            assert min(height for _, height, _ in every) >= 44
+            assert len(set(page.evaluate(tops))) == 1, "one row"
+            assert max(height for _, height, _ in every) <= 34
             page.call(
                 "Emulation.setDeviceMetricsOverride",
                 width=390, height=844, deviceScaleFactor=1, mobile=False,
@@ -1133,6 +1200,8 @@ def test_on_a_phone_the_page_has_the_question_and_large_buttons_of_its_answers(h
             assert min(height for _, height, _ in found) >= 56
             question = page.evaluate("document.getElementById('question').textContent")
             assert question == page.text().split(": ", 1)[1].split("?")[0] + "?"
+            yes = page.evaluate("document.querySelector('button[data-key=a] .name').textContent")
+            assert yes == f"Yes, {question.rstrip('?').lower()}"
             play = "document.querySelector('button[data-key=p]').disabled"
             assert page.evaluate(play) is True  # no sound of this home was kept
 

@@ -33,10 +33,12 @@ from viewers import (
 from hearthlog.analyzer.logs.local_time import day_span
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.lanes import PROBABILITIES, SELECTED_COLOUR
+from hearthlog.analyzer.review.timeline import Key
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.review.viewer.drawing import SHARED_AXIS
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import save_timeline
+from hearthlog.analyzer.review.viewer.row_heights import TOP_BAR
 from hearthlog.analyzer.review.viewer.viewer import WindowViewer
 from hearthlog.analyzer.review.viewer.web import open_page
 from hearthlog.models.classes import GAP, colour, ordered
@@ -237,13 +239,78 @@ def test_the_page_shows_a_day_as_it_was_heard(timeline, tmp_path):
         assert viewer.state().errors == []
 
 
+def test_a_page_that_is_loaded_again_shows_what_it_showed_and_another_window_says_so(
+    short_sounds, tmp_path
+):
+    timeline = read_timeline([short_sounds], *day_span(DAY, UTC))
+    start = timeline.grid.start + 6 * HOUR
+    path = tmp_path / "day.png"
+
+    def drawn(page):
+        def take():
+            with suppress(ConnectionError, TimeoutError):
+                viewer.refresh()
+            return page.picture()
+
+        is_hidden = "document.getElementById('canvas').classList.contains('waits')"
+        patiently(lambda: page.evaluate(is_hidden), lambda hidden: hidden is False)
+        patiently(take, lambda png: is_seen(png, timeline, path))
+
+    with open_page() as viewer, browsing(viewer.address, tmp_path / "one", "1366,1000") as page:
+        viewer.offer([Key("c", "confirm the labels")], lambda _: None)
+        page.open(viewer.address)
+        viewer.draw(timeline, close_up=False)
+        viewer.wait_until_drawn()
+        viewer.announce("drag a span")
+        drawn(page)
+        page.open(viewer.address)
+        drawn(page)
+        assert page.text() == "drag a span"
+        viewer.show(start, start + HOUR, HOUR)
+        with browsing(viewer.address, tmp_path / "other", "1366,1000") as other:
+            patiently(other.text, lambda text: text == "drag a span")
+            patiently(lambda: [viewer.refresh(), viewer.selection()][1] == (start, start + HOUR))
+            text = "open in another window: close this one, or reload it to go on here"
+            patiently(page.text, lambda found: found == text)
+            assert page.evaluate("document.querySelector('button').disabled") is True
+
+
+LOW = [(1366, 536), (1366, 650), (1000, 600)]  # a canvas below a row of buttons; of a phone
+
+
+@pytest.mark.parametrize("size", LOW)
+@pytest.mark.parametrize("close_up", [False, True])
+def test_names_of_lanes_are_legible_in_a_low_page(short_sounds, size, close_up):
+    timeline = read_timeline([short_sounds], *day_span(DAY, UTC))
+    width, height = size
+    with hidden((width, height + round(TOP_BAR))) as viewer:
+        viewer.draw(timeline, close_up=close_up)
+        viewer.wait_until_drawn()
+        found = patiently(lambda: [viewer.refresh(), viewer._blueprint()][1], bool)
+        containers = [one.get("ContainerBlueprint", {}) for one in found.values()]
+        (rows,) = [one for one in containers if one.get("container_kind") == "Vertical"
+                   and len(one["contents"]) in {2, 3} and "row_shares" in one]  # fmt: skip
+        is_folded = found["/time_panel"]["TimePanelBlueprint"]["state"] == "Collapsed"
+        assert close_up or not is_folded, "one drags on the ruler"
+        plots = found[rows["contents"][-1]]["ContainerBlueprint"]
+        lanes = rows["row_shares"][2 if close_up else 1]
+        count = max(
+            len(one["row_shares"]) - 1
+            for one in containers
+            if isinstance(one.get("row_shares"), list) and one is not rows
+        )
+        assert plots["visible"] is (rows["row_shares"][-1] > 0)
+        assert (lanes - 47) / count >= 26
+        assert rows["row_shares"][0] == 62  # the question, or the hours, in every window
+
+
 def test_a_page_that_is_closed_leaves_no_error_in_the_terminal(capfd):
     with open_page() as viewer:
         address = urlsplit(viewer.address)
         before = threading.active_count()
         with socket.create_connection((address.hostname, address.port)) as page:
             page.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-            wanted = f"GET {address.path}text HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n"
+            wanted = f"GET {address.path}text/0 HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n"
             page.sendall(wanted.encode())
             patiently(threading.active_count, lambda count: count > before)
         viewer.announce("nobody reads this")

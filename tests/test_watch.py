@@ -10,7 +10,7 @@ import time
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC
-from itertools import islice, takewhile
+from itertools import islice, pairwise, takewhile
 
 import numpy as np
 import psutil
@@ -22,6 +22,7 @@ from rerun.experimental import ViewerClient
 from viewers import Window, address_of, display
 from waiting import wait_for
 
+from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
@@ -40,8 +41,9 @@ from hearthlog.analyzer.review.lanes import (
 from hearthlog.analyzer.review.live_timeline import LiveTimeline, last_time
 from hearthlog.analyzer.review.timeline import LogLines, Plot
 from hearthlog.analyzer.review.viewer.canvas import Canvas
+from hearthlog.analyzer.review.viewer.drawing import plot_entity
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
-from hearthlog.analyzer.review.viewer.recording import LiveServer
+from hearthlog.analyzer.review.viewer.recording import LiveServer, _stack_plots
 from hearthlog.models.classes import colour, ordered
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.schemas.frames import FRAME_NANOSECONDS
@@ -228,6 +230,82 @@ def test_a_viewer_that_comes_when_the_first_was_dropped_still_knows_names_and_co
             wait_for(lambda: is_there(eye.picture(), colour("phone_ring"), 1580))
 
 
+BEGIN = 1_772_348_400 * SECOND
+
+
+class Drawn(Canvas):
+    """Keeps what is drawn."""
+
+    def __init__(self):
+        self.rows, self.states, self.names = [], [], {}
+
+    def add_rows(self, _entity, times, _shares, length, _colours):
+        self.rows += [(time - length // 2, time + length // 2) for time in times.tolist()]
+
+    def configure_states(self, _entity, colours, names=None):
+        self.names = dict(zip(colours, zip(names, colours.values(), strict=True), strict=True))
+
+    def change_states(self, _entity, _times, states):
+        self.states += states
+
+    def configure(self, *_):
+        pass
+
+    write = draw_lines = write_lines = configure
+
+
+def test_pieces_of_a_row_that_came_in_parts_of_a_second_do_not_overlap():
+    canvas, server = Drawn(), LiveServer(free_port(), "127.0.0.1", MINUTES)
+    middles = [0.5, 1.5, 2.2, 2.7, 3.5, 4.2, 4.7, 5.5, 6.2, 6.7, 7.5, 8.5, 9.1, 9.6, 10.5, 11.5]
+    with server:
+        for part in np.split(np.array(middles), [3, 6, 9, 13]):
+            times = BEGIN + (part * SECOND).astype(np.int64)
+            values = np.tile([[0.9, 0.1]], (len(part), 1))
+            plot = Plot(PROBABILITIES, "mic", "live", ("silence", "speech"), times, values)
+            server._show_plot(plot, canvas)
+    assert [start - BEGIN for start, _ in canvas.rows] == [k * SECOND for k in range(11)]
+    assert all(one[1] == other[0] for one, other in pairwise(canvas.rows))
+
+
+def test_a_state_too_short_for_its_word_has_none_and_quiet_and_doubt_are_faint():
+    canvas, server = Drawn(), LiveServer(free_port(), "127.0.0.1", 5)
+    times = BEGIN + np.arange(43) * SECOND
+    states = ["silence"] * 20 + ["speech"] * 3 + ["speech?"] * 20
+    with server:
+        server._show_lane(StateLane(RECORDER, "mic", times, states), canvas)
+    names = [canvas.names[state][0] for state in canvas.states]
+    assert names == ["Quiet"] * 20 + [" "] * 3 + ["Talking?"] * 20
+    quiet, talking, doubtful = (canvas.names[canvas.states[k]][1] for k in (0, 20, 30))
+    assert max(quiet) < 60
+    assert talking == colour("speech")
+    assert doubtful == tuple((part + 13) // 2 for part in colour("speech"))
+
+
+def test_the_axes_begin_with_what_is_there_until_they_are_full():
+    layouts = []
+    with LiveServer(free_port(), "127.0.0.1", 5) as server:
+        server._recording.send_blueprint = lambda layout, **_: layouts.append(layout)
+        for second in (0, 60, 299, 300, 400):
+            times = np.array([BEGIN + second * SECOND])
+            server.show([Plot(LEVEL, "mic", "", ("level",), times, np.array([[-40.0]]))])
+    first, later = (repr(one._range.start) for one in layouts)
+    assert str(BEGIN) in first
+    assert str(300 * SECOND) in later
+
+
+def test_the_table_of_events_is_in_the_last_tab():
+    times = np.array([BEGIN])
+    plots = {
+        plot_entity(one): [one]
+        for one in (
+            Plot(LEVEL, "mic", "", ("level",), times, np.array([[-40.0]])),
+            Plot(NOVELTY, "mic", "live", ("novelty",), times, np.array([[0.5]])),
+        )
+    }
+    *_, details = _stack_plots("mic", plots).contents
+    assert [view.name for view in details.contents] == [NOVELTY.title, "Events"]
+
+
 def test_lanes_are_sent_at_once_and_plots_every_few_seconds():
     begin = 1_772_348_400 * SECOND
 
@@ -353,7 +431,8 @@ def test_a_lane_ends_as_the_segments_say_and_is_filled_until_they_do(logs):
     within = np.searchsorted(starts, times, side="right") - 1
     for time_, state, at in zip(times.tolist(), states, within.tolist(), strict=True):
         if at >= 0 and time_ < ends[at]:
-            assert state == segments["label"][at]
+            is_sure = segments["confidence"][at] >= UNSURE_BELOW
+            assert state == segments["label"][at] + "?" * (not is_sure)
     assert np.isin(starts, times).all()
     first = next(each for each in found if isinstance(each, StateLane) and each.kind is RECORDER)
     assert None not in first.states

@@ -1,6 +1,6 @@
 """Metrics of a home and its days: coverage, durations, events, and counts with ranges."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, tzinfo
 from functools import reduce
@@ -34,6 +34,7 @@ from hearthlog.analyzer.logs.spans import (
     difference,
     first_of_groups,
     intersection,
+    joined,
     lengths,
     rows_at,
     single_span,
@@ -63,6 +64,7 @@ class HomeMinutes:
     # [shape=(4, n)]; events that begin in each minute: labelled ones outside of reviewed spans, all
     # after corrections, and those of them that begin in reviewed spans, or are not sure elsewhere
     events: dict[str, Int64]
+    apart: Collection[str] = ON_TELEVISION  # classes that do not count beside a television
 
     def between(self, spans: Spans) -> "HomeMinutes":
         """Return the minutes that begin in some spans."""
@@ -72,9 +74,9 @@ class HomeMinutes:
     def count(self, name: str, rates: CheckedRates | None) -> Count:
         """Count the events of a class.
 
-        `ON_TELEVISION` classes count in minutes without a television, and where a person reviewed.
+        Classes `apart` count in minutes without a television, and where a person reviewed.
         """
-        own = self.rows(~self.television) if name in ON_TELEVISION else self
+        own = self.rows(~self.television) if name in self.apart else self
         if name not in own.events:
             return Count(rates=rates)
         labelled, corrected, certain, unsure = own.events[name]
@@ -91,14 +93,14 @@ class HomeMinutes:
 
     def counted(self, name: str, starts: Int64) -> Int64:
         """Return the events of a class, by starts within these minutes, that `count` counts."""
-        if name not in ON_TELEVISION:
+        if name not in self.apart:
             return starts
         near_television = np.isin(starts // MINUTE * MINUTE, self.starts[self.television])
         return starts[~near_television | (rows_at(self.reviewed, starts) >= 0)]
 
     def uncounted_events(self, name: str) -> int:
-        """Count the events of `ON_TELEVISION` classes that `count` leaves out."""
-        if name not in ON_TELEVISION or name not in self.events:
+        """Count the events of classes `apart` that `count` leaves out."""
+        if name not in self.apart or name not in self.events:
             return 0
         _, corrected, certain, _ = self.events[name]
         return int((corrected - certain)[self.television].sum())
@@ -112,6 +114,7 @@ class HomeMinutes:
             self.gone_through[rows],
             self.reviewed,
             {name: counts[:, rows] for name, counts in self.events.items()},
+            self.apart,
         )
 
 
@@ -176,6 +179,7 @@ class HomeMetrics:
     events: dict[str, Int64]
     minutes: HomeMinutes
     rates: dict[str, CheckedRates]  # by class, from the checked minutes
+    unsure: dict[str, Int64]  # by class: those starts that are not sure, and not reviewed
 
     def between(self, start: int, end: int) -> "HomeMetrics":
         """Return the metrics of a span in nanoseconds of UTC; events belong where they begin."""
@@ -188,6 +192,7 @@ class HomeMetrics:
             {name: self.events_in(name, single_span(start, end)) for name in self.events},
             self.minutes.between(single_span(start, end)),
             self.rates,
+            self.unsure,
         )
 
     def events_in(self, name: str, span: Spans) -> Int64:
@@ -221,8 +226,11 @@ def metrics_of_home(data: HomeData, checks: CheckedMinutes | None = None) -> Hom
     labelled = in_order(data.labelled.values())
     minutes = home_minutes(labelled, gone_through, everything, events)
     rates = {} if checks is None else checked_rates_of(minutes, checks)
-    starts = {name: own for name, (own, _) in events.items()}
-    return HomeMetrics(classes, everything, listened, sound, spans, starts, minutes, rates)
+    starts, unsure = {}, {}
+    for name, (begun, confidences) in events.items():
+        doubtful = (confidences < UNSURE_BELOW) & (rows_at(minutes.reviewed, begun) < 0)
+        starts[name], unsure[name] = begun, begun[doubtful]
+    return HomeMetrics(classes, everything, listened, sound, spans, starts, minutes, rates, unsure)
 
 
 def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSegments:
@@ -248,17 +256,23 @@ class DayMetrics:
     span: Spans  # a single span, like the night
     night: Spans
     coverage: Spans  # covered spans of the day
-    over: Spans  # the part of the day that is not still to come
+    logged: Spans  # the part of the day from the first log to the last one; may have no length
+    apart: Collection[str] = ON_TELEVISION  # classes that do not count beside a television
 
     @property
-    def coming(self) -> int:
-        """Nanoseconds of the day that are still to come."""
-        return self.span.length - self.over.length
+    def before_logs(self) -> int:
+        """Nanoseconds of the day before the first log."""
+        return int(self.logged.starts[0] - self.span.starts[0])
+
+    @property
+    def after_logs(self) -> int:
+        """Nanoseconds of the day after the last log."""
+        return int(self.span.ends[0] - self.logged.ends[0])
 
     @property
     def missing(self) -> Spans:
-        """Spans of the day, as far as it is over, without coverage."""
-        return difference(self.over, self.coverage)
+        """Spans of the day without coverage, from the first log to the last one."""
+        return difference(self.logged, self.coverage) if self.logged.length else NONE
 
     @property
     def share(self) -> float:
@@ -283,34 +297,65 @@ class DayMetrics:
         """Return the share of the day covered for a class, 0 to 1; 0 if no model has it."""
         return _share(self.home.listened.get(name, NONE), self.span)
 
+    @property
+    def counting(self) -> HomeMinutes:
+        """Minutes of the home in which the classes `apart` do not count beside a television."""
+        return replace(self.home.minutes, apart=self.apart)
+
+    def joined_events(self, name: str) -> tuple[Spans, Spans]:
+        """Return the spans of the events of a class that count, and of those that do not."""
+        spans = self.home.spans.get(name, NONE)
+        events = joined(spans.starts, spans.ends, EVENT_PAUSE)
+        counts = np.isin(events.starts, self.counting.counted(name, events.starts))
+        counted, apart = (Spans(events.starts[own], events.ends[own]) for own in (counts, ~counts))
+        return counted, apart
+
+    def spans_of(self, name: str) -> Spans:
+        """Return the spans of a class on this day, as far as its events count."""
+        counted, _ = self.joined_events(name)
+        return self._spans_in(name, counted)
+
     def minutes(self, name: str) -> Duration | None:
-        """Return the duration of a class; None if unknown."""
-        minutes = _length(intersection(self.home.spans.get(name, NONE), self.span))
-        return _if_covered(minutes, self.share_of(name))
+        """Return the duration of the events of a class that count; None if unknown."""
+        return _if_covered(_length(self.spans_of(name)), self.share_of(name))
+
+    def uncounted_minutes(self, name: str) -> float:
+        """Return the minutes of the events of a class that do not count: beside a television."""
+        _, apart = self.joined_events(name)
+        return self._spans_in(name, apart).length / MINUTE
+
+    def _spans_in(self, name: str, events: Spans) -> Spans:
+        spans = intersection(self.home.spans.get(name, NONE), events)
+        return intersection(spans, self.span)
 
     def events(self, name: str) -> Int64:
         """Return the event starts of a class, if any, on this day, in nanoseconds of UTC."""
         return self.home.events_in(name, self.span)
 
+    def counted_events(self, name: str, span: Spans) -> Int64:
+        """Return the event starts of a class in a span that count, in nanoseconds of UTC."""
+        return self.counting.counted(name, self.home.events_in(name, span))
+
     def night_events(self, name: str) -> Int64:
         """Return the event starts that `night_count` counts for a class, in nanoseconds of UTC."""
-        return self.home.minutes.counted(name, self.home.events_in(name, self.night))
+        return self.counted_events(name, self.night)
 
     def count(self, name: str) -> Count | None:
         """Return the number of events of a class on this day; None if unknown."""
-        return _if_covered(self._count(name, self.span), self.share_of(name))
+        return _if_covered(self.count_in(name, self.span), self.share_of(name))
 
     def night_count(self, name: str) -> Count | None:
         """Return the number of events of a class in the night; None if unknown."""
         share = _share(self.home.listened.get(name, NONE), self.night)
-        return _if_covered(self._count(name, self.night), share)
+        return _if_covered(self.count_in(name, self.night), share)
 
     def uncounted_events(self, name: str) -> int:
         """Return the number of events of a class not counted because of a television."""
-        return self.home.minutes.between(self.span).uncounted_events(name)
+        return self.counting.between(self.span).uncounted_events(name)
 
-    def _count(self, name: str, span: Spans) -> Count:
-        return self.home.minutes.between(span).count(name, self.home.rates.get(name))
+    def count_in(self, name: str, span: Spans) -> Count:
+        """Return the number of events of a class that begin in a span of this day or its night."""
+        return self.counting.between(span).count(name, self.home.rates.get(name))
 
     @property
     def sound(self) -> Duration | None:
@@ -390,21 +435,26 @@ class DayMetrics:
         return Clock(60 * local.hour + local.minute)
 
 
-def day_of(home: HomeMetrics, day: date, zone: tzinfo, now: int | None = None) -> DayMetrics:
+def day_of(
+    home: HomeMetrics,
+    day: date,
+    zone: tzinfo,
+    logged: tuple[int, int] | None = None,
+    apart: Collection[str] = ON_TELEVISION,
+) -> DayMetrics:
     """Return the figures of a local day; its night is from 22:00 on the day before to 07:00.
 
-    After `now`, in nanoseconds of UTC, the day is still to come, and so is an hour at most before
-    it that is not in the logs yet. By default the day is over.
+    `logged` is from when to when the home has logs, in nanoseconds of UTC; by default all day, and
+    so if less than a minute lacks.
     """
     start, end = day_span(day, zone)
     span, night = single_span(start, end), single_span(*night_span(day, zone))
     near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
     coverage = intersection(near.coverage, span)
-    over = span
-    if now is not None and start < now < end:
-        recorded = int(coverage.ends[-1]) if coverage.length else start
-        over = single_span(start, recorded if now - recorded < HOUR else now)
-    return DayMetrics(day, near, zone, span, night, coverage, over)
+    first, last = (start, end) if logged is None else (min(max(t, start), end) for t in logged)
+    first, last = start if first - start < MINUTE else first, end if end - last < MINUTE else last
+    logs = single_span(first, last)
+    return DayMetrics(day, near, zone, span, night, coverage, logs, apart)
 
 
 def _share(covered: Spans, span: Spans) -> float:

@@ -21,6 +21,8 @@ _DEFAULT = "en"
 _LONGEST_HEADER = 500  # characters of an `Accept-Language`
 _CLASS = "class."
 _TIMES = {0: "never", 1: "once", 2: "twice"}  # keys of counts that have a word
+_MINUTE, _HOUR = 60, 60  # seconds and minutes
+_WHOLE_MINUTES = 5  # from which on no half minute is written
 _WITH_CAUSE = ("error.not saved", "error.not played")
 
 
@@ -90,15 +92,21 @@ class Translation:
         return self.text("long date", weekday=weekday, day=day.day, month=month)
 
     def length(self, seconds: float) -> str:
-        """Format a length of time: `12 seconds`, `3 minutes`, `2 hours 10 minutes`."""
+        """Format a length of time: `12 seconds`, `1½ minutes`, `2 hours 10 minutes`.
+
+        It has half minutes below five minutes.
+        """
         if seconds < 1:
             return self.text("below a second")
-        if seconds < 90:
+        if round(seconds) < _MINUTE:
             return self.count("second", round(seconds))
-        minutes = round(seconds / 60)
-        if minutes < 90:
+        halves = int(2 * seconds / _MINUTE + 0.5)
+        if halves < 2 * _WHOLE_MINUTES and halves % 2:
+            return self.text("minute.other", count=f"{halves // 2}½")
+        minutes = int(seconds / _MINUTE + 0.5)
+        if minutes < _HOUR:
             return self.count("minute", minutes)
-        hours, rest = divmod(minutes, 60)
+        hours, rest = divmod(minutes, _HOUR)
         return self.count("hour", hours) + (f" {self.count('minute', rest)}" if rest else "")
 
     def sureness(self, confidence: float, home: Sureness = UNMEASURED) -> str:
@@ -110,9 +118,13 @@ class Translation:
         """Format a count: `never`, `once`, `4 times`."""
         return self.text(_TIMES.get(count, "times"), count=self.number(count))
 
-    def more_times(self, count: int) -> str:
-        """Format a count, of at least one, in addition to another: `once more`."""
-        return self.text(f"more.{_TIMES.get(count, 'times')}", count=self.number(count))
+    def more_times(self, count: int, before: int) -> str:
+        """Format a count, of at least one, in addition to another: `once more`.
+
+        After `4 times` it is `3 more`, after `once` `3 more times`.
+        """
+        key = _TIMES.get(count, "times" if before in _TIMES else "count")
+        return self.text(f"more.{key}", count=self.number(count))
 
     def class_words(self, label: str) -> str:
         """Return the display name of a class, on one line of limited length."""

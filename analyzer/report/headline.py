@@ -1,7 +1,8 @@
 """Headline of a report: what a day or a week was like, in two or three short sentences."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import timedelta
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,18 +10,18 @@ from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Count, Duration, rounded
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
-from hearthlog.analyzer.logs.spans import difference, intersection, joined, single_span
-from hearthlog.analyzer.report.report_data import counted_events, television_spans
+from hearthlog.analyzer.logs.spans import intersection, joined, single_span
+from hearthlog.analyzer.report.report_data import television_spans
 from hearthlog.analyzer.report.wording import (
     clock_text,
-    clock_with_day,
+    edge_of_week,
     number_in_words,
     several_in_words,
     short_day,
+    times_in_words,
     weekday,
 )
 from hearthlog.models.classes import (
-    ON_TELEVISION,
     SILENCE,
     UNKNOWN,
     WORRYING,
@@ -41,56 +42,72 @@ _NAMES = 3
 _EXACT_HOURS = 3  # fewer recorded hours are given to the minute
 
 
-def day_headline(day: DayMetrics) -> str:
+class Headline(NamedTuple):
+    """A first sentence, and the others."""
+
+    first: str
+    rest: str
+
+
+def day_headline(day: DayMetrics) -> Headline:
     """Return the headline of a day: whether it was quiet, coughing, crying and shouting.
 
     A day is quiet if three quarters of it, and of the time from 07:00 to 22:00, were recorded,
     and if at most six of its hours have five minutes of sound or more. Of a day with less than
     that: what was labelled, and how much is missing.
     """
-    return " ".join([_day(day), *_by_sound(list(_sounds(day))), *_missing(day)])
+    rest = [*map(_sentence, _sounds(day)), *_missing(day)]
+    return Headline(f"{_day(day)}.", " ".join(rest))
 
 
-def week_headline(days: Sequence[DayMetrics]) -> str:
+def week_headline(days: Sequence[DayMetrics]) -> Headline:
     """Return the headline of a week: its quiet days; coughing, crying and shouting."""
     recorded = [day for day in days if day.coverage.length]
     complete_days = [day for day in recorded if _is_covered(day)]
-    quiet = sum(is_quiet(day) for day in complete_days)
-    number, of = number_in_words(len(complete_days)), number_in_words(len(days))
-    which = {0: "none", len(complete_days): "all" if len(complete_days) > _ONE_MORE else "both"}
-    was = _capital(which.get(quiet, number_in_words(quiet)))
-    rest = f"too little was recorded of the other {number_in_words(len(days) - len(complete_days))}"
-    if len(complete_days) == len(days):
-        parts = [f"{was} of the {of} days {_were(quiet)} quiet."]
-    elif len(complete_days) > 1:
-        parts = [f"{was} of the {number} recorded days {_were(quiet)} quiet; {rest}."]
-    elif complete_days:
-        (day,) = complete_days
-        parts = [f"{weekday(day.day)} was {'' if quiet else 'not '}quiet; {rest} days."]
-    else:
-        parts = [f"Too little was recorded to judge any of the {of} days."]
-    sounds: list[tuple[str, bool]] = []
+    others = [day for day in days if day not in complete_days]
+    sounds = (_sentence(text) for text in _sounds_of_week(recorded, len(days)))
+    first = f"{_quiet_days(complete_days, len(others))}{_too_little(complete_days, others)}."
+    return Headline(first, " ".join(sounds))
+
+
+def _quiet_days(days: Sequence[DayMetrics], others: int) -> str:
+    """Return how many of the judged days of a week were quiet."""
+    if not days:
+        return f"Too little was recorded to judge any of the {number_in_words(others)} days"
+    if others and len(days) == 1:
+        return _day(days[0])
+    quiet = [day for day in days if is_quiet(day)]
+    which = {0: "none", len(days): "all" if len(days) > _ONE_MORE else "both"}
+    was = _capital(which.get(len(quiet), number_in_words(len(quiet))))
+    of = f"{number_in_words(len(days))}{' recorded' * bool(others)} days"
+    but = " but for a few hours" if any(_lively(day).any() for day in quiet) else ""
+    return f"{was} of the {of} {'were' if len(quiet) > 1 else 'was'} quiet{but}"
+
+
+def _too_little(days: Sequence[DayMetrics], others: Sequence[DayMetrics]) -> str:
+    """Return that the other days of a week are not judged."""
+    if not days or not others:
+        return ""
+    number = number_in_words(len(others))
+    which = f"other {number} days" if len(others) > 1 else "other day"
+    if any(day.logged.length for day in others):
+        return f"; of the {which} there is too little"
+    return f"; there are no logs of the {which}"
+
+
+def _sounds_of_week(recorded: Sequence[DayMetrics], number: int) -> Iterator[str]:
+    """Yield the counts of coughing, crying and shouting of some of a number of days."""
     for name in WORRYING:
         counts = [(count, day) for day in recorded if (count := day.count(name)) and count.labelled]
-        if counts:
-            total = sum((count for count, _ in counts), Count())
-            on = f"{number_in_words(len(counts))} day{'s' * (len(counts) > 1)}"
-            text = f"{amount(name, total)} on {on}"
-            most, day = max(counts, key=lambda pair: pair[0].labelled)
-            if len(counts) > 1 and most.labelled > total.labelled / len(days):
-                text += f", most on {short_day(day.day)} ({most.labelled})"
-            sounds.append((text, total.certain == total.labelled))
-    return " ".join([*parts, *_by_sound(sounds)])
-
-
-def _by_sound(sounds: Sequence[tuple[str, bool]]) -> Iterator[str]:
-    """Yield sentences of counts: what is known, and what is only labelled so.
-
-    A count of a class in words comes with whether a person reviewed all of it.
-    """
-    yield from (f"{_capital(text)}." for text, is_checked in sounds if is_checked)
-    if labelled := [text for text, is_checked in sounds if not is_checked]:
-        yield f"By the sound of it, {'; '.join(labelled)}."
+        if not counts:
+            continue
+        total = sum((count for count, _ in counts), Count())
+        most, day = max(counts, key=lambda pair: pair[0].labelled)
+        when = f"{len(counts)} days" if len(counts) > 1 else short_day(day.day)
+        text = amount(name, total, f"on {when}")
+        if len(counts) > 1 and most.labelled > total.labelled / number:
+            text += f"; most on {short_day(day.day)}: {most.labelled}"
+        yield text
 
 
 def is_quiet(day: DayMetrics) -> bool:
@@ -98,59 +115,50 @@ def is_quiet(day: DayMetrics) -> bool:
     return _is_covered(day) and int(_lively(day).sum()) <= QUIET_HOURS
 
 
-def amount(name: str, count: Count, *, named: bool = True) -> str:
-    """Return a number of events in words, as labelled: `two bouts of coughing`, `crying once`.
+def amount(name: str, count: Count, when: str = "", *, named: bool = True) -> str:
+    """Return a number of events, as labelled: `2 bouts of coughing`, `crying once`.
 
-    Without the name of the class, just `two`, `once`. With events that are not sure, `two (perhaps
-    four) bouts of coughing`, or `four bouts of something like coughing`.
+    Without the name of the class, just `2`, `once`. With events that are not sure, `2 bouts of
+    coughing, perhaps 3 more`, or `perhaps 3 bouts of coughing`. `when` goes after the name.
     """
-    sure = count.labelled - (count.unsure if count.range is None else 0)
+    unsure = count.unsure if count.range is None else 0
+    sure = count.labelled - unsure
+    perhaps, number = ("", sure) if sure or not unsure else ("perhaps ", unsure)
     several, sound = several_in_words(name).lower(), in_words(name).lower()
-    if named and not sure and count.labelled:
-        several = several.replace(sound, f"something like {sound}")
-        sound, sure = f"something like {sound}", count.labelled
     if several.startswith("times of "):
-        often = _with_unsure(sure, count.labelled, _often)
-        return f"{sound} {often}" if named else often
-    number = _with_unsure(sure, count.labelled, number_in_words)
-    if count.labelled == 1:
-        bouts = several.startswith("bouts ")
-        several = several.replace("bouts", "bout", 1) if bouts else sound
-    return f"{number} {several}" if named else number
-
-
-def _with_unsure(sure: int, labelled: int, words: Callable[[int], str]) -> str:
-    if sure == labelled:
-        return words(labelled)
-    return f"{words(sure)} (perhaps {words(labelled)})" if sure else f"perhaps {words(labelled)}"
-
-
-def _often(number: int) -> str:
-    return {1: "once", 2: "twice"}.get(number, f"{number_in_words(number)} times")
+        often = {1: "once", 2: "twice"}.get(number, f"{number} times")
+        text = f"{perhaps}{sound} {often}" if named else f"{perhaps}{often}"
+    else:
+        one = several.replace("bouts", "bout", 1) if several.startswith("bouts ") else sound
+        text = f"{perhaps}{number} {one if number == 1 else several}"
+        text = text if named else f"{perhaps}{number}"
+    more = f", perhaps {unsure} more" if unsure and not perhaps else ""
+    return f"{text} {when}".strip() + more
 
 
 def _day(day: DayMetrics) -> str:
-    """Return whether a day was quiet, and how much of it is known."""
+    """Return whether a day was quiet, and how much of it is known, without a full stop."""
     name = weekday(day.day)
     hours = rounded(day.coverage.length / MINUTE) / 60  # as the page says it
-    hours_of_day = rounded(day.over.length / HOUR)
+    hours_of_day = rounded(day.logged.length / HOUR)
     if states_missing_time(day):
         return _recorded_part(day)
     lively = _lively(day)
-    if day.coming:
-        name += f" until {clock_text(int(day.over.ends[0]), day.zone)}"
+    start, end = (clock_text(int(edge[0]), day.zone) for edge in day.logged)
+    name += f" from {start}" * bool(day.before_logs)
+    name += f" {'to' if day.before_logs else 'until'} {end}" * bool(day.after_logs)
     partly = ""
     if day.missing.length / HOUR >= _MISSING_HOURS:
         partly = f" ({int(hours)} of {hours_of_day} hours recorded)"
     if not is_quiet(day):
-        return f"{name} had sound in {lively.sum()} of {hours_of_day} hours{partly}."
+        return f"{name} had sound in {lively.sum()} of {hours_of_day} hours{partly}"
     if not lively.any():
-        return f"{name} was quiet{partly}."
+        return f"{name} was quiet{partly}"
     runs = _runs(day, lively)
     but = (
         listed(runs, "and") if len(runs) <= _RUNS else f"{number_in_words(int(lively.sum()))} hours"
     )
-    return f"{name} was quiet but for {but}{partly}."
+    return f"{name} was quiet but for {but}{partly}"
 
 
 def states_missing_time(day: DayMetrics) -> bool:
@@ -162,7 +170,7 @@ def _recorded_part(day: DayMetrics) -> str:
     """Return when a partly recorded day was recorded, and what was labelled then."""
     name = weekday(day.day)
     if day.coverage.length < MINUTE:
-        return f"Less than a minute of {name} was recorded."
+        return f"Less than a minute of {name} was recorded"
     stretches = joined(*day.coverage, _PAUSE)
     hours = rounded(day.coverage.length / HOUR)
     if len(stretches.starts) == 1:
@@ -172,38 +180,54 @@ def _recorded_part(day: DayMetrics) -> str:
         when = f"In the {hours} recorded hours of {name}"
     else:
         when = f"In the recorded {Duration(day.coverage.length / MINUTE).text} of {name}"
-    return f"{when}: {_labelled(day)}."
+    return f"{when}: {_labelled(day)}"
 
 
 def _labelled(day: DayMetrics) -> str:
-    """Return the classes labelled longest, but those that have a sentence of their own."""
+    """Return the classes labelled longest, but those with a sentence of their own; a television."""
     lengths: list[tuple[int, str]] = []
     for name in set(day.home.classes) - {SILENCE, UNKNOWN, *WORRYING}:
-        spans = intersection(day.home.spans[name], day.span)
-        if name in ON_TELEVISION:
-            spans = difference(spans, television_spans(day))
-        if spans.length >= _NAMED:
-            lengths.append((-spans.length, in_words(name).lower()))
-    if lengths:
-        return listed([words for _, words in sorted(lengths)[:_NAMES]], "and")
+        length = day.spans_of(name).length
+        if length >= _NAMED:
+            lengths.append((-length, in_words(name).lower()))
+    television = ["something like a television"] * bool(television_spans(day).length)
+    if lengths or television:
+        return listed([*(words for _, words in sorted(lengths)[:_NAMES]), *television], "and")
     sound = intersection(day.home.sound, day.span).length
     return f"{Duration(sound / MINUTE).text} of sound" if sound else "nothing but quiet"
 
 
 def _missing(day: DayMetrics) -> Iterator[str]:
-    """Yield how much of a partly recorded day was not recorded."""
+    """Yield how much of a partly recorded day was not recorded, or is in no log."""
     if not states_missing_time(day) or day.coverage.length < MINUTE:
         return
-    hours = rounded(day.coverage.length / HOUR)
-    number = rounded(day.over.length / HOUR) - hours
-    if day.coming:
-        if day.missing.length >= MINUTE:
-            missing, end = Duration(day.missing.length / MINUTE).text, int(day.over.ends[0])
-            yield f"{missing} before {clock_text(end, day.zone)} were not recorded."
-        yield "The rest of the day is not recorded yet."
-    else:
-        other = f"other {number} hours were"
+    if not (day.before_logs or day.after_logs):
+        hours = rounded(day.coverage.length / HOUR)
+        other = f"other {rounded(day.span.length / HOUR) - hours} hours were"
         yield f"The {other if hours else 'rest of the day was'} not recorded."
+        return
+    yield unlogged([day])
+    if day.missing.length >= MINUTE:
+        yield f"{Duration(day.missing.length / MINUTE).text} of the rest were not recorded."
+
+
+def unlogged(days: Sequence[DayMetrics], *, with_day: bool = False) -> str:
+    """Return when the logs of successive days begin and end; empty if they have all of the time."""
+    logged = [day for day in days if day.logged.length]
+    if not logged:
+        return ""
+    zone, edges = days[0].zone, (int(logged[0].logged.starts[0]), int(logged[-1].logged.ends[0]))
+    first, last = (
+        edge_of_week(edge, zone, is_end=is_end) if with_day else clock_text(edge, zone)
+        for edge, is_end in zip(edges, (False, True), strict=True)
+    )
+    begins, ends = bool(days[0].before_logs), bool(days[-1].after_logs)
+    span = {
+        (True, True): f"from {first} to {last}",
+        (True, False): f"from {first} on",
+        (False, True): f"up to {last}",
+    }.get((begins, ends))
+    return "" if span is None else f"There are logs only {span}."
 
 
 def _is_covered(day: DayMetrics) -> bool:
@@ -225,8 +249,8 @@ def _runs(day: DayMetrics, lively: Bool) -> list[str]:
     return [f"{a} to {b}" for a, b in zip(texts[::2], texts[1::2], strict=True)]
 
 
-def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
-    """Yield the counts of coughing, crying and shouting, and whether a person reviewed them.
+def _sounds(day: DayMetrics) -> Iterator[str]:
+    """Yield the counts of coughing, crying and shouting.
 
     Those of the night that ends on the day, of 07:00 to 22:00, and of the evening after that.
     """
@@ -238,30 +262,27 @@ def _sounds(day: DayMetrics) -> Iterator[tuple[str, bool]]:
     )
     for name in WORRYING:
         parts: list[str] = []
-        is_checked = True
         for span, when in times_of_day:
-            starts = counted_events(day, name, span)
+            starts = day.counted_events(name, span)
             if len(starts):
-                count = day.home.minutes.between(span).count(name, day.home.rates.get(name))
                 times = f" ({_when(day, starts)})" if _when(day, starts) else ""
-                parts.append(f"{amount(name, count, named=not parts)} {when}{times}")
-                is_checked &= count.certain == count.labelled
+                count = day.count_in(name, span)
+                parts.append(amount(name, count, when, named=not parts) + times)
         if parts:
-            yield listed(parts, "and"), is_checked
+            yield "; ".join(parts)
 
 
 def _when(day: DayMetrics, starts: Int64) -> str:
     """Return the times of a few events; of more, how many were on the day before, if any."""
     if len(starts) <= _TIMES:
-        clocks = [clock_with_day(start, day.zone, day.day) for start in np.sort(starts).tolist()]
-        return listed(clocks, "and")
+        return times_in_words(starts, day.zone, first=day.day)
     number, before = int((starts < day.span.starts[0]).sum()), day.day - timedelta(days=1)
-    which = f"{number_in_words(number)} of them" if number < len(starts) else "all"
+    which = f"{number} of them" if number < len(starts) else "all"
     return f"{which} on {weekday(before)}" if number else ""
 
 
-def _were(number: int) -> str:
-    return "were" if number > 1 else "was"
+def _sentence(text: str) -> str:
+    return f"{_capital(text)}."
 
 
 def _capital(text: str) -> str:

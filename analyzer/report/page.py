@@ -10,19 +10,16 @@ import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
-from hearthlog.analyzer.report.headline import day_headline, week_headline
+from hearthlog.analyzer.report.headline import day_headline, unlogged, week_headline
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
     ASSESSED_ITEMS,
     FigureSection,
     ReportData,
     ReportFigure,
-    apart_figure,
-    counted_events,
     event_figure,
     minutes_figure,
     sections,
-    television_minutes_of,
 )
 from hearthlog.analyzer.report.summary_text import (
     longest_quiet,
@@ -50,9 +47,9 @@ from hearthlog.analyzer.report.wording import (
     times_in_words,
 )
 from hearthlog.models.classes import (
+    APART_IN_REPORT,
     COUGHING,
     FLUSHING_WATER,
-    ON_TELEVISION,
     SHOWER,
     SILENCE,
     UNKNOWN,
@@ -80,6 +77,7 @@ class PageTable(NamedTuple):
     heads: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     kind: str = ""
+    rests: Sequence[str] = ()  # by row: on a phone, what stands in place of its dashes
 
 
 class PagePicture(NamedTuple):
@@ -108,7 +106,7 @@ _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
 _HOME, _MICROPHONE = "home", "mic"  # names that nobody gave
 _FEW = 5  # events of which every time is written
-_NOT_COUNTED = "not counted"
+_BESIDE = "beside a television"
 _SPACE = "\N{NO-BREAK SPACE}"
 
 
@@ -130,9 +128,9 @@ def day_page(data: ReportData) -> str:
         data,
         PagePicture(f"The sounds of {title}", _description(timeline), [("", timeline)], bars),
         title=title,
-        headline=_first_sentence(day_headline(day)),
+        headline=day_headline(day),
         summary=list(summarize_day(data, day)),
-        overview=[(f"What was heard{_labelled(data)}", _sounds(data, day))],
+        overview=[("What was heard", _sounds(data, day))],
         parts=[_part(data, section, day) for section in sections(data.classes)],
     )
 
@@ -149,16 +147,13 @@ def week_page(data: ReportData) -> str:
         data,
         PagePicture(f"The sounds of {spoken}", described, days),
         title=f"Week {first.isocalendar().week}, {spoken}",
-        headline=_first_sentence(week_headline(data.days)),
+        headline=week_headline(data.days),
         summary=list(summarize_week(data)),
         overview=[
+            ("How often it was heard", _week(data, list(map(event_figure, names)))),
             (
-                f"How often it was heard{_labelled(data)}",
-                _week(data, list(map(event_figure, names))),
-            ),
-            (
-                "How long it was heard, as labelled",
-                _week(data, list(map(apart_figure, names)), has_share=False),
+                "How long it was heard",
+                _week(data, list(map(minutes_figure, names)), has_share=False),
             ),
         ],
         parts=[
@@ -167,33 +162,20 @@ def week_page(data: ReportData) -> str:
     )
 
 
-def _first_sentence(headline: str) -> tuple[str, str]:
-    """Return the first sentence of a headline, and the rest of it."""
-    first, point, rest = headline.partition(". ")
-    return f"{first}{point.strip()}", rest
-
-
-def _labelled(data: ReportData) -> str:
-    """Return the end of a title above figures that are all as labelled."""
-    return "" if data.checked else ", as labelled"
-
-
 def _description(timeline: DayTimeline) -> str:
     """Return the text alternative of a timeline."""
     parts = []
     for lane in timeline.lanes:
-        uncounted = (
-            f", and {len(lane.uncounted)} beside a television" if len(lane.uncounted) else ""
-        )
+        uncounted = f", and {len(lane.uncounted)} {_BESIDE}" if len(lane.uncounted) else ""
         if not lane.empty:
-            parts.append(f"{lane.words} {len(lane.counted)}{uncounted}")
+            parts.append(f"{lane.words} {len(lane.counted) + len(lane.unsure)}{uncounted}")
     zone, spans = timeline.day.zone, timeline.day.missing
     gaps = [
         f"{clock_text(start, zone)} to {clock_text(end, zone)}"
         for start, end in spans.pairs()
         if end - start >= HOUR
     ]
-    text = f"{'; '.join(parts) or 'Nothing was heard'}."
+    text = f"{'; '.join(parts) or 'Nothing was heard'}. {unlogged([timeline.day])}".strip()
     return text + (f" Not recorded: {', '.join(gaps)}." if gaps else "")
 
 
@@ -202,7 +184,7 @@ def _page(data: ReportData, picture: PagePicture, **parts: Any) -> str:
     names = [name for name in data.classes if name not in {SILENCE, UNKNOWN}]
     absent = [name for name in names if _has_count(data, name) and not _occurs(data, name)]
     uncertain = [name for name in names if not _has_count(data, name)]
-    uncounted = [name for name in ON_TELEVISION if name in data.classes]
+    everywhere = [name for name in names if name not in APART_IN_REPORT]
     return fill_page(
         data=data,
         picture=picture,
@@ -215,8 +197,8 @@ def _page(data: ReportData, picture: PagePicture, **parts: Any) -> str:
         uncertain=_listed(uncertain),
         unknown=_listed(data.unknown),
         confused=_listed(data.confused),
-        uncounted=_listed(uncounted),
-        television=_television(data),
+        everywhere=_listed(everywhere),
+        dash=_NOTHING,
         unsure=any(_is_unsure(data, name) for name in names),
         scenarios=[(plain(name), _scenario(data, name)) for name in data.scenarios],
         days_before=BASELINE_DAYS,
@@ -237,12 +219,6 @@ def _covered_days(days: Sequence[DayMetrics]) -> str:
     return f"{len(days)} of them heard" + (f", {partly} only in part" if partly else "")
 
 
-def _television(data: ReportData) -> str:
-    """Return a remark on labels during television sound, which are not counted."""
-    amounts = {name: sum(day.uncounted_events(name) for day in data.days) for name in data.classes}
-    return listed([f"{in_words(name).lower()} {n}" for name, n in amounts.items() if n], "and")
-
-
 def _scenario(data: ReportData, name: str) -> PageTable:
     """Return the minutes of each class of a scenario, a row per class, a column per day."""
     days = data.scenarios[name]
@@ -258,8 +234,9 @@ def _scenario(data: ReportData, name: str) -> PageTable:
         for label in classes
     ]
     if len(days) == 1:
-        return PageTable(["Sound", "How long, as labelled"], rows)
-    return PageTable(["Sound", *_day_heads(data)], rows, "wide")
+        return PageTable(["Sound", "How long"], rows)
+    rests = [_rest([cell.text for cell in row[1:]], data.days) for row in rows]
+    return PageTable(["Sound", *_day_heads(data)], rows, "wide", rests)
 
 
 def _scenario_text(minutes: float, day: DayMetrics) -> str:
@@ -269,46 +246,36 @@ def _scenario_text(minutes: float, day: DayMetrics) -> str:
 
 def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
     """Return how often, when and how long each class was heard."""
-    labelled = ", as labelled" * data.checked  # else the title of the table has it
-    heads = ["Sound", "How often", f"When{labelled}", f"How long{labelled}"]
+    heads = ["Sound", "How often", "When", "How long"]
     rows = []
     for name in data.classes:
-        figure = event_figure(name)
-        lasting = (minutes_figure if name == SILENCE else apart_figure)(name)
+        figure, lasting = event_figure(name), minutes_figure(name)
         value, uncounted = figure.value(day), day.uncounted_events(name)
         if name == SILENCE:
             cells = [Cell(""), Cell(""), _cell(data, lasting, day)]
         elif _occurs(data, name) and (value is not None or uncounted):
-            cell = _cell(data, figure, day)
-            notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{uncounted}"] * bool(uncounted) + [
-                cell.note
-            ] * bool(cell.note)
-            starts = counted_events(day, name, day.span)
             cells = [
-                cell._replace(note=", ".join(notes)),
-                Cell(_times(day, starts)),
-                _with_television(_cell(data, lasting, day), name, day),
+                _with_apart(_cell(data, figure, day), _apart(figure, [day])),
+                Cell(_times(day, day.counted_events(name, day.span))),
+                _with_apart(_cell(data, lasting, day), _apart(lasting, [day])),
             ]
         else:
             continue
         right = [Cell(data.accuracy_text(name))] * data.checked
         rows.append([Cell(in_words(name), colour=colour_on_paper(name)), *cells, *right])
-    kind = "sounds stack" if data.checked else "sounds"  # five columns are too many for a phone
-    return PageTable([*heads, *["Right here"] * data.checked], rows, kind)
+    return PageTable([*heads, *["Right here"] * data.checked], rows, "sounds stack")
 
 
-def _with_television(cell: Cell, name: str, day: DayMetrics) -> Cell:
-    """Add how long a class sounded beside a television, from a minute on."""
-    minutes = television_minutes_of(day, name)
-    if minutes < 1:
-        return cell
-    notes = [*[cell.note] * bool(cell.note), _television_note(minutes)]
-    text = "none" if cell.text == Duration().text else cell.text
-    return cell._replace(text=text, note=", ".join(notes))
+def _with_apart(cell: Cell, apart: str) -> Cell:
+    return cell._replace(note=", ".join(note for note in (apart, cell.note) if note))
 
 
-def _television_note(minutes: float) -> str:
-    return f"+{_SPACE}{Duration(minutes).text.replace(' ', _SPACE)} beside a television"
+def _apart(figure: ReportFigure, days: Sequence[DayMetrics]) -> str:
+    """Return how much of a figure is beside a television, and so not in it: `11 beside a …`."""
+    number = sum(day.uncounted_events(figure.name) for day in days) if figure.counts else 0
+    minutes = sum(day.uncounted_minutes(figure.name) for day in days) if figure.lasts else 0.0
+    amount = f"{number}" if number else Duration(minutes).text.replace(" ", _SPACE)
+    return f"{amount} {_BESIDE}" if number or minutes >= 1 else ""
 
 
 def _times(day: DayMetrics, starts: Int64) -> str:
@@ -340,17 +307,9 @@ def _has_count(data: ReportData, name: str) -> bool:
     return any(day.count(name) is not None or day.uncounted_events(name) for day in data.days)
 
 
-def _cell(
-    data: ReportData, figure: ReportFigure, day: DayMetrics, *, is_alone: bool = False
-) -> Cell:
-    """Return a figure, how it differs, and its usual range if there is a baseline.
-
-    If it `is_alone`, the head of the column cannot say which figures are as labelled.
-    """
-    value = figure.value(day)
-    text = _text(value)
-    if is_alone and data.checked and not _is_checked(value):
-        text += ", as labelled"
+def _cell(data: ReportData, figure: ReportFigure, day: DayMetrics) -> Cell:
+    """Return a figure, how it differs, and its usual range if there is a baseline."""
+    text = _text(figure.value(day))
     if not data.comparable:
         return Cell(text, unbroken=True)
     usual = data.usually(figure)
@@ -364,7 +323,7 @@ def _text(value: Value | None) -> str:
 
 def _part(data: ReportData, section: FigureSection, day: DayMetrics) -> PageSection:
     shown = [figure for figure in section.figures if figure.value(day) is not None]
-    rows = [[Cell(figure.title), _cell(data, figure, day, is_alone=True)] for figure in shown]
+    rows = [[Cell(figure.title), _cell(data, figure, day)] for figure in shown]
     remarks = [*_remarks(section, day)]
     if len(shown) < len(section.figures):
         more = "more" if shown else "anything"
@@ -381,7 +340,7 @@ def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
             starts = day.events(name)
             if len(starts):
                 at = times_in_words(starts, day.zone)
-                yield f"{several_in_words(name)}, as labelled, at {at}."
+                yield f"{several_in_words(name)} at {at}."
     elif section.title == "Night":
         yield _coughing(day)
     else:
@@ -395,10 +354,10 @@ def _coughing(day: DayMetrics) -> str:
         return ""
     if len(starts) <= _FEW:
         times = times_in_words(starts, day.zone, first=day.day)
-        return f"Coughing in the night, as labelled, at {times}."
+        return f"Coughing in the night at {times}."
     hours = [clock_text(time, day.zone)[:2] for time in np.sort(starts).tolist()]
     each = [f"{hours.count(hour)} after {hour}:00" for hour in dict.fromkeys(hours)]
-    return f"Bouts of coughing in the night, as labelled, hour by hour: {', '.join(each)}."
+    return f"Bouts of coughing in the night, hour by hour: {', '.join(each)}."
 
 
 def _week(
@@ -411,25 +370,29 @@ def _week(
     shares = [_share(figures, day) for day in data.days]
     recorded = [Cell(percent(share) if share else _NOTHING) for share in shares]
     rows = [[Cell("Recorded"), *recorded, Cell("")]] if has_share else []
+    rests = [_rest([cell.text for cell in recorded], data.days)] if has_share else []
     for figure in figures:
         values = [figure.value(day) if day.coverage.length else None for day in data.days]
-        uncounted = [day.uncounted_events(figure.name) * figure.counts for day in data.days]
         usual = _dense(data.usually(figure)) if data.comparable else ""
-        notes = [f"{_NOT_COUNTED}:\N{NO-BREAK SPACE}{sum(uncounted)}"] * any(uncounted)
-        notes += [f"usually {usual} a day"] * bool(usual)
-        if figure.is_apart:
-            minutes = sum(television_minutes_of(day, figure.name) for day in data.days)
-            length = Duration(minutes).text.replace(" ", _SPACE)
-            notes += [f"television:{_SPACE}{length}"] * (minutes >= 1)
+        notes = [_apart(figure, data.days), f"usually {usual} a day" * bool(usual)]
+        texts = [*map(_short, values)]
+        rests.append(_rest(texts, data.days))
         colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(
             [
-                Cell(figure.short, colour=colour, note=", ".join(notes)),
-                *map(Cell, map(_short, values)),
+                Cell(figure.short, colour=colour, note=", ".join(filter(None, notes))),
+                *map(Cell, texts),
                 Cell(_total(data.days, figure)),
             ]
         )
-    return PageTable(["", *_day_heads(data), "All"], rows, "wide")
+    return PageTable(["", *_day_heads(data), "All"], rows, "wide", rests)
+
+
+def _rest(texts: Sequence[str], days: Sequence[DayMetrics]) -> str:
+    """Return what is with the days that have a dash."""
+    lacking = [day for text, day in zip(texts, days, strict=True) if text == _NOTHING]
+    why = "too little recorded" if any(day.coverage.length for day in lacking) else "not recorded"
+    return f"{'others ' * (len(lacking) < len(days))}{why}" if lacking else ""
 
 
 def _day_heads(data: ReportData) -> list[str]:
@@ -477,19 +440,9 @@ def _interrai(data: ReportData, days: Sequence[DayMetrics]) -> PageTable:
         number = _sum([item.value(day) for day in days])
         if number is None or item.needs not in ("", *data.classes):
             continue
-        text = _text(number)
-        if data.checked and not _is_checked(number):
-            text += ", as labelled"
-        minutes = 0.0
-        if isinstance(number, Duration) and item.needs:
-            minutes = sum(television_minutes_of(day, item.needs) for day in days)
-        cell = Cell(text, note=_television_note(minutes) if minutes >= 1 else "")
-        rows.append([Cell(item.topic), Cell(item.sounds), cell, Cell(item.limits)])
-    count = "Count" if data.checked else "Count, as labelled"
-    heads = ["The form asks about", "Heard here", count, "What sound cannot tell"]
+        lasts = isinstance(number, Duration) and item.needs
+        note = _apart(minutes_figure(item.needs), days) if lasts else ""
+        count = Cell(_text(number), note=note)
+        rows.append([Cell(item.topic), Cell(item.sounds), count, Cell(item.limits)])
+    heads = ["The form asks about", "Heard here", "Count", "What sound cannot tell"]
     return PageTable(heads, rows, "stack")
-
-
-def _is_checked(value: Value | None) -> bool:
-    """Return whether checked minutes give a range for the correct number."""
-    return isinstance(value, Count) and value.rates is not None

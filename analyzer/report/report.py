@@ -1,9 +1,8 @@
 """Report of a home: from logs to a page and a picture."""
 
-import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
@@ -41,6 +40,7 @@ from hearthlog.analyzer.logs.spans import Spans, intersection, joined, rows_at
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import ReportData
+from hearthlog.models.classes import APART_IN_REPORT
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.files import RELABEL_LAYER
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
@@ -77,7 +77,6 @@ def make_report(  # noqa: PLR0913
     progress: Progress = ignore_progress,
     *,
     draw: Draw | None = None,
-    now: int | None = None,
 ) -> WrittenReport:
     """Write the report of a day or a week.
 
@@ -86,8 +85,7 @@ def make_report(  # noqa: PLR0913
     `save_timelines`, which needs matplotlib; by default there is only the page. `progress` receives
     the share of the logs read, 0 to 1. Raise `DataError` if these days have no logs or no labels,
     or the labelling does not exist; `LogError` if segments are invalid, or a file exists or cannot
-    be written. After `now`, in nanoseconds of UTC, by default the current time, a day is still to
-    come.
+    be written.
     """
     picture = page.with_suffix(".png")
     if draw is not None and picture == page:
@@ -95,7 +93,7 @@ def make_report(  # noqa: PLR0913
     paths = [page] if draw is None else [page, picture]
     for path in paths:
         check_new(path)
-    data, losses = read_report_data(logs, period, labelling, progress, now)
+    data, losses = read_report_data(logs, period, labelling, progress)
     text = day_page(data) if period.days == 1 else week_page(data)
     with ExitStack() as files:
         html, *png = [files.enter_context(new_file(path)) for path in paths]
@@ -110,7 +108,6 @@ def read_report_data(
     period: Period,
     labelling: str = LIVE,
     progress: Progress = ignore_progress,
-    now: int | None = None,
 ) -> tuple[ReportData, Sequence[str]]:
     """Read the data of a page, and the read errors.
 
@@ -124,12 +121,13 @@ def read_report_data(
     since = midnight(earlier[0] - timedelta(days=1), zone)  # for the night that ends on that day
     home = read_home(logs, labelling, since, close, progress)
     model = _model(logs, close) if labelling == LIVE else ""
-    checks = read_checked_minutes(logs, labelling, since, close[1], home.losses).of_model(model)
+    checked = read_checked_minutes(logs, labelling, since, close[1], home.losses)
+    checks = replace(checked.of_model(model), apart=APART_IN_REPORT)
     metrics = metrics_of_home(home, checks)
     routines = Routines(Profiles(home_sound(home, metrics), zone, night_after=False))
-    past = [day_of(metrics, day, zone) for day in earlier]
-    now = time.time_ns() if now is None else now
-    shown = [day_of(metrics, day, zone, now) for day in days]
+    past = [day_of(metrics, day, zone, apart=APART_IN_REPORT) for day in earlier]
+    logged = _logged(logs, metrics.coverage)
+    shown = [day_of(metrics, day, zone, logged, APART_IN_REPORT) for day in days]
     span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
     data = ReportData(
         nodes=home.nodes,
@@ -141,7 +139,7 @@ def read_report_data(
         earlier=[day for day in past if any(map(day.comparable, metrics.classes))],
         judged={day: routines.judge(day) for day in days},
         baseline_days={day: len(routines.earlier(day)) for day in days},
-        uncovered=_unrecorded(home, [day.over for day in shown]),
+        uncovered=_unrecorded(home, [day.logged for day in shown]),
         gaps=_within(home.gaps, span),
         troubles=_within(home.troubles, span),
         doubts=_doubts(logs, home, labelling, shown),
@@ -153,6 +151,13 @@ def read_report_data(
         hidden=home.hidden,
     )
     return data, home.losses
+
+
+def _logged(logs: HomeLogs, coverage: Spans) -> tuple[int, int]:
+    """Return when the first log of a home begins, and its last one ends, in nanoseconds of UTC."""
+    starts = [entry.start for entry in logs.between()]
+    last = max(*starts, logs.end() or 0, int(coverage.ends[-1]))
+    return min(*starts, int(coverage.starts[0])), last
 
 
 def _model(logs: HomeLogs, close: tuple[int, int]) -> str:

@@ -24,7 +24,7 @@ from hearthlog.analyzer.activity.values import (
     usual_range,
 )
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import NONE, Spans, intersection, joined
+from hearthlog.analyzer.logs.spans import Spans, intersection, joined
 from hearthlog.analyzer.report.wording import several_in_words
 from hearthlog.models.classes import (
     COUGHING,
@@ -42,7 +42,6 @@ from hearthlog.models.classes import (
     in_words,
     ordered,
 )
-from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import listed
 
 
@@ -55,7 +54,7 @@ class ReportFigure(NamedTuple):
     name: str = ""  # class name, for a figure of one class
     sums: bool = True  # whether a total over days is meaningful
     counts: bool = False  # whether these are the events of a day
-    is_apart: bool = False  # whether it leaves out what sounded beside a television
+    lasts: bool = False  # whether it is the time of a class
 
 
 class FigureSection(NamedTuple):
@@ -64,11 +63,6 @@ class FigureSection(NamedTuple):
     title: str
     figures: Sequence[ReportFigure]
     note: str
-
-
-def counted_events(day: DayMetrics, name: str, span: Spans) -> Int64:
-    """Return the event starts of a class in a span that count, in nanoseconds of UTC."""
-    return day.home.minutes.counted(name, day.home.events_in(name, span))
 
 
 def television_spans(day: DayMetrics, pause: int = 0) -> Spans:
@@ -88,28 +82,9 @@ def sections(classes: Sequence[str]) -> list[FigureSection]:
 
 
 def minutes_figure(name: str) -> ReportFigure:
-    """Return the figure of a class's duration."""
+    """Return the figure of a class's duration, without that beside a television."""
     title = in_words(name)
-    return ReportFigure(title, title, lambda day: day.minutes(name), name)
-
-
-def apart_figure(name: str) -> ReportFigure:
-    """Return the figure of a class's duration without that beside a television."""
-    title = in_words(name)
-    return ReportFigure(title, title, lambda day: minutes_apart(day, name), name, is_apart=True)
-
-
-def minutes_apart(day: DayMetrics, name: str) -> Duration | None:
-    """Return the duration of a class without that beside a television; None if unknown."""
-    total = day.minutes(name)
-    if total is None:
-        return None
-    return Duration(max(total.minutes - television_minutes_of(day, name), 0.0))
-
-
-def television_minutes_of(day: DayMetrics, name: str) -> float:
-    """Return the minutes of a class beside something like a television."""
-    return intersection(day.home.spans.get(name, NONE), television_spans(day)).length / MINUTE
+    return ReportFigure(title, title, lambda day: day.minutes(name), name, lasts=True)
 
 
 def event_figure(name: str, title: str = "") -> ReportFigure:
@@ -369,7 +344,7 @@ ASSESSED_ITEMS = (
         "Company and conversation",
         f"{in_words(SPEECH).lower()}, not beside a television",
         SPEECH,
-        lambda day: minutes_apart(day, SPEECH),
+        lambda day: day.minutes(SPEECH),
         "Who talked. Company that talks for long sounds like a television; what was said is not "
         "kept.",
     ),

@@ -11,8 +11,8 @@ from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import difference, joined
-from hearthlog.analyzer.report.headline import amount, states_missing_time
+from hearthlog.analyzer.logs.spans import difference, joined, lengths
+from hearthlog.analyzer.report.headline import amount, states_missing_time, unlogged
 from hearthlog.analyzer.report.report_data import ReportData, television_spans
 from hearthlog.analyzer.report.wording import (
     WEEK,
@@ -48,7 +48,7 @@ def summarize_day(data: ReportData, day: DayMetrics) -> Iterator[str]:
         yield _off_for_the_rest(data)
     else:
         is_partly = day.missing.length >= _MINUTE  # `not_recorded` says so
-        complete = "Recorded until then." if day.coming else "The whole day was recorded."
+        complete = unlogged([day]) or "The whole day was recorded."
         yield f"{'' if is_partly else complete} {_loudest(day)}".strip()
     yield _television(day)
     if data.comparable:
@@ -62,7 +62,8 @@ def summarize_week(data: ReportData) -> Iterator[str]:
     """Summarise a week in a few sentences, compared with earlier days."""
     days = [day for day in data.days if day.coverage.length]
     share = sum(day.coverage.length for day in days) / sum(day.span.length for day in data.days)
-    yield f"Recorded: {len(days)} of {len(data.days)} days, {percent(share)} of the time."
+    logs = unlogged(data.days, with_day=True)
+    yield f"Recorded: {len(days)} of {len(data.days)} days, {percent(share)} of the time. {logs}"
     if not data.comparable:
         return
     if max(data.baseline_days.values()) < FEWEST:
@@ -114,7 +115,7 @@ def not_recorded(data: ReportData) -> Iterator[str]:
 
     The total comes first, unless the headline has it.
     """
-    length = sum(day.over.length for day in data.days)
+    length = sum(day.logged.length for day in data.days)
     missing = sum(day.missing.length for day in data.days)
     is_stated = len(data.days) == 1 and states_missing_time(data.days[0])
     if missing >= _MINUTE and not is_stated:
@@ -159,7 +160,7 @@ def longest_quiet(day: DayMetrics) -> str:
     if day.quiet is None or day.quiet.minutes < 1:
         return ""
     start, end = (clock_text(int(edge[0]), day.zone) for edge in quiet)
-    return f"The longest quiet stretch by day, as labelled, lasted from {start} to {end}."
+    return f"The longest quiet stretch by day lasted from {start} to {end}."
 
 
 def percent(share: float) -> str:
@@ -179,7 +180,8 @@ def _off_for_the_rest(data: ReportData) -> str:
     missing = sum(day.missing.length for day in data.days)
     if missing < _MINUTE or missing - _unexplained(data) >= _MINUTE:
         return ""
-    rest = "Then" if data.days[0].coming else "In the rest of the day"
+    day = data.days[0]
+    rest = "Then" if day.before_logs or day.after_logs else "In the rest of the day"
     return f"{rest} the recorder was off, or its logs are not here."
 
 
@@ -191,7 +193,8 @@ def _loudest(day: DayMetrics) -> str:
     ]
     sounds = listed(most[:3], "and")
     quiet = "It was quiet." if day.share >= MOST else ""
-    return f"Most of the sound, as labelled: {sounds}." if most else quiet
+    television = ", a television aside" if television_spans(day).length else ""
+    return f"Most of the sound{television}: {sounds}." if most else quiet * (not television)
 
 
 def _television(day: DayMetrics) -> str:
@@ -207,7 +210,7 @@ def _television(day: DayMetrics) -> str:
     ]
     more = "at other times and " if len(spans.starts) > _TIMES else ""
     when = more + f"from {listed(times, 'and')}"
-    return f"As labelled, something like a television, a radio or company sounded {when}."
+    return f"Something like a television, a radio or company sounded {when}."
 
 
 def _still(day: DayMetrics) -> str:
@@ -220,7 +223,12 @@ def _still(day: DayMetrics) -> str:
     partly = day.span.length - day.coverage.length >= _MINUTE
     recorded = ", as far as it was recorded" * partly
     steady = "steady sound, such as a fan's, counts as quiet"
-    return f"Hardly any sound was labelled {times}{recorded}; {steady}." if times else ""
+    start, end = int(day.span.starts[0]), int(day.span.ends[0])
+    edges = np.array([start, day.active[0], day.active[-1] + 10 * _MINUTE, end])
+    short, _, late = lengths(day.home.sound, edges).tolist()
+    is_any = (first and short) or (last and late)
+    what = "Only short sounds" if is_any else "Nothing was labelled"
+    return f"{what} {times}{recorded}; {steady}." if times else ""
 
 
 def _changes(data: ReportData, day: DayMetrics) -> str:
@@ -246,7 +254,7 @@ def _night(day: DayMetrics) -> str:
     partly = ""
     if day.night_hours < hours - _HALF:
         partly = f" Only {day.night_hours:.1f} of its {hours:.0f} hours were recorded."
-    return f"In the night, 22:00 to 07:00, as labelled: {', '.join(parts)}.{partly}"
+    return f"In the night, 22:00 to 07:00: {'; '.join(parts)}.{partly}"
 
 
 def _unexplained(data: ReportData) -> int:

@@ -10,11 +10,10 @@ from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Duration, UsualRange, usual_range
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
 from hearthlog.analyzer.logs.spans import (
-    EVENT_PAUSE,
+    NONE,
     Spans,
     difference,
     intersection,
-    joined,
     lengths,
     single_span,
 )
@@ -23,6 +22,8 @@ from hearthlog.models.classes import SILENCE, Colour, colour_on_paper, in_words
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 
 PHONE_LANES = 12
+LOW = 0.5  # height of a mark of which the model is not sure
+BEFORE_LOGS, AFTER_LOGS = "before the first log", "after the last log"
 _LEAST_HATCHED = 2  # minutes
 # Marks are at least three pixels wide: of the widest page 5.5 steps, of the narrowest 16.
 _TOUCHING, _SHORT, _LONG = 5, 16.0, 2.0  # steps
@@ -53,24 +54,24 @@ class TimelineLane(NamedTuple):
     name: str
     words: str
     colour: Colour
-    counted: Float64  # [shape=(n, 2)]; start and end of the events that count
+    counted: Float64  # [shape=(n, 2)]; start and end of the events that count, and are sure
+    unsure: Float64  # [shape=(n, 2)]; of those that count, but the model is not sure
     uncounted: Float64  # [shape=(n, 2)]; of those beside a television
     gaps: Sequence[TimelineBlock]  # time in which only other classes could be detected
 
     @property
     def empty(self) -> bool:
         """Whether nothing of the class was heard."""
-        return not (len(self.counted) or len(self.uncounted))
+        return not (len(self.counted) or len(self.unsure) or len(self.uncounted))
 
     @property
-    def paths(self) -> MarkPaths:
-        """Marks of the events that count."""
-        return _paths(self.counted)
-
-    @property
-    def pale_paths(self) -> MarkPaths:
-        """Marks of the events beside a television."""
-        return _paths(self.uncounted)
+    def paths(self) -> Sequence[tuple[str, MarkPaths]]:
+        """Marks by their look: pale beside a television, low if not sure."""
+        return (
+            (" pale", _paths(self.uncounted)),
+            (" low", _paths(self.unsure, LOW)),
+            ("", _paths(self.counted)),
+        )
 
 
 class HourTick(NamedTuple):
@@ -98,6 +99,7 @@ class DayTimeline(NamedTuple):
     steps: int  # 1440, but for days on which the clock is changed
     lanes: Sequence[TimelineLane]
     gaps: Sequence[TimelineBlock]  # nobody listened
+    unlogged: Sequence[tuple[TimelineBlock, str]]  # before the first log, and after the last one
     empty_hours: Sequence[TimelineBlock]  # in which nobody listened
     nights: Sequence[TimelineBlock]
     ticks: Sequence[HourTick]
@@ -120,6 +122,11 @@ class DayTimeline(NamedTuple):
     def has_uncounted(self) -> bool:
         """Whether there are events beside a television."""
         return any(len(lane.uncounted) for lane in self.lanes)
+
+    @property
+    def has_unsure(self) -> bool:
+        """Whether there are events that are not sure."""
+        return any(len(lane.unsure) for lane in self.lanes)
 
     @property
     def has_gaps(self) -> bool:
@@ -164,12 +171,29 @@ def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimel
         round(span.length / _step(day, span)),
         [_lane(day, span, name) for name in names],
         list(_blocks(span, intersection(day.missing, span))),
-        list(
-            _runs(lefts, (lengths(day.coverage, hours) < MINUTE) & (hours[:-1] < day.over.ends[0]))
-        ),
+        list(_unlogged(day, span)),
+        list(_runs(lefts, _empty_hours(day, hours))),
         list(_runs(lefts, night)),
         list(_ticks(lefts, clock)),
     )
+
+
+def _unlogged(day: DayMetrics, span: Spans) -> Iterable[tuple[TimelineBlock, str]]:
+    """Yield the parts of an axis without logs, and what they are."""
+    (start,), (end,) = day.span
+    for first, last, text in (
+        (start, day.logged.starts[0], BEFORE_LOGS),
+        (day.logged.ends[0], end, AFTER_LOGS),
+    ):
+        part = intersection(single_span(int(first), int(last)), span)
+        yield from ((block, text) for block in _blocks(span, part))
+
+
+def _empty_hours(day: DayMetrics, hours: Int64) -> Bool:
+    """Return in which of the hours nobody listened, though there are logs around them."""
+    (first,), (last,) = day.logged
+    empty: Bool = lengths(day.coverage, hours) < MINUTE
+    return empty & (hours[1:] > first) & (hours[:-1] < last)
 
 
 def shown_span(day: DayMetrics) -> Spans:
@@ -229,24 +253,21 @@ def _ticks(lefts: Float64, clock: Sequence[int]) -> Iterable[HourTick]:
 
 
 def _lane(day: DayMetrics, span: Spans, name: str) -> TimelineLane:
-    spans = day.home.spans[name]
-    events = joined(spans.starts, spans.ends, EVENT_PAUSE)
-    counts = np.isin(events.starts, day.home.minutes.counted(name, events.starts))
+    events, apart = day.joined_events(name)
+    is_unsure = np.isin(events.starts, day.home.unsure.get(name, NONE.starts))
+    sure, unsure = (Spans(events.starts[own], events.ends[own]) for own in (~is_unsure, is_unsure))
     gaps = difference(intersection(day.coverage, span), day.home.listened[name])
     step = _step(day, span)
-    counted, uncounted = (
-        (
-            np.stack(intersection(Spans(events.starts[own], events.ends[own]), span), axis=1)
-            - span.starts
-        )
-        / step
-        for own in (counts, ~counts)
+    counted, doubtful, uncounted = (
+        (np.stack(intersection(own, span), axis=1) - span.starts) / step
+        for own in (sure, unsure, apart)
     )
     return TimelineLane(
         name,
         in_words(name),
         colour_on_paper(name),
         counted,
+        doubtful,
         uncounted,
         list(_blocks(span, gaps)),
     )
@@ -274,8 +295,11 @@ def _percent(span: Spans, times: Int64) -> Float64:
     return (times - span.starts[0]) / span.length * 100
 
 
-def _paths(events: Float64) -> MarkPaths:
-    """Return the marks of events; their size does not grow with the number of short ones."""
+def _paths(events: Float64, height: float = 1.0) -> MarkPaths:
+    """Return the marks of events; their size does not grow with the number of short ones.
+
+    They stand on the floor of their box; `height` is a share of it.
+    """
     widths = events[:, 1] - events[:, 0]
     long = events[widths >= _LONG].round(1).tolist()
     places = np.unique(np.round(events[widths < _SHORT].mean(axis=1)).astype(np.int64))
@@ -283,8 +307,9 @@ def _paths(events: Float64) -> MarkPaths:
     firsts, lasts = places[apart], places[np.roll(apart, -1)]
     runs = zip(firsts.tolist(), lasts.tolist(), strict=True)
     ends = np.unique(np.concatenate([firsts, lasts])).tolist()
+    top, middle = 1 - height, 1 - height / 2
     return MarkPaths(
-        "".join(f"M{a:g} 0h{b - a:g}v1h{a - b:g}z" for a, b in long),
-        "".join(f"M{place} 0v1" for place in ends),
-        "".join(f"M{a} .5H{b}" for a, b in runs if b > a),
+        "".join(f"M{a:g} {top:g}h{b - a:g}v{height:g}h{a - b:g}z" for a, b in long),
+        "".join(f"M{place} {top:g}v{height:g}" for place in ends),
+        "".join(f"M{a} {middle:g}H{b}" for a, b in runs if b > a),
     )

@@ -11,6 +11,7 @@ from matplotlib.patches import Patch
 
 from hearthlog.analyzer.activity.daily_metrics import DayMetrics
 from hearthlog.analyzer.report.timeline import (
+    LOW,
     DayTimeline,
     HourBar,
     TimelineBlock,
@@ -54,6 +55,20 @@ def _draw_lanes(axes: Any, timelines: Sequence[DayTimeline]) -> None:
         top = number * each
         _draw_blocks(axes, timeline, timeline.nights, (top, max(each, 1)), color=_NIGHT)
         _draw_gaps(axes, timeline, timeline.gaps, (top, max(each, 1)))
+        for block, text in timeline.unlogged:
+            middle = (block.left + block.width / 2) * timeline.steps / 100
+            if block.width >= _WRITTEN:
+                level = top + max(each, 1) / 2
+                axes.text(
+                    middle,
+                    level,
+                    text,
+                    ha="center",
+                    va="center",
+                    fontsize=8.5,
+                    color=_HATCH,
+                    backgroundcolor="white",
+                )
         for place, lane in enumerate(timeline.lanes):
             _draw_gaps(axes, timeline, lane.gaps, (top + place, 1))
             _draw_lane(axes, lane, top + place)
@@ -71,9 +86,13 @@ def _draw_lanes(axes: Any, timelines: Sequence[DayTimeline]) -> None:
 
 def _draw_lane(axes: Any, lane: TimelineLane, top: int) -> None:
     colour = _shade(lane)
-    band = top + 0.12, 0.76
-    axes.broken_barh(_at_least(lane.uncounted), band, facecolor=(*colour, _PALE), lw=0, zorder=2)
-    axes.broken_barh(_at_least(lane.counted), band, facecolor=colour, lw=0, zorder=2)
+    for events, shade, height in (
+        (lane.uncounted, (*colour, _PALE), 1.0),
+        (lane.unsure, colour, LOW),
+        (lane.counted, colour, 1.0),
+    ):
+        band = top + 0.12 + 0.76 * (1 - height), 0.76 * height
+        axes.broken_barh(_at_least(events), band, facecolor=shade, lw=0, zorder=2)
 
 
 def _shade(lane: TimelineLane) -> tuple[float, float, float]:
@@ -133,6 +152,7 @@ def _draw_hours(axes: Any, timeline: DayTimeline, bars: Sequence[HourBar]) -> No
 
 
 _NUMBERED = 0.5
+_WRITTEN = 15.0  # per cent of an axis
 
 
 def _draw_axis(axes: Any, timeline: DayTimeline) -> None:
@@ -155,8 +175,10 @@ def _draw_legend(figure: Any, timelines: Sequence[DayTimeline]) -> None:
     if any(timeline.has_gaps for timeline in timelines):
         gap = Patch(facecolor="white", edgecolor=_HATCH, hatch="////", label="not recorded")
         entries.append(gap)
+    if any(timeline.has_unsure for timeline in timelines):
+        entries.append(Patch(color=_HATCH, label="half as high: not sure"))
     if any(timeline.has_uncounted for timeline in timelines):
-        entries.append(Patch(color=_UNCOUNTED, label="beside a television: not counted"))
+        entries.append(Patch(color=_UNCOUNTED, label="pale: beside a television"))
     figure.legend(handles=entries, loc="outside lower left", ncols=6, fontsize=8.5, frameon=False)
 
 

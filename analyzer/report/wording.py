@@ -85,6 +85,12 @@ def clock_with_day(nanoseconds: int, zone: tzinfo, first: date | None) -> str:
     return f"{weekday(moment.date())} {moment:%H:%M}" if is_before else f"{moment:%H:%M}"
 
 
+def edge_of_week(nanoseconds: int, zone: tzinfo, *, is_end: bool) -> str:
+    """Format an edge of a time span with its day: `Mon 2 Mar 07:05`; at midnight just the day."""
+    day, clock = local_time(nanoseconds - is_end, zone).date(), clock_text(nanoseconds, zone)
+    return short_day(day) if clock == "00:00" else f"{short_day(day)} {clock}"
+
+
 def times_in_words(starts: Int64, zone: tzinfo, most: int = 16, first: date | None = None) -> str:
     """List times of day (nanoseconds of UTC, any order), `most` of them, and how many more.
 
@@ -92,7 +98,7 @@ def times_in_words(starts: Int64, zone: tzinfo, most: int = 16, first: date | No
     """
     shown = Counter(clock_with_day(start, zone, first) for start in np.sort(starts)[:most].tolist())
     more = len(starts) - shown.total()
-    texts = [text if n == 1 else f"{text} ({_often(n)})" for text, n in shown.items()]
+    texts = [text if n == 1 else f"{text} {_often(n)}" for text, n in shown.items()]
     return ", ".join(texts) + (f" and {more} more" if more else "")
 
 

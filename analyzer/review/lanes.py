@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.activity.checked_minutes import (
+    UNSURE_BELOW,
     ClassCheck,
     checked_minutes,
     read_reviewed_labels,
@@ -19,7 +20,7 @@ from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, microphone_states
 from hearthlog.analyzer.logs.selection import checked_array_names
 from hearthlog.analyzer.logs.sound_vectors import as_vectors, degrees_of
-from hearthlog.analyzer.logs.spans import overlay
+from hearthlog.analyzer.logs.spans import joined, overlay, rows_at
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.timeline import (
     LabelledSpans,
@@ -45,7 +46,7 @@ from hearthlog.models.classes import (
     ordered,
     translation,
 )
-from hearthlog.schemas.arrays import Float64, Int64
+from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.messages import message_types
@@ -64,6 +65,9 @@ _TROUBLED: Colour = (240, 140, 40)
 _TROUBLES = {"warning": _TROUBLED, "error": (230, 60, 60), "stale": (150, 90, 160)}
 TROUBLES = tuple(_TROUBLES)  # texts of a live lane, by the level of a diagnostic status minus one
 GAP_STATE = "not heard"
+NOT_SURE = "not sure"  # after the name of a class
+_DOUBT = "?"
+BACKGROUND: Colour = (13, 13, 13)  # behind the plots of the viewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +80,26 @@ class LaneKind:
 
 
 def _class_colours(states: Iterable[str]) -> dict[str, Colour]:
-    return {state: colour(state) for state in states}
+    return {state: _state_colour(state) for state in states}
+
+
+def _state_colour(state: str) -> Colour:
+    """Return the colour of a class in a lane of all classes, in which quiet is faint."""
+    name = sure_state(state)
+    shade = colour(name)
+    if class_name(name) == SILENCE:
+        return unsure_colour(unsure_colour(shade))
+    return shade if name == state else unsure_colour(shade)
+
+
+def unsure_state(state: str) -> str:
+    """Return the state of a class of which the model is not sure."""
+    return f"{state}{_DOUBT}"
+
+
+def sure_state(state: str) -> str:
+    """Return the state without what `unsure_state` adds."""
+    return state.removesuffix(_DOUBT)
 
 
 def _trouble_colours(states: Iterable[str]) -> dict[str, Colour]:
@@ -190,8 +213,25 @@ def _lanes_of(microphone: MicrophoneTimeline, *, marking: bool) -> Iterator[Lane
     for one in labellings:
         for name, shade in words.items():
             spans = _of_class(one.spans, name)
-            yield Lane(microphone.name, one.name, name, spans, {name: shade})
+            unsure = np.isin(spans.starts, _not_reviewed(one.unsure, microphone.reviewed).starts)
+            texts = np.where(unsure, f"{name}, {NOT_SURE}", spans.texts)
+            shades = {name: shade, f"{name}, {NOT_SURE}": unsure_colour(shade)}
+            yield Lane(microphone.name, one.name, name, LabelledSpans(*spans[:2], texts), shades)
     yield from _shared_lanes(microphone, labellings, marking=marking)
+
+
+def unsure_colour(shade: Colour) -> Colour:
+    """Return a colour mixed with the background, for labels that the model doubts itself."""
+    red, green, blue = ((part + dark) // 2 for part, dark in zip(shade, BACKGROUND, strict=True))
+    return red, green, blue
+
+
+def _not_reviewed(spans: LabelledSpans, reviewed: LabelledSpans) -> LabelledSpans:
+    """Drop the spans that a person reviewed completely."""
+    done = joined(reviewed.starts, reviewed.ends)
+    rows = rows_at(done, spans.starts)
+    inside = (rows >= 0) & (spans.ends <= np.append(done.ends, 0)[rows])
+    return spans.where(~inside)
 
 
 def labellings_of(microphone: MicrophoneTimeline) -> list[LabellingTimeline]:
@@ -373,7 +413,7 @@ _SEGMENT_LINE = re.compile(r"^(\w+) for(?= [\d.]+ s \(\d+ %\)$)")
 FIELDS = {
     message_types.FEATURES: ("header.stamp", "values"),
     message_types.LABEL: ("header.stamp", "novelty", "probabilities"),
-    message_types.SEGMENT: ("header.stamp", "duration", "label"),
+    message_types.SEGMENT: ("header.stamp", "duration", "label", "confidence"),
     message_types.GAP: ("header.stamp", "duration", "reason"),
     message_types.DIRECTION: ("header.stamp", "azimuth", "confidence"),
     message_types.DIAGNOSTICS: ("header.stamp", "header.frame_id", "status"),
@@ -389,6 +429,7 @@ class LaneRows(NamedTuple):
     microphone: str
     labelling: str
     spans: LabelledSpans
+    unsure: Bool  # [shape=(n,)], which are segments of a low confidence
 
 
 class StateRows(NamedTuple):
@@ -449,10 +490,11 @@ def _microphone_rows(
             yield Plot(DIRECTION, microphone, "", ("direction",), times, towards)
         case message_types.SEGMENT:
             spans = LabelledSpans(times, times + columns["duration"], columns["label"])
-            yield LaneRows(RECORDER, microphone, labelling, spans)
+            unsure = columns["confidence"] < UNSURE_BELOW
+            yield LaneRows(RECORDER, microphone, labelling, spans, unsure)
         case message_types.GAP:
             spans = LabelledSpans(times, times + columns["duration"], columns["reason"])
-            yield LaneRows(GAPS, microphone, "", spans)
+            yield LaneRows(GAPS, microphone, "", spans, np.zeros(len(spans), bool))
 
 
 def shown_topic(name: str) -> TopicName | None:

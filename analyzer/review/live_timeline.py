@@ -28,6 +28,8 @@ from hearthlog.analyzer.review.lanes import (
     scenario_kind,
     scenario_sounds,
     state_lane,
+    sure_state,
+    unsure_state,
 )
 from hearthlog.analyzer.review.timeline import LabelledSpans, LogLines, Plot, PlotKind
 from hearthlog.models.classes import UNKNOWN, class_name, ordered
@@ -102,7 +104,12 @@ class LiveTimeline:
             case LaneRows() if rows.kind is GAPS:
                 yield _gaps(rows)
             case LaneRows(labelling="live"):
-                yield from self._segments(rows.microphone, rows.spans)
+                texts = [
+                    unsure_state(text) if unsure else text
+                    for text, unsure in zip(rows.spans.texts, rows.unsure, strict=True)
+                ]
+                spans = LabelledSpans(*rows.spans[:2], np.array(texts, object))
+                yield from self._segments(rows.microphone, spans)
             case LaneRows() if is_scenario(rows.labelling):
                 kind = scenario_kind(rows.labelling)
                 yield state_lane(kind, rows.microphone, scenario_sounds(rows.spans))
@@ -119,7 +126,7 @@ class LiveTimeline:
         return update
 
     def _is_hidden(self, name: str | None) -> bool:
-        return name is not None and class_name(name) in self.hidden
+        return name is not None and class_name(sure_state(name)) in self.hidden
 
     def _add_seconds(self, rows: Plot) -> Iterator[Plot | StateLane]:
         starts, times, means = self._by_second(rows)

@@ -27,6 +27,11 @@ _RIGHT = "."
 _CAPS = {_RIGHT: "Enter", "p": "Space"}
 _NO_SOUND = "no sound of this span was kept"
 _SILENT = "nothing to hear: its sound was not kept"
+_NONE_AUDIBLE = (
+    "None of these can be heard: record with `--keep-audio unsure` (see docs/recorder.md). "
+    "You can still answer from memory."
+)
+_LOADING = "The picture is still loading; you can answer already."
 _LONG = 60 * NANOSECONDS  # a longer span is marked by a second press
 _ANSWERS = {"a", "c", _RIGHT, "n", "b", "q"}
 _CLASS_KEYS = "1234567890eghijklorsvwxy"
@@ -116,6 +121,8 @@ class ReviewSession:
     _at: int = -1
     _judged: list[int] = field(default_factory=list)  # the item of each change
     _began: float = 0.0
+    _is_loading: bool = False  # until the first key, while the viewer does not answer
+    _is_pressed: bool = False
     _begin: int | None = None  # start of a span without an end yet
     _plays_until: float = 0.0  # by CLOCK_MONOTONIC
     _long: tuple[str, int, int] | None = None  # label and span of the last press, if too long
@@ -150,12 +157,12 @@ class ReviewSession:
         actions: dict[str, tuple[str, Callable[[], None]]] = {}
         if self.items:
             actions["a"] = "confirm the label", self._accept
-        else:
-            actions["c"] = "confirm the labels", lambda: self._mark(self.marking.confirm)
-        actions[_RIGHT] = "confirm the rest", self._rest_is_right
         for key, label in self._labels().items():
             actions[key] = _words(label), partial(self._mark_as, label)
+        if not self.items:
+            actions["c"] = "confirm the labels", lambda: self._mark(self.marking.confirm)
         actions |= {
+            _RIGHT: ("confirm the rest", self._rest_is_right),
             "m": ("move the mark", self._move),
             "d": ("delete the marks", lambda: self._mark(self.marking.delete)),
             "z": ("undo", self._undo),
@@ -176,7 +183,9 @@ class ReviewSession:
         Raise `LogError` if a review layer is damaged when the session begins.
         """
         self._began = time.monotonic()
-        self._redraw()
+        if self.items and not self._is_any_audible:
+            self.announce(_NONE_AUDIBLE)
+        self._redraw("")
         self.announce(
             "press a if the label is right, else the key of the right class; n skips"
             if self.items
@@ -203,6 +212,7 @@ class ReviewSession:
         A key is one of `keys`, Enter, or a space, which plays. Any other key except white space
         shows the list of keys.
         """
+        self._is_pressed = True
         actions = self._actions()
         same = {"\n": _RIGHT, " ": "p"}.get(key, key)
         try:
@@ -230,6 +240,10 @@ class ReviewSession:
             raise DataError(f"{length} is long: press the key again to mark it as {_words(label)}")
         self._long = None
         self._mark(lambda start, end: self.marking.mark(start, end, label, chosen))
+
+    @property
+    def _is_any_audible(self) -> bool:
+        return any(item.is_audible for item in self.items)
 
     @property
     def _in_minute(self) -> bool:
@@ -272,7 +286,7 @@ class ReviewSession:
     def _done(self, start: int, end: int, text: str) -> None:
         self._judged.append(self._at)
         self.announce(f"{text}: {self._text(start, end)}")
-        self._redraw()
+        self._redraw("saved, but ")
 
     def _undo(self) -> None:
         span = self.marking.undo()
@@ -281,23 +295,27 @@ class ReviewSession:
             return
         judged = self._judged.pop()
         self.announce(f"undone: {self._text(*span)}")
-        self._redraw()
+        self._redraw("undone, but ")
         if judged != self._at:
             self._go(judged - self._at)
 
-    def _redraw(self) -> None:
+    def _redraw(self, done: str) -> None:
         of = self.marking.microphone, self.marking.scenario
         marks, reviewed = self.marking.marks(), self.marking.reviewed()
-        with self._unless_silent():
+        with self._unless_silent(done):
             self.screen.redraw_marks(*of, marks, reviewed)
 
     @contextmanager
-    def _unless_silent(self) -> Iterator[None]:
-        """Report a viewer that does not answer; completed changes are kept."""
+    def _unless_silent(self, done: str = "") -> Iterator[None]:
+        """Report a viewer that does not answer, after what is `done` all the same."""
         try:
             yield
         except (ConnectionError, TimeoutError):
-            self.announce("saved, but not shown, as the viewer did not answer")
+            if self._is_pressed:
+                self.announce(f"{done}not shown, as the viewer did not answer")
+            elif not self._is_loading:
+                self._is_loading = True
+                self.announce(_LOADING)
 
     def _play(self) -> None:
         """Play the selected span, or the item; stop a sound that plays."""
@@ -311,7 +329,8 @@ class ReviewSession:
         self._plays_until = time.monotonic() + seconds
         self.announce(text)
         if seconds:
-            self.screen.play(start)
+            with suppress(ConnectionError, TimeoutError):  # it plays, also without a cursor
+                self.screen.play(start)
 
     def span_to_play(self) -> tuple[int, int]:
         """Return the selected span, or the item, in nanoseconds of UTC.
@@ -333,7 +352,6 @@ class ReviewSession:
         """Begin a span, or move the start of the selected one."""
         cursor, selection = self._cursor(), self.screen.selection()
         if selection is not None and cursor < selection[1]:
-            self._begin = None
             self._select(cursor, selection[1])
             return
         self._begin = cursor
@@ -346,11 +364,11 @@ class ReviewSession:
         end = self._cursor()
         if start is None or start >= end:
             raise DataError("put the time cursor on the start and press [, then on the end and ]")
-        self._begin = None
         self._select(start, end)
 
     def _select(self, start: int, end: int) -> None:
         self.screen.show(start, end, _margin(start, end))
+        self._begin = None
         self.announce(self._text(start, end))
 
     def _cursor(self) -> int:
@@ -378,7 +396,7 @@ class ReviewSession:
             return
         item = self.items[self._at]
         place = f"{self._at + 1} of {len(self.items)}"
-        silent = "" if item.is_audible else f"; {_SILENT}"
+        silent = f"; {_SILENT}" if self._is_any_audible and not item.is_audible else ""
         span = self._text(item.start, item.end)
         margin = _margin(item.start, item.end)
         with self._unless_silent():

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.local_time import home_zone, local_time
 from hearthlog.models.classes import Colour, in_words, ordered
-from hearthlog.schemas.arrays import Float32, Float64, Indices, Int16, Int64
+from hearthlog.schemas.arrays import Bool, Float32, Float64, Indices, Int16, Int64
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import scenario_name
 
@@ -119,6 +119,10 @@ class LabelledSpans(NamedTuple):
 
     def __len__(self) -> int:
         return len(self.starts)
+
+    def where(self, rows: Bool) -> "LabelledSpans":
+        """Return some of the spans."""
+        return LabelledSpans(self.starts[rows], self.ends[rows], self.texts[rows])
 
 
 def labelled_spans(rows: Iterable[tuple[int, int, str]] = ()) -> LabelledSpans:
@@ -298,6 +302,7 @@ class LabellingTimeline:
     name: str
     spans: LabelledSpans
     classes: Sequence[str] = ()  # of its model
+    unsure: LabelledSpans = field(default_factory=no_spans)  # segments of a low confidence
 
 
 @dataclass
@@ -339,6 +344,11 @@ class Timeline:
     coverage: Mapping[str, Coverage]
     every: int = 1
     losses: list[str] = field(default_factory=list)
+
+    @property
+    def has_sound(self) -> bool:
+        """Whether some sound was kept."""
+        return any(microphone.clips for microphone in self.microphones.values())
 
     @property
     def clock(self) -> HomeClock:

@@ -101,6 +101,7 @@ class _Microphone:
     means: dict[PlotKey, _NamedMeans] = field(default_factory=dict)
     frames: dict[PlotKey, list[Plot]] = field(default_factory=dict)
     spans: dict[str, list[LabelledSpans]] = field(default_factory=dict)  # by labelling
+    unsure: dict[str, list[LabelledSpans]] = field(default_factory=dict)  # likewise
     reviewed: dict[str, list[LabelledSpans]] = field(default_factory=dict)  # by scenario
     gaps: list[LabelledSpans] = field(default_factory=list)
     states: list[MicrophoneHealth] = field(default_factory=list)
@@ -119,6 +120,9 @@ class _Microphone:
                 self.gaps.append(rows.spans)
             case LaneRows():
                 self.spans.setdefault(rows.labelling, []).append(rows.spans)
+                if rows.unsure.any():
+                    unsure = rows.spans.where(rows.unsure)
+                    self.unsure.setdefault(rows.labelling, []).append(unsure)
                 self._forget_frames(rows.labelling)
             case StateRows():
                 self.states += rows.states
@@ -192,8 +196,9 @@ class _Microphone:
         if not parts and probabilities is not None:
             means = self.means[PROBABILITIES, name].means
             parts = list(_runs(_probability_frames(means, self.grid), 0, self.grid.step))
+        classes = () if probabilities is None else probabilities.names
         return LabellingTimeline(
-            name, self._join(parts), () if probabilities is None else probabilities.names
+            name, self._join(parts), classes, self._join(self.unsure.get(name, []))
         )
 
     def _join(self, parts: Sequence[LabelledSpans]) -> LabelledSpans:

@@ -45,7 +45,6 @@ from hearthlog.analyzer.report.report import Period, read_report_data
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_ITEMS,
     ReportData,
-    apart_figure,
     minutes_figure,
     sections,
 )
@@ -225,12 +224,26 @@ def report_statements(
 ) -> Iterator[Statement]:
     """Yield the statements of the report of a day.
 
+    The foot of a report says that all but its headline and its ranges is as labelled.
+
     Parameters
     ----------
     before : sequence of TrueDay
         The days before, as far as they are heard, for the assessment of three days.
     """
-    day, page = data.days[0], _Page(day_page(data))
+    page = _Page(day_page(data))
+    is_labelled = any("are as labelled" in text for _, text in page.paragraphs)
+    for number, statement in enumerate(_statements_of(page, data.days[0], truth, before)):
+        if is_labelled and number and not statement.is_range and statement.verdict == FALSE:
+            yield statement._replace(verdict=LABELLED)
+        else:
+            yield statement
+
+
+def _statements_of(
+    page: _Page, day: DayMetrics, truth: TrueDay, before: Sequence[TrueDay]
+) -> Iterator[Statement]:
+    """Yield the statements of a page: first that of its headline."""
     for kind, text in page.paragraphs:
         yield from _paragraph(kind, text, day, truth)
     figures = {
@@ -238,9 +251,7 @@ def report_statements(
         for part in sections(day.home.classes)
         for figure in part.figures
     }
-    for full, plain, cells in page.rows:
-        title, labelled, _ = full.partition(", as labelled")
-        heads = [head + labelled for head in plain]
+    for title, heads, cells in page.rows:
         if title == "What was heard":
             yield from _sound_counts(heads, cells, day, truth)
         elif (title, cells[0]) in figures:
@@ -326,42 +337,45 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
         "22:00": single_span(evening, int(day.span.ends[0])),
     }
     modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
-    for stated in sentence.split("; "):
-        for name in (name for name in _sounds_of(day) if _mentions(stated, name)):
-            known = {in_words(name).lower(), several_in_words(name).lower()}
-            words = f"(?:{'|'.join(map(re.escape, sorted(known)))})"
-            after_number = rf"(?:bouts? of |times of )?(?:something like )?{words}|by day|after"
-            for part in re.split(r"(?:,| and) (?=\w+ (?:by day|after 22:00))", stated):
-                bare = re.sub(r"\([^)]*\)", "", part).lower()
-                match = re.search(rf"{words} ({_NUMBER})", bare) or re.search(
-                    rf"({_NUMBER})(?: to ({_NUMBER}))? (?={after_number})", bare
-                )
-                if match is None:
-                    continue
-                low = _number(match[1])
-                high = _number(match[2]) if match.lastindex == 2 else low
-                span = next((own for when, own in parts.items() if when in part), day.span)
-                true = day.home.minutes.between(span).count(name, None).labelled
-                if doubtful := re.search(rf"\(perhaps ({_NUMBER})", part):
-                    most = _number(doubtful[1])
-                    right = low <= true <= most or is_close(low, true) or is_close(most, true)
-                    yield _judged(surface, part, f"{true:g}", right=right, modest=modest)
-                else:
-                    yield _counted(surface, part, (low, high), true, modest=modest)
-                if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
-                    yield _at_times(surface, part, name, clocks, truth, modest=modest)
+    name = None
+    for part in sentence.split("; "):
+        name = next((each for each in _sounds_of(day) if _mentions(part, each)), name)
+        if name is None:
+            continue
+        known = {in_words(name).lower(), several_in_words(name).lower()}
+        words = f"(?:{'|'.join(map(re.escape, sorted(known)))})"
+        after_number = rf"(?:bouts? of |times of )?{words}|by day|after|in the night"
+        bare = re.sub(r"\([^)]*\)", "", part).lower()
+        match = re.search(rf"{words} ({_NUMBER})", bare) or re.search(
+            rf"({_NUMBER})(?: to ({_NUMBER}))? (?={after_number})", bare
+        )
+        if match is None:
+            continue
+        low = _number(match[1])
+        high = _number(match[2]) if match.lastindex == 2 else low
+        where = sentence if sentence.startswith("In the night") else part
+        span = next((own for when, own in parts.items() if when in where), day.span)
+        true = day.count_in(name, span).labelled
+        if "perhaps" in part:
+            more = re.search(rf"perhaps ({_NUMBER}) more", part)
+            least, most = (low, low + _number(more[1])) if more else (0, low)
+            right = least <= true <= most or is_close(least, true) or is_close(most, true)
+            yield _judged(surface, part, f"{true:g}", right=right, modest=modest)
+        else:
+            yield _counted(surface, part, (low, high), true, modest=modest)
+        if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
+            yield _at_times(surface, part, name, clocks, truth, modest=modest)
 
 
 def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
     true, modest = truth.metrics, is_modest(text)
     if match := re.search(r"Most of the sound[^:]*: (.*)\.", text):
         names = [name for name in day.home.classes if name != SILENCE]
-        lasting = sorted(names, key=lambda name: -_minutes(true, name))
+        lasting = sorted(names, key=lambda name: -_counted_minutes(true, name))
         stated = [name for name in names if _mentions(match[1], name)]
-        shown = ", ".join(f"{in_words(n)} {_minutes(true, n):.0f}" for n in lasting[: len(stated)])
-        yield _judged(
-            REPORT, text, shown, right={*stated} == {*lasting[: len(stated)]}, modest=modest
-        )
+        most = lasting[: len(stated)]
+        shown = ", ".join(f"{in_words(n)} {_counted_minutes(true, n):.0f}" for n in most)
+        yield _judged(REPORT, text, shown, right={*stated} == {*most}, modest=modest)
     elif "It was quiet." in text:
         yield _judged(
             REPORT, text, f"{_sound(true):.1f} min", right=_sound(true) <= 2, modest=modest
@@ -384,7 +398,7 @@ def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
         yield from _counts_in(REPORT, text, truth)
         if (stated := read_minutes(text)) is not None and true.night_sound is not None:
             yield _lasted(REPORT, text, stated, true.night_sound.minutes, modest=modest)
-    elif match := re.search(r"Hardly any sound", text):
+    elif match := re.search(r"Only short sounds|Nothing was labelled", text):
         before = re.search(r"until (\d\d:\d\d)", text)
         after = re.search(r"after (\d\d:\d\d)", text)
         spans = [(int(true.span.starts[0]), _time(true, before[1]))] if before else []
@@ -407,6 +421,10 @@ def _busiest(sound: Spans, start: int, end: int) -> float:
 
 def _minutes(day: DayMetrics, name: str) -> float:
     return intersection(day.home.spans.get(name, NONE), day.span).length / MINUTE
+
+
+def _counted_minutes(day: DayMetrics, name: str) -> float:
+    return day.spans_of(name).length / MINUTE
 
 
 def _sound(day: DayMetrics) -> float:
@@ -462,8 +480,7 @@ def _sound_counts(
             REPORT, where + when, name, clocks, truth, modest=is_modest(heads[2] + when)
         )
     if (minutes := read_minutes(lasting.partition(" | ")[0])) is not None:
-        figure = minutes_figure if name == SILENCE else apart_figure
-        value = figure(name).value(truth.metrics)
+        value = minutes_figure(name).value(truth.metrics)
         true = 0 if value is None else value.middle
         yield _lasted(REPORT, where + lasting, minutes, true, modest=is_modest(heads[3] + lasting))
 
@@ -604,7 +621,9 @@ def info_statements(
         if name in _sounds_of(day):
             stated = (total.counted, total.counted)
             text = f"{in_words(name)} {total.counted}"
-            yield _counted(INFO, text, stated, _count(truth, name), modest=is_modest(line))
+            minutes = truth.metrics.home.minutes.between(day.span)
+            number = minutes.count(name, None).labelled
+            yield _counted(INFO, text, stated, number, modest=is_modest(line))
     for line in Overview(summary, day.zone).lines(None):
         for name in (n for n in _sounds_of(day) if _mentions(line, n)):
             words = re.escape(in_words(name).lower())

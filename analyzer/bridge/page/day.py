@@ -1,5 +1,6 @@
 """A day on the page: its picture, counts, times, and one sentence about it."""
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import date, tzinfo
 from typing import Any, NamedTuple
@@ -239,7 +240,7 @@ def _lane(
     of_day = [event for own in of_parts for event in own]
     count = len(of_day) if of_day or None not in counts else None
     uncounted = sorted({*events} - {*counted})
-    uncounted_today = sum(e.start >= day.start for e in uncounted)
+    uncounted_today = [event for event in uncounted if event.start >= day.start]
     of_last_days = [event for event in counted if event.start >= day.start - 24 * _HOUR]
     last = (of_last_days if home.is_past and of_last_days else [None, *sounds.counted])[-1]
     at = "" if last is None else home.when(last.end)
@@ -248,19 +249,23 @@ def _lane(
     key = "lane of a day" if home.is_past else "lane and last" if count else "lane"
     description = words.text(key, **{"class": name, "times": often, "last": at})
     if uncounted_today:
-        times = words.times(uncounted_today)
+        times = words.times(len(uncounted_today))
         description = words.text("lane beside", told=description, times=times)
     return {
         "label": label,
         "words": name,
         "colour": colour_on_paper(label),
         "important": label in IMPORTANT,
-        "bars": bars((event for event in counted if event.end > day.start), day),
-        "pale": bars((event for event in uncounted if event.end > day.start), day),
+        "bars": bars(counted, day),
+        "sure_bars": bars((e for e in counted if not home.is_unsure(e)), day),
+        "unsure_bars": bars(filter(home.is_unsure, counted), day),
+        "pale": bars(uncounted, day),
         "told": description,
         "count": count,
         "counts": counts,
         "unsure": [sum(map(home.is_unsure, own)) for own in (of_day, *of_parts)],
+        "uncounted": len(uncounted_today),
+        "uncounted_times": _few_clocks(uncounted_today, home),
         "last": at,
         "times": [_times(each, name, sounds.given, home) for each in (of_day, *of_parts)],
     }
@@ -285,13 +290,20 @@ def _times(events: Sequence[SoundEvent], name: str, given: Collection[str], home
     return {"times": times, "before": len(events) - len(shown)}
 
 
+def _few_clocks(events: Sequence[SoundEvent], home: HomeDay) -> str:
+    """Return the times of day of a few events in words; empty if there are more."""
+    if len(events) > _MOST_CLOCKS:
+        return ""
+    return _clocks_in_words([clock(event.start, home.zone) for event in events], home.words)
+
+
 def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
     """Return how much of each two minutes of a day events fill: one digit per bin, 9 for full.
 
-    Empty without events.
+    Empty without events in the day.
     """
     filled = [0] * -(-(day.end - day.start) // BIN)
-    for event in events:
+    for event in (each for each in events if each.end > day.start):
         start, end = max(event.start, day.start), min(max(event.end, event.start + 1), day.end)
         for place in range((start - day.start) // BIN, -(-(end - day.start) // BIN)):
             first = day.start + place * BIN
@@ -310,6 +322,7 @@ _NOON = 12
 _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 4  # of a class
 _LONGEST = 72  # characters of a sentence about several classes: four lines of a phone
+_LONGEST_OF_ONE = 96  # about one of several
 
 
 SoundsOfRooms = dict[str, dict[str, Sequence[SoundEvent]]]  # by class and microphone
@@ -396,7 +409,7 @@ def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
         is_dispensable = bool(names[1:]) and names[-1] not in WORRYING
         for times in (_MOST_CLOCKS,) if is_dispensable else (_MOST_CLOCKS, 1, 0):
             sentence = _sentence_of(when, shown, home, times if is_brief else None)
-            if not names[1:] or len(sentence) <= _LONGEST:
+            if not is_brief or len(sentence) <= (_LONGEST if names[1:] else _LONGEST_OF_ONE):
                 return sentence
         if not is_dispensable:
             return sentence
@@ -426,7 +439,7 @@ def _class_and_times(
     ----------
     most : int or None
         In a sentence about one of several classes or more, how many times of day are written out:
-        more are left out, and it says how many of all events are not sure.
+        more are left out.
     """
     words = home.words
     shown = words.inside(words.class_words(name))
@@ -434,19 +447,12 @@ def _class_and_times(
     for microphone, events in rooms.items():
         unsure = [event for event in events if home.is_unsure(event)]
         sure = [event for event in events if event not in unsure]
-        if most is not None and sure and unsure:
-            where = _where(name, microphone, events, home, most)
-            some = words.text("not sure.in brief", count=words.number(len(unsure)))
-            where = f"{where}, {some}" if where else some
-            times = words.times(len(events))
-            parts.append(_times_of(times, where, "" if parts else shown, words))
-            continue
         if sure:
             where = _where(name, microphone, sure, home, most)
             parts.append(_times_of(words.times(len(sure)), where, "" if parts else shown, words))
         if unsure:
             count = len(unsure)
-            times = words.more_times(count) if sure else words.times(count)
+            times = words.more_times(count, len(sure)) if sure else words.times(count)
             where = _where(name, "" if sure else microphone, unsure, home, most)
             if parts:
                 text = _times_of(times, where, "", words)
@@ -473,10 +479,22 @@ def _where(
     place = room(microphone) if microphone and len(home.microphones) > 1 else ""
     if name not in IMPORTANT:
         return place
-    clocks = [*dict.fromkeys(clock(event.start, home.zone) for event in events)]
-    when = words.listed(clocks)
+    each = [clock(event.start, home.zone) for event in events]
+    clocks = [*dict.fromkeys(each)]
+    when = _clocks_in_words(each, words)
     if most is not None and len(clocks) > most:
         return place
     if len(clocks) > _MOST_CLOCKS:
         when = words.text("range", first=clocks[0], last=clocks[-1])
     return words.text("room and clocks", room=place, clocks=when) if place else when
+
+
+def _clocks_in_words(clocks: Sequence[str], words: Translation) -> str:
+    """Return times of day as a list, one that comes again with how often: `23:04 twice, 23:37`."""
+    counts = Counter(clocks)
+    if len(counts) == len(clocks):
+        return words.listed(clocks)
+    return ", ".join(
+        words.text("times in a minute", clock=each, times=words.times(count)) if count > 1 else each
+        for each, count in counts.items()
+    )

@@ -9,8 +9,14 @@ export function say(key, values = {}) {
   return texts[`page.${key}`].replace(/\{(\w+)\}/g, (_, name) => values[name]);
 }
 
-export function count(key, number) {
-  return say(`${key}.${number === 1 ? "one" : "other"}`, { count: number.toLocaleString(language) });
+export function count(key, number, unsure = 0) {
+  return say(`${key}.${number === 1 ? "one" : "other"}`, { count: counted(number, unsure) });
+}
+
+// A count, those apart that are not sure: 2 (+3?), or 3? if none is sure. It breaks at the thin space.
+export function counted(value, unsure) {
+  if (!unsure) return value.toLocaleString(language);
+  return unsure === value ? `${value}?` : `${value - unsure}\u2009(+${unsure}?)`;
 }
 
 const BREAKS = texts["page.breaks"].split(" ").map((word) => [word.replaceAll("|", ""), word.replaceAll("|", "\u00ad")]);
@@ -39,9 +45,9 @@ function fill(element, attributes, children) {
   return element;
 }
 
-// A number stays on the line of what it counts.
+// A number stays on the line of what it counts, and a range of hours on one.
 export function write(element, text) {
-  const glued = text.replace(/(\d) (?=\p{L})/gu, "$1\u00a0");
+  const glued = text.replace(/([\d½]) (?=\p{L})/gu, "$1\u00a0").replace(/(\d–)(?=\d)/g, "$1\u2060");
   if (element.textContent !== glued) element.textContent = glued;
 }
 

@@ -1,6 +1,6 @@
 // The page of the home: what sounds now, what works, days, and the stream of news.
 import { ask, colour, draw, inside, keep, make, place, say, set, write } from "./elements.js";
-import { drawAgain, marks, showDay, spans } from "./picture.js";
+import { beginMarks, drawAgain, showDay, showMarks, spans } from "./picture.js";
 import { allowSound, showEvents, showRecurring, showSoundsOf } from "./sounds.js";
 
 const STALE = 20000, AGAIN = 10000, DAYS = 3600000; // milliseconds
@@ -107,6 +107,9 @@ function showPlaceOfDay() {
   if (date) place("dates").value = date;
   place("day-before").disabled = at < 0 || at + 1 >= dates.length;
   place("day-after").disabled = at <= 0;
+  for (const button of place("week").querySelectorAll("button")) {
+    set(button, "aria-current", String(button.dataset.date === date));
+  }
 }
 
 async function readDay(date) {
@@ -147,6 +150,7 @@ function step(by) {
 function openWeek() {
   const week = place("week");
   week.hidden = !week.hidden;
+  place("date").classList.toggle("hidden", week.hidden); // else the list of days has it
   set(place("show-week"), "aria-expanded", String(!week.hidden));
   showWeek();
 }
@@ -157,15 +161,20 @@ async function showWeek() {
   const rows = dates.slice(0, 7).map(([date, words]) => {
     const row = { date, svg: draw("svg", { "aria-hidden": "true", preserveAspectRatio: "none" }),
       about: make("span", { class: "about" }) };
-    row.button = make("button", { type: "button" }, make("span", { class: "what" }, date === today?.date ? say("today") : words),
+    row.button = make("button", { type: "button", "data-date": date }, make("span", { class: "what" }, date === today?.date ? say("today") : words),
       row.svg, row.about);
-    row.button.addEventListener("click", () => chooseDay(date));
+    row.button.addEventListener("click", async () => {
+      await chooseDay(date);
+      place("date").scrollIntoView();
+      place("date").focus({ preventScroll: true });
+    });
     return row;
   });
   const important = (today?.rooms ?? []).flatMap(({ lanes }) => lanes).filter((lane) => lane.important);
   const names = [...new Set(important.map(({ words: name }) => inside(name)))].join(", ");
   week.replaceChildren(...rows.map((row) => make("li", {}, row.button)),
     ...(names ? [make("li", { class: "note" }, say("week rows", { classes: names }))] : []));
+  showPlaceOfDay();
   for (const row of rows) {
     const day = row.date === today?.date ? today : await readDay(row.date);
     if (week.hidden || !row.button.isConnected) return;
@@ -175,7 +184,8 @@ async function showWeek() {
 }
 
 function showDayOfWeek(row, day) {
-  const width = 480, height = 36, upper = 19; // what needs a look is in a row of its own
+  const width = Math.max(Math.floor(row.svg.getBoundingClientRect().width), 100);
+  const height = 36, upper = 19; // what needs a look is in a row of its own
   const lanes = day.rooms.flatMap((room) => room.lanes).filter(({ bars, pale }) => bars || pale);
   const now = day.now ?? 1;
   set(row.svg, "viewBox", `0 0 ${width} ${height}`);
@@ -183,12 +193,11 @@ function showDayOfWeek(row, day) {
     ...day.rooms.map(({ gaps }) => draw("path", { fill: "url(#unheard)", d: spans(gaps, width, height) })),
     draw("rect", { class: "future", x: now * width, width: (1 - now) * width, height }),
     draw("path", { class: "line", d: `M0 ${upper}.5H${width}` }),
-    ...lanes.toReversed().flatMap((lane) => [[lane.pale, "marks pale"], [lane.bars, "marks"]].map(([own, kind]) => {
-      const [top, tall] = lane.important ? [1, upper - 1] : [upper + 1, height - upper - 1];
-      const path = draw("path", { class: kind, d: marks(own, width, day.hours.length, top, tall) });
-      colour(path, lane.colour);
-      return path;
-    })));
+    ...lanes.toReversed().flatMap((lane) => {
+      const [top, tall] = lane.important ? [1, upper - 1] : [upper + 1, height - upper - 1], paths = beginMarks();
+      showMarks(paths, lane, width, day.hours.length, top, tall);
+      return paths;
+    }));
   write(row.about, day.sentence);
 }
 

@@ -1,26 +1,42 @@
 // A day as one picture, its counts, and the times behind a lane or a count.
-import { breakable, colour, draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
+import { breakable, colour, count, counted, draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
 import { showEntries } from "./sounds.js";
 
-const LANE = 36, NAME = 15, GAP = 3, HOURS = 20; // pixels
+const LANE = 36, NAME = 15, GAP = 3, HOURS = 20, NARROWEST = 4; // pixels
+const WIDE = 700; // pixels of the page, from which on the names of lanes are left of the picture
+const MOST_NAME = 0.3; // of the width
 const BINS_AN_HOUR = 30;
 let open = null; // the lane or count whose times are shown
 
-// Bins of one height in a row are one mark, and the narrowest is seen.
-export function marks(bars, width, hours, top, height) {
+// Bins of one height in a row are one mark, and the narrowest is seen. A share of the height is that
+// of each mark; without it, it is how much of the bin is filled.
+function marks(bars, width, hours, top, height, share) {
   const step = width / (hours * BINS_AN_HOUR), foot = top + height;
+  const shares = [...bars].map((digit) => digit === "0" ? 0 : share ?? 0.2 + 0.8 * digit / 9);
   let path = "";
-  for (let i = 0; i < bars.length;) {
+  for (let i = 0; i < shares.length;) {
     let end = i + 1;
-    while (end < bars.length && bars[end] === bars[i]) end += 1;
-    if (bars[i] !== "0") {
-      const head = foot - height * (0.2 + 0.8 * bars[i] / 9);
-      path += `M${(i * step).toFixed(1)} ${foot}V${head.toFixed(1)}h${
-        Math.max((end - i) * step, 3).toFixed(1)}V${foot}Z`;
+    while (end < shares.length && shares[end] === shares[i]) end += 1;
+    if (shares[i]) {
+      path += `M${(i * step).toFixed(1)} ${foot}V${(foot - height * shares[i]).toFixed(1)}h${
+        Math.max((end - i) * step, NARROWEST).toFixed(1)}V${foot}Z`;
     }
     i = end;
   }
   return path;
+}
+
+// The marks of a class, from the back: what does not count, what is not sure, and the rest. What needs
+// a look is an event, however short it is: its height only tells these three apart.
+const KINDS = [["pale", "marks pale", 0.3], ["unsure_bars", "marks unsure", 0.55], ["sure_bars", "marks", 1]];
+
+export const beginMarks = () => KINDS.map(([, kind]) => draw("path", { class: kind }));
+
+export function showMarks(paths, lane, width, hours, top, height) {
+  KINDS.forEach(([key, , share], index) => {
+    set(paths[index], "d", marks(lane[key], width, hours, top, height, lane.important ? share : undefined));
+    colour(paths[index], lane.colour);
+  });
 }
 
 export function spans(list, width, height) {
@@ -64,14 +80,20 @@ function showTimes() {
     ({ id, ids: [id], label: it.label, words: it.words, time, about, said, isSingle: true })));
   let text = before ? say("before", { count: before }) : "";
   if (!times.length) text = value === null ? `${capital(say("not known"))}.` : say("not once");
-  write(open.note, text);
+  write(open.note, [text, value === it.count && uncountedNote(it)].filter(Boolean).join(" "));
   write(open.hide, say("hide", { class: inside(it.words) }));
 }
 
-// A count, those apart that are not sure: 2 (+3?), or 3? if none is sure.
-function counted(value, unsure) {
-  if (!unsure) return String(value);
-  return unsure === value ? `${value}?` : `${value - unsure}\u202F(+${unsure}?)`;
+function uncountedNote({ uncounted, uncounted_times: times }) {
+  if (!uncounted) return "";
+  const text = count("uncounted", uncounted);
+  return times ? say("uncounted at", { text, times }) : say("uncounted note", { text });
+}
+
+// The count of a lane; if it is 0, why the lane has marks nevertheless.
+function figureOf({ count: value, unsure, uncounted }) {
+  if (value) return unsure[0] ? counted(value, unsure[0]) : `${value}×`;
+  return uncounted ? `${value ?? "–"} · ${count("uncounted", uncounted)}` : "";
 }
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 const dayName = () => shown.now === null ? shown.title : say("since evening");
@@ -83,10 +105,9 @@ async function hideClass(label) {
 
 function beginLane(room, number) {
   const name = draw("text", { class: "name" }), figure = draw("text", { class: "count" });
-  const lane = { name, figure, marks: draw("path", { class: "marks" }), pale: draw("path", { class: "marks pale" }), line: draw("path", { class: "line" }),
-    hit: draw("rect", { class: "hit" }) };
+  const lane = { name, figure, marks: beginMarks(), line: draw("path", { class: "line" }), hit: draw("rect", { class: "hit" }) };
   lane.element = draw("g", { class: "lane", role: "button", tabindex: 0, "aria-expanded": "false" },
-    lane.hit, lane.line, lane.pale, lane.marks, name, figure);
+    lane.hit, lane.line, ...lane.marks, name, figure);
   const chosen = { button: lane.element, where: (panel) => room.svg.after(panel),
     data: () => { const it = room.sounded.find(({ label }) => label === lane.label); return it && timesOf(it, 0); } };
   lane.element.addEventListener("click", () => choose(chosen));
@@ -127,13 +148,18 @@ function showZero({ zero, rows, lanes }) {
   rows.forEach(({ element, counts }, index) => {
     element.hidden = isFolded && none[index] && !counts.includes(open?.button);
   });
-  const names = lanes.filter((_, index) => none[index]).map(({ words }) => inside(words));
+  const names = lanes.filter(({ label }, index) => none[index] && label !== "unknown").map(({ words }) => inside(words));
   write(zero.button, say("zero", { classes: names.join(", ") }));
   zero.element.hidden = !names.length;
 }
 
-function showRow(row, it, where, columns) {
-  if (!row.name.firstChild) row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour), make("span", {}, breakable(it.words))));
+function showRow(row, it, where, { columns, now }) {
+  const isPast = now === null;
+  if (!row.name.firstChild) {
+    row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour),
+      make("span", {}, breakable(it.words), row.about = make("span", { class: "about" }))));
+  }
+  write(row.about, it.uncounted && !it.count ? count("uncounted", it.uncounted) : "");
   it.counts.forEach((value, index) => {
     row.cells[index].className = value ? "" : "none";
     write(row.counts[index], value === null ? say("not known") : counted(value, it.unsure[index + 1]));
@@ -141,7 +167,7 @@ function showRow(row, it, where, columns) {
     set(row.counts[index], "aria-label", `${name}: ${row.counts[index].textContent}`);
   });
   row.last.className = it.last ? "" : "none";
-  write(row.last, it.last || say("not lately"));
+  write(row.last, it.last || say(isPast ? "none in span" : "not lately"));
 }
 
 function beginRoom(name, isAlone) {
@@ -153,8 +179,9 @@ function beginRoom(name, isAlone) {
   room.hours = draw("g", { class: "hours", "aria-hidden": "true" });
   room.group = draw("g");
   room.ground = draw("rect", { class: "ground", rx: 6 });
-  room.svg = draw("svg", { class: "picture", role: "group" }, room.ground, room.nights, room.unheard,
+  room.plot = draw("g", {}, room.ground, room.nights, room.unheard,
     room.future, room.moment, room.group, room.hours); // the counts lie over the line of now
+  room.svg = draw("svg", { class: "picture", role: "group" }, room.plot);
   room.heads = make("tr");
   room.body = make("tbody");
   room.caption = make("caption", { class: "hidden" });
@@ -164,12 +191,40 @@ function beginRoom(name, isAlone) {
   return room;
 }
 
+// Writes the names and counts of the lanes; returns how much room they take left of the picture.
+function showNames({ svg, sounded, drawn }, full) {
+  const isApart = innerWidth >= WIDE, most = MOST_NAME * full;
+  svg.classList.toggle("apart", isApart);
+  let widest = 0;
+  sounded.forEach((it, number) => {
+    const { name, figure } = drawn[number];
+    write(name, it.words);
+    write(figure, figureOf(it));
+    if (!isApart) return;
+    for (const text of [name, figure]) {
+      for (let end = text.textContent.length - 1; end > 1 && text.getComputedTextLength() > most; end -= 1) {
+        text.textContent = `${text.textContent.slice(0, end)}…`;
+      }
+      widest = Math.max(widest, text.getComputedTextLength());
+    }
+  });
+  return isApart && widest ? Math.ceil(widest) + 10 : 0;
+}
+
 function showRoom(room, { gaps, unheard, lanes }, day) {
   room.lanes = lanes;
   room.sounded = lanes.filter(({ bars, pale }) => bars || pale);
-  const width = Math.max(Math.floor(room.svg.getBoundingClientRect().width), 100);
+  const full = Math.max(Math.floor(room.svg.getBoundingClientRect().width), 100);
   const height = Math.max(room.sounded.length, 1) * LANE, whole = height + HOURS;
-  set(room.svg, "viewBox", `0 0 ${width} ${whole}`);
+  while (room.drawn.length < room.sounded.length) {
+    const lane = beginLane(room, room.drawn.length);
+    room.drawn.push(lane);
+    room.group.append(lane.element);
+  }
+  while (room.drawn.length > room.sounded.length) room.drawn.pop().element.remove();
+  const left = showNames(room, full), width = full - left;
+  set(room.plot, "transform", `translate(${left} 0)`);
+  set(room.svg, "viewBox", `0 0 ${full} ${whole}`);
   set(room.svg, "height", whole);
   set(room.svg, "aria-label", [say("picture", { day: [room.where, day.title].filter(Boolean).join(", ") }), unheard].filter(Boolean).join(" "));
   for (const [name, value] of [["width", width], ["height", height]]) set(room.ground, name, value);
@@ -180,26 +235,17 @@ function showRoom(room, { gaps, unheard, lanes }, day) {
     set(room.future, name, value);
   }
   set(room.moment, "d", day.now === null ? "" : `M${now * width} 0V${height}`);
-  while (room.drawn.length < room.sounded.length) {
-    const lane = beginLane(room, room.drawn.length);
-    room.drawn.push(lane);
-    room.group.append(lane.element);
-  }
-  while (room.drawn.length > room.sounded.length) room.drawn.pop().element.remove();
+  const head = left ? GAP : NAME; // marks do not lie below a name
   room.sounded.forEach((it, number) => {
     const lane = room.drawn[number], top = number * LANE;
     set(lane.element, "aria-label", it.told);
-    for (const [name, value] of [["x", 0], ["y", top], ["width", width], ["height", LANE]]) set(lane.hit, name, value);
-    set(lane.line, "d", number ? `M0 ${top}H${width}` : "");
+    for (const [name, value] of [["x", -left], ["y", top], ["width", full], ["height", LANE]]) set(lane.hit, name, value);
+    set(lane.line, "d", number ? `M${-left} ${top}H${width}` : "");
     if (open?.button === lane.element && lane.label !== it.label) close(); // its times would be those of another class
     lane.label = it.label;
-    for (const [path, bars] of [[lane.marks, it.bars], [lane.pale, it.pale]]) {
-      set(path, "d", marks(bars, width, day.hours.length, top + NAME, LANE - NAME - GAP));
-      colour(path, it.colour);
-    }
-    write(lane.name, it.words);
-    write(lane.figure, it.count ? (it.unsure[0] ? counted(it.count, it.unsure[0]) : `${it.count}×`) : "");
-    for (const [text, x] of [[lane.name, 6], [lane.figure, width - 6]]) { set(text, "x", x); set(text, "y", top + 12.5); }
+    showMarks(lane.marks, it, width, day.hours.length, top + head, LANE - head - GAP);
+    const places = left ? [[lane.name, -left, 15], [lane.figure, -left, 30]] : [[lane.name, 6, 12.5], [lane.figure, width - 6, 12.5]];
+    for (const [text, x, y] of places) { set(text, "x", x); set(text, "y", top + y); }
   });
   const every = width < 520 ? 4 : 2;
   room.hours.replaceChildren(...day.hours.filter(([, hour]) => hour % every === 0).map(([where, hour]) =>
@@ -221,7 +267,7 @@ function showTable(room, day) {
     room.zero = beginZero(day.columns);
     room.body.replaceChildren(...room.rows.map(({ element }) => element), room.zero.element);
   }
-  room.rows.forEach((row, index) => showRow(row, room.lanes[index], room.where, day.columns));
+  room.rows.forEach((row, index) => showRow(row, room.lanes[index], room.where, day));
   showZero(room);
 }
 
@@ -235,6 +281,7 @@ export function showDay(day) {
   write(place("missing"), day.missing);
   place("missing").hidden = !day.missing;
   place("key-unheard").hidden = !day.rooms.some(({ gaps }) => gaps.length);
+  place("key-unsure").hidden = !day.rooms.some(({ lanes }) => lanes.some((lane) => lane.unsure_bars));
   place("key-beside").hidden = !day.rooms.some(({ lanes }) => lanes.some(({ pale }) => pale));
   const key = JSON.stringify(day.rooms.map(({ room }) => room));
   if (key !== roomsOf) {

@@ -149,12 +149,19 @@ function beginFold({ key, colour, words }) {
   return item;
 }
 
+// When an entry was, and whether all of it, or how much, is not sure: 03:21?, or 03:21 to 03:30 (2?).
+function timeOf({ time, unsure, ids }) {
+  if (!unsure) return time;
+  return unsure === ids.length ? `${time}?` : `${time} (${unsure}?)`;
+}
+
 function showFold(item, { key, earlier, words }) {
-  const number = earlier.reduce((sum, { ids }) => sum + ids.length, 0), isOpen = unfolded.has(key);
-  write(item.often, `${SEPARATOR}${count("earlier", number)}`);
-  write(item.about, earlier.map(({ time, room }) => [time, room].filter(Boolean).join(" ")).join(", "));
+  const sum = (numbers) => numbers.reduce((total, each) => total + each, 0), isOpen = unfolded.has(key);
+  const often = count("earlier", sum(earlier.map(({ ids }) => ids.length)), sum(earlier.map(({ unsure }) => unsure)));
+  write(item.often, `${SEPARATOR}${often}`);
+  write(item.about, earlier.map((each) => [timeOf(each), each.room].filter(Boolean).join(" ")).join(", "));
   item.button.setAttribute("aria-expanded", String(isOpen));
-  item.button.setAttribute("aria-label", `${say(isOpen ? "fold" : "unfold")}: ${words}, ${count("earlier", number)}`);
+  item.button.setAttribute("aria-label", `${say(isOpen ? "fold" : "unfold")}: ${words}, ${often}`);
   write(item.button, say(isOpen ? "fold" : "unfold"));
 }
 

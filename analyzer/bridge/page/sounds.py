@@ -176,6 +176,7 @@ class ShownBouts(NamedTuple):
             "time": time,
             "length": "" if is_mixed else length,
             "sure": self._sureness(bout),
+            "unsure": self._unsure_of(bout.events),
             "beside": self._uncounted_note(bout),
             "doubtful": bool(bout.doubts),
             "room": "" if self.is_alone else room(first.microphone),
@@ -209,13 +210,14 @@ class ShownBouts(NamedTuple):
 
     def _sureness_of(self, events: Sequence[SoundEvent]) -> str:
         """Return how many of some events are not sure; whether the likeliest is if none are."""
-        unsure = sum(
-            self.sureness.is_unsure(e.confidence) and not self.correction(e) for e in events
-        )
+        unsure = self._unsure_of(events)
         if 0 < unsure < len(events):
-            return self.words.text("not sure.some", count=self.words.number(unsure))
+            return self.words.count("not sure.some", unsure)
         word = self.sureness.word(max(event.confidence for event in events))
         return self.words.text(word) if word == SURE or unsure else ""
+
+    def _unsure_of(self, events: Sequence[SoundEvent]) -> int:
+        return sum(self.sureness.is_unsure(e.confidence) and not self.correction(e) for e in events)
 
     def _uncounted_note(self, bout: Bout) -> str:
         """Return how many events of a bout do not count, because a television was on."""
@@ -224,7 +226,7 @@ class ShownBouts(NamedTuple):
             return ""
         if number == len(bout.events):
             return self.words.text("beside")
-        return self.words.text("beside.some", count=self.words.number(number))
+        return self.words.count("beside.some", number)
 
     def _uncounted_of(self, bout: Bout) -> int:
         return sum(e.id in self.uncounted and not self.correction(e) for e in bout.events)

@@ -10,6 +10,7 @@ import soundfile
 from numpy.typing import NDArray
 
 from hearthlog.analyzer.logs.spans import Spans
+from hearthlog.analyzer.review.lanes import BACKGROUND
 from hearthlog.analyzer.review.timeline import HomeClock, LogLines, Plot, SoundClip, Style
 from hearthlog.models.classes import Colour, in_words
 from hearthlog.schemas.arrays import Float64, Int64
@@ -22,7 +23,7 @@ _STRIP_LINES, _STRIP_WIDTH = 12, 5.0  # screen points
 _ROW_LINES, _ROW_WIDTH, _ROW_SHARE = 6, 6.0, 0.8
 ROWS_HEIGHT = 3.9  # of all rows, as of all lanes: so their axes are equally wide
 _SHADES = 10  # of a row; each change of its colour is a line of its own for the viewer
-_GROUND = np.array((13, 13, 13))  # behind the plots of the viewer
+_GROUND = np.array(BACKGROUND)
 _FILLING = 400  # texts that leave no pause in the data
 _LEAST_SHARE = 0.004  # a smaller share makes a band less than a pixel high
 _ROWS_AT_ONCE = 72_000  # an hour of frames
@@ -87,10 +88,13 @@ class Canvas:
         """Set the text of a text entity, plain or such as `text/markdown`."""
         self.recording.log(entity, rr.TextDocument(text, media_type=media_type), static=True)
 
-    def configure_states(self, entity: str, colours: Mapping[str, Colour]) -> None:
+    def configure_states(
+        self, entity: str, colours: Mapping[str, Colour], names: Sequence[str] | None = None
+    ) -> None:
         """Set the colours (RGB, 0 to 255) and displayed names of the states of a lane."""
+        labels = [*map(in_words, colours)] if names is None else names
         style = rr.StateConfiguration(
-            values=list(colours), labels=[*map(in_words, colours)], colors=[*colours.values()]
+            values=list(colours), labels=labels, colors=[*colours.values()]
         )
         self.recording.log(entity, style, static=True)
 

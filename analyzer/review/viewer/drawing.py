@@ -33,6 +33,7 @@ from hearthlog.analyzer.review.timeline import (
     spectrogram,
 )
 from hearthlog.analyzer.review.viewer.canvas import ROWS_HEIGHT, Canvas
+from hearthlog.analyzer.review.viewer.row_heights import RowHeights
 from hearthlog.models.classes import Colour, colour, in_words, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import LIVE
@@ -342,10 +343,7 @@ Row = tuple[int, rrb.View | rrb.Container]  # with its relative height
 
 
 class TimelineBlueprint(rrb.Blueprint):
-    """Blueprint with linked time axes that start at a range of times, or seconds from the cursor.
-
-    The lanes have `lanes_share` of the height.
-    """
+    """Blueprint with linked time axes that start at some times, or seconds from the cursor."""
 
     def __init__(
         self,
@@ -354,11 +352,11 @@ class TimelineBlueprint(rrb.Blueprint):
         start: Boundary,
         end: Boundary,
         *,
-        lanes_share: float = 1.0,
+        heights: RowHeights | None = None,
     ) -> None:
         super().__init__(stack(rows), panel, collapse_panels=True)
         self._range = rr.encodings.TimeRange(start, end)
-        self.lanes_share = lanes_share
+        self.heights = heights
 
     def _log_to_stream(self, stream: rr.RecordingStream) -> None:
         super()._log_to_stream(stream)
@@ -440,6 +438,8 @@ def review_layout(
     places = placed_lanes(timeline, marking=marking and not close_up)
     sampled = "" if timeline.every == 1 else f"; a sample: one part in {timeline.every}"
     stacks: dict[str, list[Row]] = {}
+    has_sound = close_up and timeline.has_sound
+    below_lanes: list[bool] = []
     for name, microphone in timeline.microphones.items():
         own = [(lane.labelling, place) for lane, place in places if lane.microphone == name]
         count = len({place.height for _, place in own})
@@ -449,13 +449,15 @@ def review_layout(
         more = _plot_views(microphone, plots[name], timeline, close_up=close_up)
         level = [_all(same) for same in _by_title(plots[name]) if same[0].kind is LEVEL]
         if close_up:
-            rows.insert(0, (_SPECTRUM_HEIGHT, _spectrum_view(microphone.name)))
+            if has_sound:
+                rows.insert(0, (_SPECTRUM_HEIGHT, _spectrum_view(microphone.name)))
         elif marking or not more:
             more[1:1] = level
         else:
             rows += [(_LEVEL_HEIGHT, view) for view in level]
         below = _CLOSE_PLOT if close_up else _PLOT_HEIGHT
         stacks[name] = [*rows, (below, tabs(more))] if more else rows
+        below_lanes.append(bool(more))
     panel = rrb.TimePanel(
         state="expanded" if marking else "collapsed", timeline=clock.name, play_state="paused"
     )
@@ -469,9 +471,15 @@ def review_layout(
     question.append((_REQUESTED_HEIGHT, _requested_view()))
     homes = (height, tabs(stack(rows, name) for name, rows in stacks.items()))
     hours: list[Row] = [(_HOURS_HEIGHT, _hours_view())] if _has_hours(timeline) else []
-    everything = [*(question if close_up else hours), homes]
-    share = max(own[close_up][0] for own in stacks.values()) / sum(part for part, _ in everything)
-    return TimelineBlueprint(everything, panel, start, end, lanes_share=share)
+    above = question if close_up else hours
+    heights = RowHeights(
+        tuple(height for height, _ in above),
+        tuple(tuple(height for height, _ in rows) for rows in stacks.values()),
+        int(has_sound),
+        all(below_lanes),
+        close_up,
+    )
+    return TimelineBlueprint([*above, homes], panel, start, end, heights=heights)
 
 
 def _lane_views(

@@ -32,6 +32,7 @@ from hearthlog.analyzer.review.lanes import (
     RECORDER,
     Checked,
     StateLane,
+    sure_state,
 )
 from hearthlog.analyzer.review.live_timeline import Update
 from hearthlog.analyzer.review.timeline import LogLines, Plot, Timeline, home_clock
@@ -60,6 +61,7 @@ from hearthlog.analyzer.review.viewer.drawing import (
     write_checked,
 )
 from hearthlog.models.classes import Colour, in_words, ordered
+from hearthlog.schemas.arrays import Bool
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS, time_text
 from hearthlog.schemas.new_files import check_new, new_file
@@ -152,6 +154,7 @@ _DETAILS, _DETAILS_HEIGHT = {DIRECTION, NOVELTY, FEATURES}, 150  # plots in tabs
 _LANE_COLUMNS, _ROW_COLUMNS, _LEVEL_COLUMNS = (200, 1166), (183, 1183), (160, 1206)
 _STEP_SECONDS = 1, 10, 60  # between updates of a sound: in the first 10 s, the first minute, later
 _LEAST_CHANGE = 0.1  # of a confidence, for an update
+_WORDLESS, _LETTER = " ", 8.0  # after a state without its word; points of a letter
 _MOST_NAMED = 8  # microphones in the text
 _MOST_STATES = 2_000  # maximum of a lane's states with their own colours
 
@@ -176,6 +179,7 @@ class LiveServer:
         self._recording.send_recording_name("live")
         self._canvas: Canvas | None = None  # None until the clock of the home is known
         self._minutes = minutes
+        self._first, self._is_full = 0, False
         self._plots: Plots = {}
         self._waiting: dict[str, list[Plot]] = {}  # by entity: plots too short to be sent yet
         self._lanes: dict[str, dict[str, Colour]] = {}
@@ -196,9 +200,15 @@ class LiveServer:
         for update in updates:
             if len(update.times):
                 self._show(update, self._canvas_at(int(update.times[-1]), zone))
+                self._fill(int(update.times[0]), int(update.times[-1]))
         if self._canvas is not None and self._plots and not self._is_laid_out:
             self._canvas.write(_LANES_NAME, "What is heard")
-            layout = _layout(self._plots, self._minutes, self._canvas.clock.name)
+            begin = (
+                Boundary.cursor_relative(seconds=-60 * self._minutes)
+                if self._is_full
+                else Boundary.absolute(nanos=self._canvas.clock.shown(self._first))
+            )
+            layout = _layout(self._plots, begin, self._canvas.clock.name)
             self._recording.send_blueprint(layout, make_active=True, make_default=True)
             self._is_laid_out = True
 
@@ -226,6 +236,12 @@ class LiveServer:
                 rr.TextDocument.columns(text=[heading], media_type=["text/markdown"]),
             )
 
+    def _fill(self, first: int, last: int) -> None:
+        """Note the times of an update: the axes begin with the first until they are full."""
+        self._first = min(first, self._first or first)
+        if not self._is_full and last - self._first >= self._minutes * 60 * NANOSECONDS:
+            self._is_full, self._is_laid_out = True, False
+
     def _canvas_at(self, time: int, zone: tzinfo) -> Canvas:
         clock = home_clock(zone, time, time + 1)
         if self._canvas is None or self._canvas.clock != clock:
@@ -243,14 +259,32 @@ class LiveServer:
 
     def _show_lane(self, lane: StateLane, canvas: Canvas) -> None:
         entity = f"{_STATES}/{lane.microphone}/{lane.kind.name}"
+        if lane.kind is RECORDER:
+            lane = lane._replace(states=self._without_cut_words(lane))
         states = {state for state in lane.states if state is not None}
         if entity not in self._lanes and not states:
             return  # a lane appears with its first state
         colours = self._lanes.get(entity) or lane.kind.colours(lane.kind.states)
         if entity not in self._lanes or (states - colours.keys() and len(colours) < _MOST_STATES):
-            self._lanes[entity] = lane.kind.colours(ordered(states)) | colours
-            canvas.configure_states(entity, self._lanes[entity])
+            known = {state.removesuffix(_WORDLESS): None for state in states}
+            shades = lane.kind.colours(ordered(known))
+            shades |= {f"{state}{_WORDLESS}": shade for state, shade in shades.items()}
+            self._lanes[entity] = shades | colours
+            names = [_state_name(state) for state in self._lanes[entity]]
+            canvas.configure_states(entity, self._lanes[entity], names)
         canvas.change_states(entity, lane.times, lane.states)
+
+    def _without_cut_words(self, lane: StateLane) -> list[str | None]:
+        """Return the states, without a word those that are too short for it."""
+        states = np.array(lane.states, object)
+        first = np.flatnonzero(np.append(True, states[1:] != states[:-1]))
+        ends = np.append(lane.times[first[1:]], lane.times[-1] + NANOSECONDS)
+        points = (ends - lane.times[first]) * (_LANE_COLUMNS[1] / (60e9 * self._minutes))
+        for begin, end, width in zip(first, [*first[1:], len(states)], points, strict=True):
+            state = states[begin]
+            if state is not None and width < _LETTER * len(_state_name(state)) + _LETTER:
+                states[begin:end] = f"{state}{_WORDLESS}"
+        return states.tolist()
 
     def _show_plot(self, plot: Plot, canvas: Canvas) -> None:
         """Draw into the entity of these names; another model or feature set has its own."""
@@ -265,9 +299,20 @@ class LiveServer:
             self._is_laid_out = False
         waiting = [*self._waiting.pop(entity, []), plot]
         if is_new or abs(int(plot.times[-1] - waiting[0].times[0])) >= _TOGETHER:
-            draw_plot(_joined(waiting), entity, canvas, is_new=is_new)
+            joined = _joined(waiting)
+            if plot.kind is PROBABILITIES:  # pieces of a row must not overlap, or they are dots
+                joined, rest = _complete_seconds(joined)
+                self._waiting[entity] = [rest]
+            draw_plot(joined, entity, canvas, is_new=is_new)
         else:
             self._waiting[entity] = waiting
+
+
+def _state_name(state: str) -> str:
+    """Return what is written on a state, of a space those without a word."""
+    name = sure_state(state)
+    doubt = state[len(name) :]
+    return " " if state.endswith(_WORDLESS) else f"{in_words(name)}{doubt}"
 
 
 def _step(sound: CurrentSound, sounds: CurrentSounds) -> tuple[str, int, float]:
@@ -295,7 +340,22 @@ def _joined(parts: Sequence[Plot]) -> Plot:
     return parts[0]._replace(times=times, values=np.concatenate([part.values for part in parts]))
 
 
-def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
+def _complete_seconds(plot: Plot) -> tuple[Plot, Plot]:
+    """Return one row for each complete second, and the rows of the last second."""
+    plot = _rows_of(plot, ~np.isnan(plot.values).all(axis=1))
+    seconds = plot.times // NANOSECONDS
+    is_last = seconds == (seconds[-1] if len(seconds) else 0)
+    ends = np.append(np.diff(seconds) != 0, True)[: len(seconds)]
+    complete = _rows_of(plot, ends & ~is_last)
+    middles = complete.times // NANOSECONDS * NANOSECONDS + NANOSECONDS // 2
+    return complete._replace(times=middles), _rows_of(plot, is_last)
+
+
+def _rows_of(plot: Plot, rows: Bool) -> Plot:
+    return plot._replace(times=plot.times[rows], values=plot.values[rows])
+
+
+def _layout(plots: Plots, begin: Boundary, clock: str) -> TimelineBlueprint:
     """Lay out the views, whose time axes end with the newest data."""
     microphones = sorted({same[0].microphone for same in plots.values()})
     named = microphones[:_MOST_NAMED]
@@ -311,8 +371,7 @@ def _layout(plots: Plots, minutes: float, clock: str) -> TimelineBlueprint:
         (_PLOTS_HEIGHT, tabs(_stack_plots(name, plots) for name in microphones)),
     ]
     panel = rrb.TimePanel(state="collapsed", timeline=clock, play_state="following")
-    ends = (Boundary.cursor_relative(seconds=seconds) for seconds in (-60 * minutes, 0.0))
-    return TimelineBlueprint(rows, panel, *ends)
+    return TimelineBlueprint(rows, panel, begin, Boundary.cursor_relative(seconds=0.0))
 
 
 def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
@@ -339,7 +398,7 @@ def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
             height, columns = _ROW_HEIGHT * len(names) + _AXIS_HEIGHT, _ROW_COLUMNS
             texts = names_view(names, len(names))
         rows.append((height, rrb.Horizontal(texts, view, column_shares=columns)))
-    rows.append((_DETAILS_HEIGHT, tabs([lines_view(), *details])))
+    rows.append((_DETAILS_HEIGHT, tabs([*details, lines_view()])))
     return stack(rows, microphone)
 
 

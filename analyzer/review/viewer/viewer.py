@@ -48,14 +48,19 @@ from hearthlog.analyzer.review.viewer.drawing import (
 )
 from hearthlog.analyzer.review.viewer.process import ViewerProcess, check_display
 from hearthlog.analyzer.review.viewer.recording import name_recording
+from hearthlog.analyzer.review.viewer.row_heights import (
+    AXIS_HEIGHT,
+    TAB_BAR,
+    Blueprint,
+    FittedRows,
+    RowHeights,
+)
 
 _PANEL, _AXIS, _CONTAINER = "/time_panel", "ScalarAxis", "ContainerBlueprint"
 _WAIT_SECONDS = 60
 _FLUSH_SECONDS = 30.0
 _SIZE_SECONDS = 3.0
 _ROUNDING = 1_000_000  # nanoseconds
-
-Blueprint = dict[str, Any]
 
 
 class ViewerState(NamedTuple):
@@ -76,9 +81,7 @@ class ViewerSize(NamedTuple):
 
 # Points of the viewer's own parts.
 _RULER_LEFT, _RULER_RIGHT = 200.0, 30.0  # from the edges of the viewer to the ends of its ruler
-_SCALE_WIDTH, _AXIS_HEIGHT = 17.0, 17.0  # between a view and its plot
-TOP_BAR, _TAB_BAR = 36.0, 30.0
-_PANEL_HEIGHTS = 150.0, 250.0  # a quarter of the viewer, within these
+_SCALE_WIDTH = 17.0  # between a view and its plot
 
 
 class Viewer(ABC):
@@ -91,12 +94,13 @@ class Viewer(ABC):
         self._canvas = Canvas(self._recording, HomeClock("", 0))
         self._lanes: dict[tuple[str, str], DrawnLane] = {}  # those that change
         self._grid: TimelineGrid | None = None
-        self._lanes_share = 1.0
+        self._rows = FittedRows(RowHeights((), ((1,),), 0, has_plots=False, is_close_up=False))
         # Containers in the blueprint: of a text and a plot, and of the names of lanes.
         self._columns: dict[str, float] = {}  # with the width of the text, in points
         self._names: list[str] = []
         self._aligned: ViewerSize | None = None
         self._size_due = 0.0  # of the next look at the size, by CLOCK_MONOTONIC
+        self._shown: tuple[int, int, int, bool] | None = None  # arguments of the last `show`
         self._opening: Any = None  # range of the time axes
         self._latest: Any = None  # that of the last span that was shown
         self._axes: dict[str, list[float]] = {}  # vertical ranges, by component of the blueprint
@@ -170,7 +174,8 @@ class Viewer(ABC):
         self._sent = True
         has_question = close_up and not self.address  # a page has the question next to its buttons
         layout = review_layout(timeline, marking=True, close_up=close_up, has_question=has_question)
-        self._lanes_share = layout.lanes_share
+        assert layout.heights is not None
+        self._rows = FittedRows(layout.heights)
         self._recording.connect_grpc(self._process.url, default_blueprint=layout)
         name_recording(self._recording, timeline)
         self._canvas = Canvas(self._recording, timeline.clock)
@@ -178,7 +183,7 @@ class Viewer(ABC):
         self._lanes = draw(timeline, self._canvas, marking=not close_up)
         if close_up:
             self._lanes["", SELECTED] = self._requested
-            for name in timeline.microphones:  # until a span is requested
+            for name in timeline.microphones if timeline.has_sound else ():  # until one is asked
                 clear_sound(name, timeline.grid.start, " ", self._canvas)
         self._flush()
 
@@ -362,14 +367,16 @@ class Viewer(ABC):
 
     def _set_shares(self, blueprint: Blueprint, size: ViewerSize) -> None:
         """Set the widths and heights of the names of lanes."""
-        least, most = _PANEL_HEIGHTS
-        viewport = size.height - TOP_BAR - min(max(size.height / 4, least), most)
-        lanes = viewport * self._lanes_share - _TAB_BAR - _AXIS_HEIGHT
+        counts = [
+            len(_component(blueprint, path, _CONTAINER)["row_shares"]) - 1 for path in self._names
+        ]
+        lanes = self._rows.fit(blueprint, size.height, max(counts, default=1))
+        lanes -= TAB_BAR + AXIS_HEIGHT
         for path, left in self._columns.items():
             _component(blueprint, path, _CONTAINER)["col_shares"] = [left, size.width - left]
         for path in self._names:
             heights = _component(blueprint, path, _CONTAINER)["row_shares"]
-            below = _AXIS_HEIGHT * (len(heights) - 1) / max(lanes, _AXIS_HEIGHT)
+            below = AXIS_HEIGHT * (len(heights) - 1) / max(lanes, AXIS_HEIGHT)
             _component(blueprint, path, _CONTAINER)["row_shares"] = [*heights[:-1], below]
 
     def show(self, start: int, end: int, margin: int, *, select: bool = True) -> None:
@@ -377,6 +384,7 @@ class Viewer(ABC):
 
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
+        self._shown = start, end, margin, select
         start, end = self._clock.shown(start), self._clock.shown(end)
         blueprint = self._blueprint()
         panel = blueprint.setdefault(_PANEL, {}).setdefault("TimePanelBlueprint", {})
@@ -390,6 +398,14 @@ class Viewer(ABC):
         _set_view(blueprint, self._latest)
         self._set_blueprint(blueprint)
         self._set_time(start, play=False)
+
+    def _show_again(self) -> None:
+        """Show in a viewer that opened anew what the one before showed."""
+        self._aligned, self._size_due = None, 0.0
+        self._rows.reset()
+        if self._shown is not None:
+            start, end, margin, select = self._shown
+            self.show(start, end, margin, select=select)
 
     def play(self, start: int) -> None:
         """Start the cursor running from a time.

@@ -1,9 +1,9 @@
 """Browser viewer: a local page that relays protobuf requests to the viewer."""
 
 import json
-import queue
 import secrets
 import urllib.request
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from importlib.resources import files
 from itertools import count
+from threading import Condition
 from typing import Any, cast
 
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, free_port
 from hearthlog.analyzer.review.timeline import Key, Question
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
+from hearthlog.analyzer.review.viewer.row_heights import TOP_BAR, Blueprint
 from hearthlog.analyzer.review.viewer.viewer import (
-    TOP_BAR,
-    Blueprint,
     Viewer,
     ViewerSize,
     ViewerState,
@@ -116,43 +116,84 @@ _VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 
 @dataclass
 class Relay:
-    """Queue of requests to a page, with its answers."""
+    """Requests to the newest page and lines for it, with its answers.
+
+    The page is loaded again, or opened in another window: then this one has the number of a page.
+    """
 
     keys: Sequence[Key] = ()
     press: Callable[[str], None] = lambda _: None
     sound: Callable[[], bytes] | None = None
-    texts: queue.SimpleQueue[str | Question] = field(default_factory=queue.SimpleQueue)
-    requests: queue.SimpleQueue[tuple[int, bytes]] = field(default_factory=queue.SimpleQueue)
-    answers: dict[int, "Future[bytes]"] = field(default_factory=dict)
     size: ViewerSize | None = None  # of the viewer in the page
+    page: int = 0  # number of the newest page
+    _texts: deque[str | Question] = field(default_factory=deque)
+    _shown: list[str | Question] = field(default_factory=list)  # the last question and two lines
+    _requests: dict[int, bytes] = field(default_factory=dict)  # not answered yet
+    _sent: set[int] = field(default_factory=set)
+    _answers: dict[int, "Future[bytes]"] = field(default_factory=dict)
     _numbers: Iterator[int] = field(default_factory=lambda: count(1))
+    _changed: Condition = field(default_factory=Condition)
+
+    def open_page(self) -> int:
+        """Return the number of a new page, which gets what the one before did not answer."""
+        with self._changed:
+            self.page += 1
+            self._texts.extendleft(reversed(self._shown))
+            self._shown = []
+            self._sent.clear()
+            self._changed.notify_all()
+            return self.page
 
     def request(self, request: bytes) -> bytes:
         """Send a request to the page, and wait for its answer.
 
-        Raise `TimeoutError` if there is no answer within 15 seconds. Raise `ConnectionError` if the
+        Raise `TimeoutError` if there is no answer within 30 seconds. Raise `ConnectionError` if the
         viewer in the page refused.
         """
         number, answer = next(self._numbers), Future[bytes]()
-        self.answers[number] = answer
-        self.requests.put((number, request))
+        with self._changed:
+            self._answers[number], self._requests[number] = answer, request
+            self._changed.notify_all()
         try:
             return answer.result(_ANSWER_SECONDS)
         finally:
-            del self.answers[number]
+            with self._changed:
+                del self._answers[number], self._requests[number]
 
-    def next(self) -> tuple[int, bytes]:
+    def announce(self, text: str | Question) -> None:
+        """Send a line, or a question, to the page."""
+        with self._changed:
+            self._texts.append(text)
+            self._changed.notify_all()
+
+    def next(self, page: int) -> tuple[int, bytes]:
         """Wait up to 20 seconds for number and content of the next request; 0 if there is none."""
-        with suppress(queue.Empty):
-            while True:
-                number, request = self.requests.get(timeout=_POLL_SECONDS)
-                if number in self.answers:  # a caller still waits for it
+        with self._changed:
+            self._wait(page, lambda: bool(self._requests.keys() - self._sent))
+            for number, request in self._requests.items():
+                if page == self.page and number not in self._sent:
+                    self._sent.add(number)
                     return number, request
         return 0, b""
 
+    def text(self, page: int) -> str | Question:
+        """Wait up to 20 seconds for the next line or question; empty if there is none."""
+        with self._changed:
+            self._wait(page, lambda: bool(self._texts))
+            if page != self.page or not self._texts:
+                return ""
+            text = self._texts.popleft()
+            questions = [one for one in (*self._shown, text) if isinstance(one, Question)]
+            lines = [one for one in (*self._shown, text) if not isinstance(one, Question)]
+            self._shown = [*questions[-1:], *lines[-2:]]
+            return text
+
+    def _wait(self, page: int, is_there: Callable[[], bool]) -> None:
+        self._changed.wait_for(lambda: page != self.page or is_there(), _POLL_SECONDS)
+
     def answer(self, number: int, content: bytes | None) -> None:
         """Deliver the answer to a request; None if the viewer refused."""
-        waiting = self.answers.get(number)
+        waiting = self._answers.get(number)
         if waiting is None or waiting.done():
             return
         if content is None:
@@ -188,23 +229,24 @@ class _Handler(HttpHandler):
         """Send the page, the files of the viewer, the next request or the next text."""
         name = self._name()
         if name == "":
-            page = files("hearthlog.analyzer.review.viewer").joinpath("page.html").read_bytes()
+            html = files("hearthlog.analyzer.review.viewer").joinpath("page.html").read_bytes()
             policy = {"Content-Security-Policy": self._policy()}
-            self.send(HTTPStatus.OK, page, "text/html; charset=utf-8", policy)
+            self.send(HTTPStatus.OK, html, "text/html; charset=utf-8", policy)
         elif name == "description":
             relay = self._page.relay
             description = {
+                "page": relay.open_page(),
                 "data": self._page.data,
                 "keys": list(relay.keys),
                 "sound": relay.sound is not None,
             }
             self.send(HTTPStatus.OK, json.dumps(description).encode(), "application/json")
-        elif name == "next":
-            number, request = self._page.relay.next()
+        elif (page := self._page_of(name, "next")) is not None:
+            number, request = self._page.relay.next(page)
             kind = "application/octet-stream"
-            self.send(HTTPStatus.OK, request, kind, {"Number": str(number)})
-        elif name == "text":
-            self._send_text()
+            self._send_to(page, request, kind, {"Number": str(number)})
+        elif (page := self._page_of(name, "text")) is not None:
+            self._send_text(page)
         elif name == "sound" and self._page.relay.sound is not None:
             self._send_sound(self._page.relay.sound)
         elif name in _VIEWER_FILES:
@@ -225,7 +267,7 @@ class _Handler(HttpHandler):
         verb, _, rest = name.partition("/")
         if verb in {"answer", "refused"} and rest.isdecimal():
             relay.answer(int(rest[:9]), content if verb == "answer" else None)
-        elif verb == "size":
+        elif verb == "size" and self._page_of(name, verb) == relay.page:
             with suppress(ValueError):
                 width, height = (float(part) for part in content[:32].split())
                 if 0 < width < _LARGEST and 0 < height < _LARGEST:
@@ -256,6 +298,21 @@ class _Handler(HttpHandler):
         self._page.give_time(self.connection, _SECONDS)
         return name
 
+    @staticmethod
+    def _page_of(name: str | None, verb: str) -> int | None:
+        """Return the number of the page in the name of its request; None for other names."""
+        own, _, number = (name or "").partition("/")
+        return int(number[:9]) if own == verb and number.isdecimal() else None
+
+    def _send_to(
+        self, page: int, content: bytes, kind: str, headers: dict[str, str] | None = None
+    ) -> None:
+        """Send to the newest page; tell an earlier one that there is another."""
+        if page == self._page.relay.page:
+            self.send(HTTPStatus.OK, content, kind, headers or {})
+        else:
+            self.send_text(HTTPStatus.GONE, "open in another window")
+
     def _send_sound(self, sound: Callable[[], bytes]) -> None:
         """Send the sound of the current span, or a line that says why there is none."""
         try:
@@ -265,16 +322,20 @@ class _Handler(HttpHandler):
         except (ConnectionError, TimeoutError):
             self.send_text(HTTPStatus.SERVICE_UNAVAILABLE, "the viewer did not answer")
 
-    def _send_text(self) -> None:
+    def _send_text(self, page: int) -> None:
         """Send the next line, or the next question and the keys that answer it."""
-        text: str | Question = ""
-        with suppress(queue.Empty):
-            text = self._page.relay.texts.get(timeout=_POLL_SECONDS)
+        text = self._page.relay.text(page)
         if isinstance(text, Question):
-            question = {"text": text.text, "keys": [one.key for one in text.keys]}
-            self.send(HTTPStatus.OK, json.dumps(question).encode(), "application/json")
+            yes = text.keys[0]
+            words = f"yes, {text.text.rstrip('?')}" if yes.text == "yes" else yes.text
+            question = {
+                "text": text.text,
+                "keys": [one.key for one in text.keys],
+                "yes": words.capitalize(),
+            }
+            self._send_to(page, json.dumps(question).encode(), "application/json")
         else:
-            self.send(HTTPStatus.OK, text.encode(), "text/plain; charset=utf-8")
+            self._send_to(page, text.encode(), "text/plain; charset=utf-8")
 
 
 class _PageViewer(Viewer):
@@ -283,6 +344,7 @@ class _PageViewer(Viewer):
     def __init__(self, process: ViewerProcess, server: _Server) -> None:
         super().__init__(process, server.url)
         self._relay = server.relay
+        self._page = 0  # that shows what was shown
         self._server = server
         server.start()
 
@@ -305,10 +367,19 @@ class _PageViewer(Viewer):
 
     def show_question(self, start: int, end: int, question: Question) -> None:
         super().show_question(start, end, question)
-        self._relay.texts.put(question)
+        self._relay.announce(question)
 
     def announce(self, text: str) -> None:
-        self._relay.texts.put(text)
+        self._relay.announce(text)
+
+    def refresh(self) -> None:
+        page = self._relay.page
+        if page != self._page:
+            if not self.state().views:
+                return  # it has no data yet
+            self._show_again()
+            self._page = page
+        super().refresh()
 
     def close(self) -> None:
         self._server.end()

@@ -85,7 +85,8 @@ def outdated(root: Path) -> list[str]:
 
 
 def _day(home: Home) -> Image.Image:
-    return _without_menu(day_picture(home.logs, DAY, _DESK))
+    image = _without_menu(day_picture(home.logs, DAY, _DESK))
+    return image.crop((0, 0, image.width, image.height - _DESK[1] // 4))  # without the time panel
 
 
 def _evening(home: Home) -> Image.Image:

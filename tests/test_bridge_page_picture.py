@@ -1,0 +1,187 @@
+"""The page of the home in a browser: its picture and table at each width, and the week."""
+
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+
+import pytest
+from homelife import at, midnight, write_day
+from servedhome import PALE_TEXTS, Phone
+from viewers import browsing
+
+from hearthlog.analyzer.bridge.wording import translation_for
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.tools.lab.pictures.pages import served_page
+
+DAY = datetime(2026, 5, 5, tzinfo=UTC).date()
+LATE = at("23:30")  # the current day has a count of its evening, too
+HEIGHTS = """
+((words, kind) => {
+  const lane = [...document.querySelectorAll(".lane")]
+    .find((e) => e.querySelector(".name").textContent.startsWith(words));
+  return Math.round(lane.querySelector(kind).getBBox().height);
+})
+"""
+
+
+@pytest.fixture(scope="module")
+def phone(tmp_path_factory):
+    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
+        yield Phone(browser)
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory):
+    """A home late in the evening, with counts of three digits, and the day before."""
+    folder = tmp_path_factory.mktemp("late")
+    talking = [(at("19:00") + 60 * n, 3.0, "speech", 0.9) for n in range(60)]
+    coughs = [(at(text), 1.0, "coughing", 0.9) for text in ("02:40", "11:28", "15:45", "23:04")]
+    coughs += [(at("08:00") + 300 * n, 1.0, "coughing", 0.6) for n in range(19)]
+    coughs += [(at(text), 1.0, "coughing", 0.6) for text in ("22:20", "22:50")]
+    busy = [(at("12:00") + 20 * n, 2.0, "objects_activity", 0.6 + n % 5 / 10) for n in range(300)]
+    rings = [(at("17:00"), 8.0, "phone_ring", 0.9), (at("19:30:30"), 4.0, "phone_ring", 0.9)]
+    shout = [(at("19:40:30"), 2.0, "yelling", 0.9)]
+    write_day(folder, DAY - timedelta(days=1), [*talking, *shout, *coughs[:3]])
+    write_day(folder, DAY, [*talking, *coughs, *busy, *rings], hours=range(23))
+    with served_page(folder, UTC, midnight(DAY) + round(LATE * NANOSECONDS)) as page:
+        yield page
+
+
+@pytest.fixture
+def show(phone, late):
+    def open_page(width, language="en", scheme="light"):
+        agent = phone.of("navigator.userAgent")
+        phone._browser.call(
+            "Emulation.setUserAgentOverride", userAgent=agent, acceptLanguage=language
+        )
+        phone.open(SimpleNamespace(url=late.address), width, 844, scheme)
+        phone.until("document.querySelectorAll('.lane').length > 2")
+        phone.until("document.getElementById('dates').options.length > 1")
+
+    yield open_page
+    agent = phone.of("navigator.userAgent")
+    phone._browser.call("Emulation.setUserAgentOverride", userAgent=agent, acceptLanguage="en")
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize("width", [360, 390, 700])
+def test_an_evening_with_its_own_column_fits(phone, show, width, language):
+    show(width, language)
+    heads = phone.of("[...document.querySelectorAll('thead th')].map((e) => e.innerText)")
+    assert len(heads) == 5
+    assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+    # No text of a cell lies in the next one.
+    over = phone.of(
+        "[...document.querySelectorAll('th, td')].filter((cell) => { const own = new Range();"
+        "own.selectNodeContents(cell); const inside = cell.getBoundingClientRect();"
+        "return own.getBoundingClientRect().right > inside.right + 1; }).map((e) => e.innerText)"
+    )
+    assert over == []
+    assert phone.of("seen") == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1366])
+def test_important_sounds_are_tall_and_unsure_ones_lower_and_hollow(phone, show, width, scheme):
+    show(width, scheme=scheme)
+    full = 18 if width < 700 else 30
+    kinds = (".marks:not(.pale, .unsure)", ".unsure")
+    sure, unsure = (phone.of(f"{HEIGHTS}('Coughing', '{kind}')") for kind in kinds)
+    assert sure == full
+    assert unsure == pytest.approx(0.55 * full, abs=1)
+    pale = phone.of(f"{HEIGHTS}('Telephone', '.pale')")
+    assert 0 < pale < unsure
+    sure, unsure = (phone.of(f"{HEIGHTS}('Household', '{kind}')") for kind in kinds)
+    assert max(sure, unsure) < full, "by how much of it sounds"
+    style = "(({fill, stroke}) => [fill, stroke])(getComputedStyle(document.querySelector('%s')))"
+    (solid, _), (hollow, outline) = (phone.of(style % f".lane {kind}") for kind in kinds)
+    ground = phone.of("getComputedStyle(document.querySelector('.ground')).fill")
+    assert hollow == ground != solid
+    assert outline not in {ground, "none"}
+    widths = phone.of(
+        "[...document.querySelectorAll('.lane path.marks')].flatMap((path) =>"
+        "[...path.getAttribute('d').matchAll(/h([\\d.]+)/g)].map((each) => Number(each[1])))"
+    )
+    assert min(widths) >= 4
+    assert not phone.of("document.getElementById('key-unsure').hidden")
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize("width", [700, 1366])
+def test_on_a_screen_names_and_counts_are_left_of_the_picture(phone, show, width, language):
+    show(width, language)
+    left = phone.of("document.querySelector('.ground').getBoundingClientRect().left")
+    texts = phone.of(
+        "[...document.querySelectorAll('.lane text')].map((e) => e.getBoundingClientRect().right)"
+    )
+    assert len(texts) > 6
+    assert max(texts) < left
+    svg, hours = (
+        phone.of(
+            f"Math.max(...[...document.querySelectorAll('{each}')]"
+            ".map((e) => e.getBoundingClientRect().right))"
+        )
+        for each in (".picture", ".hours text")
+    )
+    assert hours <= svg
+    show(390, language)
+    name = phone.of("document.querySelector('.lane .name').getBoundingClientRect().left")
+    assert name > phone.of("document.querySelector('.ground').getBoundingClientRect().left")
+
+
+def test_a_day_of_the_week_is_marked_and_its_title_lies_above_its_sentence(phone, show):
+    show(390)
+    assert phone.of("document.getElementById('date').classList.contains('hidden')")
+    phone.of("document.getElementById('show-week').click()")
+    phone.until("document.querySelectorAll('#week .marks').length > 6")
+    chosen = "document.querySelector('#week button[aria-current=true] .what').innerText"
+    assert phone.of(chosen) == "Today"
+    phone.of("document.querySelectorAll('#week button')[1].click()")
+    phone.shows("#date", "Monday, 4 May")
+    phone.until("document.activeElement.id === 'date'")
+    assert phone.of(chosen) == "Mon, 4 May"
+    assert phone.of("document.querySelectorAll('#week [aria-current=true]').length") == 1
+    tops = phone.of(
+        "['#week', '#date', '#day-sentence', '.picture'].map((each) =>"
+        "document.querySelector(each).getBoundingClientRect().top)"
+    )
+    assert tops == sorted(tops)
+    assert -1 <= tops[1] < 200, "one is taken there"
+    below = phone.of(
+        "(([from]) => { const all = [...document.querySelectorAll('#day p, #day .what, #day h2')]"
+        ".filter((e) => e.getClientRects().length); return all[all.indexOf(from) + 1].innerText; })"
+        "([document.getElementById('day-sentence')])"
+    )
+    assert "Today" not in below
+    assert phone.of(PALE_TEXTS) == []
+    assert phone.of("document.scrollingElement.scrollWidth - innerWidth") <= 0
+    phone.of("document.getElementById('show-week').click()")
+    assert phone.of("document.getElementById('date').classList.contains('hidden')")
+    assert phone.of("seen") == []
+
+
+def test_a_past_day_says_why_a_class_with_a_count_of_0_has_a_mark(phone, show):
+    show(1366)
+    phone.of("document.getElementById('day-before').click()")
+    phone.shows("#rooms", "1 beside a television")
+    row = "[...document.querySelectorAll('tbody tr')].find((e) => e.innerText.startsWith('Shout'))"
+    cells = phone.of(f"[...{row}.cells].map((e) => e.innerText.replaceAll('\\u00a0', ' '))")
+    assert cells == ["Shouting\n1 beside a television", "0", "0", "\N{EN DASH}"]
+    lane = (
+        "[...document.querySelectorAll('.lane')]"
+        ".find((e) => e.querySelector('.name').textContent === 'Shouting')"
+    )
+    figure = phone.of(f"{lane}.querySelector('.count').textContent.replaceAll('\\u00a0', ' ')")
+    assert figure == "0 · 1 beside a television"
+    phone.of(f"{lane}.dispatchEvent(new MouseEvent('click'))")
+    phone.shows(".panel", "Not once. 1 beside a television, not counted (19:40).")
+    names = phone.of("document.querySelector('button.zero').innerText")
+    assert translation_for("en").class_words("unknown").lower() not in names
+    assert phone.of("seen") == []
+
+
+def test_what_is_not_sure_has_a_question_mark_in_the_folded_list_too(phone, show):
+    show(390)
+    phone.shows("#look .fold", "?) earlier")
+    about = phone.text("#look .fold .about")
+    assert "02:40" in about.split(", ")
+    assert any(each.endswith("?") for each in about.split(", ")), about
