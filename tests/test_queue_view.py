@@ -21,7 +21,8 @@ from hearthlog.models.classes import colour, ordered
 SECOND = 1_000_000_000
 MARGIN = 20 * SECOND
 _LEFT = 202  # pixels at the left of the plot of what is asked, as of the lanes
-_LANES, _SPECTRUM = 202, slice(175, 245)  # where the spectrogram is, at 1920 x 1080
+_LANES, _SPECTRUM = 202, slice(130, 190)  # where the spectrogram is, at 1920 x 1080
+_NOTICES = slice(35, 110), slice(1600, 1900)
 _NEAR = 14  # of 255: how far a colour may be off
 
 
@@ -271,4 +272,5 @@ def test_the_spectrogram_of_a_span_shows_its_sound_where_it_was_kept(view, logs,
         patiently(view.cursor, lambda cursor, start=start: cursor == start)
         begin = (second * SECOND) - MARGIN
         patiently(lambda begin=begin: [seconds_of_hiss(begin)], lambda f, e=expected: f == [e])
+        assert pixels(patiently(view.picture))[_NOTICES].max() < 100, "the viewer warns"
         assert view.state().errors == []

@@ -191,7 +191,8 @@ def draw_close_up(timeline: Timeline, before: Spans, canvas: Canvas) -> None:
 
 def clear_sound(microphone: str, time: int, text: str, canvas: Canvas) -> None:
     """Show no spectrogram from a time (ns of UTC) on, next to a text."""
-    canvas.show_image(f"{microphone}/{SPECTRUM}", time, np.zeros((2, 2)), text)
+    blank = np.zeros(_SPECTRUM_SHAPE)  # the viewer warns of a picture of another size
+    canvas.show_image(f"{microphone}/{SPECTRUM}", time, blank, text)
 
 
 class RequestedSpan(DrawnLane):
@@ -334,7 +335,7 @@ BELOW = 0.5  # height of the time axis, in lanes, until the height of the window
 # more: so these are few, 0 to 3, and as wide as the 0 of the other plots, which begin at one place.
 LANES_HEIGHT = 3.9
 _HOURS_HEIGHT, _SPECTRUM_HEIGHT = 62, 66
-_SPECTRUM_SHAPE = (96, 1920)  # flatter than any view of it
+_SPECTRUM_SHAPE = (96, 1920)  # as flat as its row in a window of 16 : 9
 _BLACK: Colour = (0, 0, 4)
 # Widths of a text and a plot, until that of the window is known; the hours have no axis.
 COLUMNS, HOUR_COLUMNS, _QUESTION_COLUMNS = (2, 10), (2, 11), (3, 7)
@@ -536,14 +537,15 @@ def _hours_view() -> rrb.Container:
 
 
 def _spectrum_view(microphone: str) -> rrb.Container:
-    """Show the spectrogram as wide as the lanes: it is flatter than its view."""
+    """Show the spectrogram exactly as wide as the lanes, whatever the shape of its view."""
     rows, columns = _SPECTRUM_SHAPE
+    middle = rows / 2
     entity = f"{microphone}/{SPECTRUM}"
     view = rrb.Spatial2DView(
         origin=entity,
         name="Sound",
         titlebar=False,
-        visual_bounds=rrb.VisualBounds2D(x_range=[0, columns], y_range=[0, rows]),
+        visual_bounds=rrb.VisualBounds2D(x_range=[0, columns], y_range=[middle - 1, middle + 1]),
         background=_BLACK,
     )
     return rrb.Horizontal(text_view(f"{entity}/text"), view, column_shares=HOUR_COLUMNS)

@@ -9,16 +9,20 @@ TOP_BAR, TAB_BAR, AXIS_HEIGHT = 36.0, 30.0, 17.0
 _PANEL_HEIGHTS = 150.0, 250.0  # a quarter of the viewer, within these
 _FOLDED_HEIGHT = 30.0  # of the time panel
 _LEAST_LANE = 26.0  # else its name is cut
+_WINDOW_HEIGHT = 768.0
 
 _CONTAINER, _PANEL = "ContainerBlueprint", "TimePanelBlueprint"
 
 
 class RowHeights(NamedTuple):
-    """Rows of a review from above, with their heights in points of a window of 768."""
+    """Rows of a review from above, with their heights in points of a window of 768.
+
+    The spectrogram is above the lanes: it fills its row only if it grows like its width.
+    """
 
     fixed: tuple[int, ...]  # above the microphones, in every window
     stacks: tuple[tuple[int, ...], ...]  # of each microphone
-    lanes: int  # which row of a stack has the lanes; those above are fixed
+    lanes: int  # which row of a stack has the lanes; those above grow with the window
     has_plots: bool  # in the last row of a stack
     is_close_up: bool  # where nothing has to be dragged on the time ruler
 
@@ -29,6 +33,7 @@ class _Fit(NamedTuple):
     is_folded: bool  # the time panel
     fixed: list[float]
     homes: float  # height of all microphones
+    above: list[float]  # heights of the rows above the lanes of a stack
     plots: float  # of a stack, 0 if they are hidden
 
 
@@ -68,27 +73,34 @@ class FittedRows:
         else:
             choices += [(False, fixed, False), (False, [0.0] * len(fixed), False)]
         return [
-            self._fit(height - TOP_BAR - (_FOLDED_HEIGHT if folded else panel), folded, own, plots)
+            self._fit(height, _FOLDED_HEIGHT if folded else panel, folded, own, plots)
             for folded, own, plots in choices
         ]
 
-    def _fit(self, viewport: float, is_folded: bool, fixed: list[float], has_plots: bool) -> _Fit:  # noqa: FBT001
-        homes = max(viewport - sum(fixed), 0.0)
+    def _fit(
+        self,
+        height: float,
+        panel: float,
+        is_folded: bool,  # noqa: FBT001
+        fixed: list[float],
+        has_plots: bool,  # noqa: FBT001
+    ) -> _Fit:
+        homes = max(height - TOP_BAR - panel - sum(fixed), 0.0)
         stack = max(self._rows.stacks, key=lambda one: one[self._rows.lanes])
-        above, below = sum(stack[: self._rows.lanes]), stack[self._rows.lanes :]
+        above = [one * height / _WINDOW_HEIGHT for one in stack[: self._rows.lanes]]
+        below = stack[self._rows.lanes :]
         plots = 0.0
         if has_plots and self._rows.has_plots:
-            plots = max(self._inside(homes) - above, 0.0) * below[-1] / sum(below)
-        return _Fit(is_folded, fixed, homes, plots)
+            plots = max(self._inside(homes) - sum(above), 0.0) * below[-1] / sum(below)
+        return _Fit(is_folded, fixed, homes, above, plots)
 
     def _inside(self, homes: float) -> float:
         return homes - TAB_BAR * (len(self._rows.stacks) > 1)
 
     def _lanes_height(self, fit: _Fit) -> float:
         stack = max(self._rows.stacks, key=lambda one: one[self._rows.lanes])
-        above = sum(stack[: self._rows.lanes])
         between = stack[self._rows.lanes : len(stack) - self._rows.has_plots]
-        left = max(self._inside(fit.homes) - above - fit.plots, 0.0)
+        left = max(self._inside(fit.homes) - sum(fit.above) - fit.plots, 0.0)
         return left * between[0] / sum(between)
 
     def _lane(self, fit: _Fit, count: int) -> float:
@@ -116,13 +128,13 @@ def _set_stack(
     stack = next((one for one in rows.stacks if len(contents) == len(above) + len(one)), None)
     if stack is None:  # the user has changed it
         return
-    heights = [float(one) for one in stack]
+    heights = [*fit.above, *map(float, stack[rows.lanes :])]
     if rows.has_plots:
         _container(blueprint, contents[-1])["visible"] = fit.plots > 0
         heights[-1] = fit.plots
     inside = fit.homes - TAB_BAR * (len(rows.stacks) > 1)
     others = stack[rows.lanes : len(stack) - rows.has_plots]
-    left = max(inside - sum(stack[: rows.lanes]) - fit.plots, 0.0)
+    left = max(inside - sum(fit.above) - fit.plots, 0.0)
     for row, height in enumerate(others, rows.lanes):
         heights[row] = left * height / sum(others)
     own["row_shares"] = [*above, *heights]
