@@ -35,6 +35,8 @@ from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model, save_model
 from hearthlog.recorder.sources.decoding import read_audio
 from hearthlog.schemas.frames import FRAME_SAMPLES
+from hearthlog.tools.home.clips import ClipLibrary
+from hearthlog.tools.home.composition import Rooms
 from hearthlog.tools.home.simulate import write_day, write_training_set
 
 # Its workers have 80 columns, whatever the terminal: tables there are as in a pipe elsewhere.
@@ -230,3 +232,15 @@ def refused(hearthlog):
         return result.stderr.removeprefix("hearthlog: ").rstrip()
 
     return run
+
+
+@pytest.fixture(scope="session")
+def clip_library():
+    """The clips that homes are composed of."""
+    return ClipLibrary()
+
+
+@pytest.fixture(scope="session")
+def living_room():
+    """A living room as its microphone hears it."""
+    return Rooms("living_room", seed=1)

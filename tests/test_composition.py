@@ -20,24 +20,14 @@ from hearthlog.tools.home.routine import (
 from hearthlog.tools.home.simulate import truth_of
 
 
-@pytest.fixture(scope="module")
-def library():
-    return ClipLibrary()
-
-
-@pytest.fixture(scope="module")
-def rooms():
-    return Rooms("living_room", seed=1)
-
-
 @pytest.mark.parametrize(("level", "labelled"), [(-15.0, True), (-55.0, False)])
-def test_of_two_sounds_the_louder_one_is_true(library, rooms, level, labelled):
-    speech, cough = library.of("speech")[0], library.of("coughing")[0]
+def test_of_two_sounds_the_louder_one_is_true(clip_library, living_room, level, labelled):
+    speech, cough = clip_library.of("speech")[0], clip_library.of("coughing")[0]
     sounds = [
         PlannedSound(100, 400, speech, "television", "living_room", -35.0, "television"),
         PlannedSound(200, 20, cough, "resident", "living_room", level, "day"),
     ]
-    truth = truth_of(Composition(HomePlan(600, sounds, ()), library, rooms))
+    truth = truth_of(Composition(HomePlan(600, sounds, ()), clip_library, living_room))
     here = {name for start, end, name in truth.spans if start < 220 / 20 and end > 200 / 20}
     assert ("coughing" in here) is labelled
     assert {name for *_, name in truth.spans} >= {"speech", "silence"}
@@ -45,19 +35,19 @@ def test_of_two_sounds_the_louder_one_is_true(library, rooms, level, labelled):
     assert bool(truth.events[1].audible_frames) is labelled
 
 
-def test_what_is_not_heard_through_a_wall_is_silence(library):
-    tap = library.of("tap_water")[0]
+def test_what_is_not_heard_through_a_wall_is_silence(clip_library):
+    tap = clip_library.of("tap_water")[0]
     sound = PlannedSound(20, 100, tap, "resident", "bathroom", -62.0, "washing")
     for room, labelled in (("bathroom", True), ("living_room", False)):
         rooms = Rooms(room, seed=0)
         rooms.floor *= 1e-2 ** (room == "bathroom")
-        truth = truth_of(Composition(HomePlan(200, [sound], ()), library, rooms))
+        truth = truth_of(Composition(HomePlan(200, [sound], ()), clip_library, rooms))
         assert bool(truth.events[0].audible_frames) is labelled
         assert (len(truth.spans) > 1) is labelled
 
 
-def test_walls_take_level_and_the_high_frequencies_first(library):
-    sound = library.sound(library.of("coughing")[0], 20)
+def test_walls_take_level_and_the_high_frequencies_first(clip_library):
+    sound = clip_library.sound(clip_library.of("coughing")[0], 20)
     near, far = (Rooms(room, seed=0).received(sound, "bedroom") for room in ("bedroom", "bathroom"))
     assert 11 < 10 * np.log10(frame_powers(near).mean() / frame_powers(far).mean()) < 25
     bright = [np.abs(np.fft.rfft(one))[len(one) // 4 :].std() for one in (near, far)]
@@ -65,14 +55,14 @@ def test_walls_take_level_and_the_high_frequencies_first(library):
     assert bright[0] / bright[1] > 2 * dark[0] / dark[1]
 
 
-def test_a_clip_is_cut_or_repeated_to_a_length_as_loud_as_every_other(library):
+def test_a_clip_is_cut_or_repeated_to_a_length_as_loud_as_every_other(clip_library):
     for label in ("coughing", "music", "shower"):
-        for clip in library.of(label):
+        for clip in clip_library.of(label):
             for frames in (clip.frames, 10, 400):
-                sound = library.sound(clip, frames)
+                sound = clip_library.sound(clip, frames)
                 assert sound.shape == (frames * FRAME_SAMPLES,)
                 assert abs(sound[0]) < 0.01 > abs(sound[-1])
-            assert 0.2 < frame_powers(library.sound(clip, clip.frames)).max() < 200
+            assert 0.2 < frame_powers(clip_library.sound(clip, clip.frames)).max() < 200
 
 
 def test_every_shipped_clip_may_be_given_away_and_says_whose_it_is():

@@ -152,6 +152,9 @@ def read_spans(path: Path) -> list[ReviewSpan]:
     return spans
 
 
+read_list = read_spans  # its name in the documents of 0.2
+
+
 def _span(where: str, fields: Sequence[str]) -> ReviewSpan:
     microphone, start, end, a, label_a, b, label_b, score, reason = fields
     try:

@@ -25,8 +25,8 @@ from hearthlog.recorder.recording import record_files
 from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.schemas.errors import ModelError
 from hearthlog.schemas.frames import FRAME_SECONDS
-from hearthlog.tools.home.clips import ClipLibrary, frame_powers
-from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition, Rooms
+from hearthlog.tools.home.clips import frame_powers
+from hearthlog.tools.home.composition import PERIOD_FRAMES, Composition
 from hearthlog.tools.home.routine import (
     DAY_FRAMES,
     HomePlan,
@@ -43,21 +43,11 @@ PERSON = {"resident", "visitor", "phone"}
 
 
 @pytest.fixture(scope="module")
-def library():
-    return ClipLibrary()
-
-
-@pytest.fixture(scope="module")
-def rooms():
-    return Rooms("living_room", seed=1)
-
-
-@pytest.fixture(scope="module")
-def evening(library, rooms):
+def evening(clip_library, living_room):
     """Twenty minutes before the television is on, and twenty with it."""
-    plan = plan_days(1, library, Habits(seed=1))
+    plan = plan_days(1, clip_library, Habits(seed=1))
     first = next(sound.start for sound in plan.sounds if sound.origin == "television")
-    return Composition(part(plan, first - HOUR // 3, 2 * HOUR // 3), library, rooms)
+    return Composition(part(plan, first - HOUR // 3, 2 * HOUR // 3), clip_library, living_room)
 
 
 def part(plan, first, frames):
@@ -75,17 +65,17 @@ def full_scale(samples):
     return samples.astype(np.float32) / 32768
 
 
-def test_the_same_seed_plans_the_same_days_and_more_days_begin_alike(library):
-    days = plan_days(3, library, Habits(seed=5))
-    again = plan_days(5, library, Habits(seed=5))
+def test_the_same_seed_plans_the_same_days_and_more_days_begin_alike(clip_library):
+    days = plan_days(3, clip_library, Habits(seed=5))
+    again = plan_days(5, clip_library, Habits(seed=5))
     assert list(days.sounds) == [sound for sound in again.sounds if sound.start < days.frames]
-    assert list(days.sounds) != list(plan_days(3, library, Habits(seed=6)).sounds)
+    assert list(days.sounds) != list(plan_days(3, clip_library, Habits(seed=6)).sounds)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_month_is_plausible_and_planned_in_a_moment(library, seed):
+def test_a_month_is_plausible_and_planned_in_a_moment(clip_library, seed):
     began = time.process_time()
-    plan = plan_days(30, library, Habits(seed))
+    plan = plan_days(30, clip_library, Habits(seed))
     assert time.process_time() - began < 10
     days = [[] for _ in range(30)]
     for sound in plan.sounds:
@@ -109,8 +99,8 @@ def test_a_month_is_plausible_and_planned_in_a_moment(library, seed):
     assert any(one.activity == "visit" for one in plan.sounds)
 
 
-def test_a_person_and_a_device_make_one_sound_at_a_time(library):
-    plan = plan_days(14, library, Habits(seed=2))
+def test_a_person_and_a_device_make_one_sound_at_a_time(clip_library):
+    plan = plan_days(14, clip_library, Habits(seed=2))
     assert [one.start for one in plan.sounds] == sorted(one.start for one in plan.sounds)
     for origins in (PERSON, {"television"}, {"radio"}, {"outside"}):
         sounds = [one for one in plan.sounds if one.origin in origins]
@@ -122,9 +112,9 @@ def test_a_person_and_a_device_make_one_sound_at_a_time(library):
         assert all(one.end <= other.start for one, other in pairwise(noises))
 
 
-def test_nights_get_worse_from_the_day_asked_for_and_are_the_same_before(library):
-    usual = plan_days(21, library, Habits(seed=3))
-    worse = plan_days(21, library, Habits(seed=3, coughs_from=14))
+def test_nights_get_worse_from_the_day_asked_for_and_are_the_same_before(clip_library):
+    usual = plan_days(21, clip_library, Habits(seed=3))
+    worse = plan_days(21, clip_library, Habits(seed=3, coughs_from=14))
     change = 14 * DAY_FRAMES
     before = [[one for one in plan.sounds if one.start < change] for plan in (usual, worse)]
     assert before[0] == before[1]
@@ -167,9 +157,9 @@ def test_features_without_most_of_the_sound_are_those_of_the_sound(evening, feat
         assert np.array_equal(np.concatenate(blocks), expected)
 
 
-def test_steady_noise_repeats_itself_and_its_features_do_too(library, rooms):
+def test_steady_noise_repeats_itself_and_its_features_do_too(clip_library, living_room):
     steady = [PlannedNoise("fridge", 500, 3 * PERIOD_FRAMES + 100)]
-    quiet = Composition(HomePlan(4 * PERIOD_FRAMES, (), steady), library, rooms)
+    quiet = Composition(HomePlan(4 * PERIOD_FRAMES, (), steady), clip_library, living_room)
     values = FeatureStream(quiet, DEFAULT)(0, quiet.plan.frames)
     on = values[PERIOD_FRAMES : 2 * PERIOD_FRAMES]
     assert np.array_equal(on, values[2 * PERIOD_FRAMES : 3 * PERIOD_FRAMES])
@@ -204,7 +194,7 @@ def test_the_logs_are_those_that_the_recorder_leaves_of_the_sound(evening, model
 
 
 def test_a_model_that_takes_embeddings_gets_those_of_the_composed_sound(
-    library, rooms, tmp_path, monkeypatch
+    clip_library, living_room, tmp_path, monkeypatch
 ):
     pytest.importorskip("ai_edge_litert")
     network = Path(__file__).parents[2] / "shared" / "data" / "networks" / "yamnet.tflite"
@@ -215,7 +205,7 @@ def test_a_model_that_takes_embeddings_gets_those_of_the_composed_sound(
     place = tmp_path / "hearthlog" / "networks" / "yamnet.tflite"
     place.parent.mkdir(parents=True)
     place.symlink_to(network)
-    composition = Composition(plan_short_day(2, library, 1), library, rooms)
+    composition = Composition(plan_short_day(2, clip_library, 1), clip_library, living_room)
     model = starter_file("general-embedding")
     recorded, composed = recorded_and_composed(composition, model, tmp_path)
     assert recorded == composed
