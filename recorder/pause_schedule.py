@@ -65,13 +65,13 @@ class PauseSchedule:
 
     def reason(self) -> str:
         """Return why the microphones are closed now; empty if they are open."""
-        if _is_paused(self._folder):
+        if is_paused(self._folder):
             return PAUSED
         return QUIET_HOURS if self._minutes_left() else ""
 
     def describe(self) -> str:
         """Format the reason and end of the current pause."""
-        if _is_paused(self._folder):
+        if is_paused(self._folder):
             end = paused_until(self._folder)
             until = "hearthlog resume" if end is None else self._local(end)
             who = _paused_by(self._folder)
@@ -105,7 +105,7 @@ def pause(folder: Path, duration: timedelta | None, who: str = "") -> None:
 
 def resume(folder: Path) -> bool:
     """End a pause, if there is one; raise `OSError` if the folder is not writable."""
-    was_paused = _is_paused(folder)
+    was_paused = is_paused(folder)
     (folder / _PAUSE_FILE).unlink(missing_ok=True)
     return was_paused
 
@@ -136,7 +136,8 @@ def _read_pause(folder: Path) -> bytes:
         return file.read(_LONGEST)
 
 
-def _is_paused(folder: Path) -> bool:
+def is_paused(folder: Path) -> bool:
+    """Whether somebody has paused the recorders of a folder."""
     if not os.path.exists(f"{folder}/{_PAUSE_FILE}"):  # noqa: PTH110  at each block of sound
         return False
     end = paused_until(folder)

@@ -33,11 +33,12 @@ from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
-from hearthlog.analyzer.bridge.wording import ENGLISH, translation_for
+from hearthlog.analyzer.bridge.wording import ENGLISH, clock, translation_for
 from hearthlog.analyzer.http import HttpServer, free_port
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import ON_TELEVISION
+from hearthlog.recorder.pause_schedule import is_paused, pause, paused_until
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns
@@ -659,6 +660,7 @@ def test_a_microphone_that_is_away_is_not_said_to_listen(output, why):
     assert (recorded["words"], recorded["why"]) == ("Not listening", why)
     health = health_list(update, "home", now)[0]
     assert health["text"] == (f"not listening: {why}" if why else "not listening")
+    assert health["level"] == (0 if why else 2), "a pause needs no look"
 
 
 def test_times_and_lengths_are_said_in_words():
@@ -860,6 +862,27 @@ def test_what_is_wrong_is_said_at_the_top_and_opens_to_the_list(phone, lived):
     phone.of('document.querySelector("#working summary").click()')
     assert "Disk: Needs a look (2 days left)" in phone.text("#health")
     assert "Bathroom: Not working (not listening: no device of this name)" in phone.text("#health")
+
+
+def test_a_tap_stops_the_listening_for_an_hour_and_a_second_one_begins_it_again(phone, lived):
+    folder, button = lived.log.folder, "document.getElementById('pause')"
+    phone.open(lived)
+    lived.log.hears("speech", "living_room")
+    phone.shows("#attention", "Needs a look")
+    phone.of('document.querySelector("#working summary").click()')
+    assert phone.text("#pause") == "Stop listening for an hour"
+    phone.of(f"{button}.click()")
+    phone.shows("#pause", "Listen again")
+    assert 3500 < paused_until(folder) - time.time() <= 3600
+    until = clock(round(paused_until(folder)) * NANOSECONDS, lived.home.zone)
+    assert phone.text("#paused") == f"Not listening until {until}."
+    pause(folder, None)
+    phone.shows("#paused", "Not listening, until somebody taps “Listen again”.")
+    phone.of(f"{button}.click()")
+    phone.shows("#pause", "Stop listening for an hour")
+    assert not is_paused(folder)
+    assert lived.post("/pause", {"pause": "ever", "label": ""})[0] == 422
+    assert not is_paused(folder)
 
 
 def test_a_screen_reader_is_told_what_everything_is(phone, lived):

@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from datetime import date
+from datetime import date, timedelta, tzinfo
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ from hearthlog.analyzer.logs.hidden_classes import read_hidden_classes, write_hi
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time
 from hearthlog.models.classes import SILENCE, ordered
+from hearthlog.recorder import pause_schedule
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -54,6 +55,7 @@ from hearthlog.schemas.messages.topics import is_sound
 _EVERY_SECONDS = 1.0
 _MARKS = {"/mark": False, "/mark-one": True}  # whether a mark is of the event alone
 _SHOW = {"yes": True, "no": False}
+_PAUSES = {"hour": timedelta(hours=1), "": None}  # by what a person chose; None: it ends
 _MOST_TO_REVIEW, _MOST_OTHERS = 24, 20  # bouts of the current day
 _MOST_OF_DAY = 200  # bouts of a past day
 _MOST_IDS = 50  # events in a request
@@ -204,6 +206,7 @@ class HomePage:
             "home": self.home_name(),
             "clock": clock(moment.now, update.zone),
             "sound": self._settings.sound,
+            "pause": self._pause(moment.zone, words),
         }
         view.put("home", about)
         view.put("recurring", self._recurring.describe(moment, words))
@@ -277,6 +280,8 @@ class HomePage:
             return self._mark(subject, label, words, is_single=_MARKS[path])
         if path == "/group":
             return self._recurring.name(subject, label, words)
+        if path == "/pause":
+            return self._change_pause(subject, words)
         return self._show(subject, label, words)
 
     def answer(self, path: str, text: str, words: Translation) -> Any:
@@ -381,6 +386,31 @@ class HomePage:
             raise user_error(error) from error
         key = "shown again" if _SHOW[choice] else "shown nowhere"
         return words.text(key, **{"class": words.class_words(name)})
+
+    def _change_pause(self, choice: str, words: Translation) -> str:
+        """Close the microphones for a while, or open them again; return which, in words."""
+        folder = self._home.folder
+        if choice not in _PAUSES:
+            raise BridgeError("This pause is not on the page.")
+        duration = _PAUSES[choice]
+        try:
+            if duration is None:
+                pause_schedule.resume(folder)
+            else:
+                pause_schedule.pause(folder, duration, "the page of the home")
+        except (HearthlogError, OSError) as error:
+            raise user_error(error) from error
+        return self._pause(self._home.zone, words)
+
+    def _pause(self, zone: tzinfo, words: Translation) -> str:
+        """Return until when somebody has closed the microphones; empty if nobody has."""
+        folder = self._home.folder
+        if not pause_schedule.is_paused(folder):
+            return ""
+        end = pause_schedule.paused_until(folder)
+        if end is None:
+            return words.text("pause.open")
+        return words.text("pause.until", time=clock(int(end) * NANOSECONDS, zone))
 
     def _measure(self, now: int) -> None:
         """Measure how sure the home can be of labels, in the checked minutes of four weeks."""

@@ -1,5 +1,5 @@
 // The page of the home: what sounds now, what works, days, and the stream of news.
-import { ask, colour, draw, inside, keep, make, place, say, set, write } from "./elements.js";
+import { ask, colour, draw, inside, keep, make, place, say, send, set, write } from "./elements.js";
 import { beginMarks, drawAgain, showDay, showMarks, spans } from "./picture.js";
 import { allowSound, showEvents, showRecurring, showSoundsOf } from "./sounds.js";
 
@@ -57,7 +57,22 @@ function showHome(home) {
   write(place("clock"), clock);
   if (document.title !== home.home) document.title = home.home;
   allowSound(home.sound);
+  showPause(home.pause);
 }
+
+let isPaused = false;
+
+function showPause(text) {
+  isPaused = Boolean(text);
+  write(place("paused"), text);
+  write(place("pause"), say(isPaused ? "resume" : "pause"));
+}
+
+place("pause").addEventListener("click", async () => {
+  const { said, error } = await send("pause", { pause: isPaused ? "" : "hour", label: "" });
+  if (error) write(place("paused"), error);
+  else showPause(said);
+});
 
 // Days
 

@@ -207,8 +207,14 @@ _FILES = {
 _QUERIES = {"/days", "/day", "/kept"}  # answered as JSON
 _TEXT = re.compile(r"\{\{(page\.[a-z ]+)\}\}")  # in page.html
 _GROUND = "#f4f6f8"  # as in page.css
-# JSON field beside the label: a subject, or whether the class is shown.
-_SUBJECTS = {"/mark": "event", "/mark-one": "event", "/group": "group", "/show": "show"}
+# JSON field beside the label: a subject, whether the class is shown, or for how long to pause.
+_SUBJECTS = {
+    "/mark": "event",
+    "/mark-one": "event",
+    "/group": "group",
+    "/show": "show",
+    "/pause": "pause",
+}
 _JSON = "application/json"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
@@ -381,7 +387,7 @@ class _Handler(HttpHandler):
         self.send(code, body, kind)
 
     def do_POST(self) -> None:
-        """Accept a label for an event or the sounds of a group, or whether a class is shown."""
+        """Accept a label for an event or a group, whether a class is shown, or a pause."""
         if not self._is_admitted(changes=True):
             return
         if self._path not in _SUBJECTS:

@@ -160,7 +160,8 @@ def _of_microphone(microphone: LiveMicrophone, state: HomeState, words: Translat
     if not microphone.is_listening():
         why = reason(text)
         key = "health.not listening because" if why else "health.not listening"
-        return _line(what, _WRONG, words.text(key, text=why))
+        is_meant = bool(why) and level == _WELL  # a pause, or quiet hours
+        return _line(what, _WELL if is_meant else _WRONG, words.text(key, text=why))
     key = "health.listening but" if level else "health.listening"
     return _line(what, min(level, _WRONG), words.text(key, text=text))
 
