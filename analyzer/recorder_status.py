@@ -17,7 +17,7 @@ from hearthlog.analyzer.doctor.examination import examine_file
 from hearthlog.analyzer.logs.recorder_info import CONFIGURATION, attachments_of, read_recorder_infos
 from hearthlog.models.modelfile import DESCRIPTION, attachment_of
 from hearthlog.recorder.log.folder_lock import NodeLock, node_locks
-from hearthlog.recorder.pause_schedule import paused_until
+from hearthlog.recorder.pause_schedule import is_paused, paused_until
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS, millisecond_text
 from hearthlog.schemas.logs.columns import Columns, read_columns
@@ -128,7 +128,7 @@ def _stopped(
     A recorder that completed its last log, and after which another recorder wrote to the folder,
     was stopped or renamed: a warning only. A killed recorder leaves an unfinished log.
     """
-    since = "" if newest is None else f" since {_moment(newest)}"
+    since = "" if newest is None else f" since {_minute_text(newest)}"
     others = [other for other in locks if other.node != lock.node]
     end = _last_start(logs[lock.node])
     is_followed = any(other.is_held or _last_start(logs[other.node]) > end for other in others)
@@ -177,11 +177,10 @@ def _statuses(columns: Columns, node: str) -> Iterator[_Status]:
 
 
 def _folder(folder: Path) -> Iterator[State]:
-    if (folder / ".pause").exists():
+    if is_paused(folder):
         end = paused_until(folder)
-        until = "`hearthlog resume`" if end is None else _moment(int(end) * NANOSECONDS)
-        if end is None or end > time.time():
-            yield State("ok", "pause", f"nobody is listened to until {until}")
+        until = "`hearthlog resume`" if end is None else _minute_text(int(end) * NANOSECONDS)
+        yield State("ok", "pause", f"nobody is listened to until {until}")
     problem = _write_problem(folder)
     if problem:
         text = (
@@ -193,7 +192,7 @@ def _folder(folder: Path) -> Iterator[State]:
         yield State("warning", "rights", text)
 
 
-def _moment(stamp: int) -> str:
+def _minute_text(stamp: int) -> str:
     return f"{millisecond_text(stamp)[:16].replace('T', ' ')} UTC"
 
 

@@ -219,6 +219,8 @@ INGRESS = "127.0.0.9"
 class FakeContent:
     """Content that notes what is changed."""
 
+    actions = HomePage.actions
+
     def __init__(self):
         self.acts = []
 

@@ -35,8 +35,8 @@ from hearthlog.recorder.sources.audio_files import FileSource
 from hearthlog.recorder.sources.capture import _some_channels
 from hearthlog.recorder.stream.directions import (
     ArrayDirections,
+    BlockDirections,
     ChannelWatch,
-    DirectionFinder,
     array_geometry,
 )
 from hearthlog.schemas.errors import ConfigurationError, LogError, SourceError
@@ -49,7 +49,7 @@ PAIR = [[0.0, 0.05], [0.0, -0.05]]  # left, right
 
 
 def finder(places):
-    return DirectionFinder(array_geometry(places))
+    return BlockDirections(array_geometry(places))
 
 
 def degrees_between(azimuths, azimuth):

@@ -11,7 +11,7 @@ from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Count, Duration, rounded
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import intersection, joined, single_span
-from hearthlog.analyzer.report.report_data import television_spans
+from hearthlog.analyzer.report.report_data import day_television
 from hearthlog.analyzer.report.wording import (
     clock_text,
     edge_of_week,
@@ -190,7 +190,7 @@ def _labelled(day: DayMetrics) -> str:
         length = day.spans_of(name).length
         if length >= _NAMED:
             lengths.append((-length, in_words(name).lower()))
-    television = ["something like a television"] * bool(television_spans(day).length)
+    television = ["something like a television"] * bool(day_television(day).length)
     if lengths or television:
         return listed([*(words for _, words in sorted(lengths)[:_NAMES]), *television], "and")
     sound = intersection(day.home.sound, day.span).length

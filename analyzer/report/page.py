@@ -22,7 +22,7 @@ from hearthlog.analyzer.report.report_data import (
     sections,
 )
 from hearthlog.analyzer.report.summary_text import (
-    longest_quiet,
+    longest_quiet_text,
     not_recorded,
     percent,
     plain,
@@ -344,7 +344,7 @@ def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
     elif section.title == "Night":
         yield _coughing(day)
     else:
-        yield longest_quiet(day)
+        yield longest_quiet_text(day)
 
 
 def _coughing(day: DayMetrics) -> str:

@@ -65,7 +65,7 @@ class FigureSection(NamedTuple):
     note: str
 
 
-def television_spans(day: DayMetrics, pause: int = 0) -> Spans:
+def day_television(day: DayMetrics, pause: int = 0) -> Spans:
     """Return when something like a television sounded, with short pauses closed."""
     starts = day.home.minutes.starts[day.home.minutes.television]
     return intersection(joined(starts, starts + MINUTE, pause), day.span)

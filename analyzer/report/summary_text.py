@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import difference, joined, lengths
 from hearthlog.analyzer.report.headline import amount, states_missing_time, unlogged
-from hearthlog.analyzer.report.report_data import ReportData, television_spans
+from hearthlog.analyzer.report.report_data import ReportData, day_television
 from hearthlog.analyzer.report.wording import (
     WEEK,
     clock_text,
@@ -154,7 +154,7 @@ def recorder_problems(data: ReportData) -> Iterator[str]:
         yield f"{plain(name)}: {_when(data, same)}."
 
 
-def longest_quiet(day: DayMetrics) -> str:
+def longest_quiet_text(day: DayMetrics) -> str:
     """Return when the longest quiet stretch of the day was; empty if under a minute."""
     quiet = day.longest_quiet
     if day.quiet is None or day.quiet.minutes < 1:
@@ -193,13 +193,13 @@ def _loudest(day: DayMetrics) -> str:
     ]
     sounds = listed(most[:3], "and")
     quiet = "It was quiet." if day.share >= MOST else ""
-    television = ", a television aside" if television_spans(day).length else ""
+    television = ", a television aside" if day_television(day).length else ""
     return f"Most of the sound{television}: {sounds}." if most else quiet * (not television)
 
 
 def _television(day: DayMetrics) -> str:
     """Return when something like a television sounded."""
-    spans = television_spans(day, _PAUSE)
+    spans = day_television(day, _PAUSE)
     if not len(spans.starts):
         return ""
     longest = np.sort(np.argsort(spans.starts - spans.ends, kind="stable")[:_TIMES])

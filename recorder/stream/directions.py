@@ -139,8 +139,8 @@ _ECHO_HOPS = 8  # hops remembered by the echo estimate
 _ECHO_DECAY = 0.8  # power ratio per hop: 60 dB in 0.8 s
 _ECHO_SHARE = 0.5  # share of the decayed power that counts as echo
 _LEAST_WEIGHT = 0.03  # mean over a block
-_LEAST_CONFIDENCE = 0.1  # below this, half of the directions are wrong
-_STEPS = 512  # rounding steps per radian, and per 1 of confidence: noise does not compress
+_LEAST_CONFIDENCE = 0.1  # of a block: below it, half of the directions were wrong
+_STEPS = 512  # rounding steps per radian, and per 1 of confidence: digits below are noise
 _TINY = np.float32(1e-20)
 
 _FREQUENCIES = np.fft.rfftfreq(_WINDOW, 1 / SAMPLE_RATE)
@@ -164,10 +164,10 @@ class Located(NamedTuple):
     confidences: Float32
 
 
-_NOWHERE = Located(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
+_NO_BLOCKS = Located(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
 
 
-class DirectionFinder:
+class BlockDirections:
     """Finds the direction of each block of one stream of frames.
 
     Each band and time step is weighted by its share that is neither noise floor nor echo: an echo
@@ -198,14 +198,14 @@ class DirectionFinder:
         if self._held is None:
             begin = -first % BLOCK_FRAMES
             if begin >= len(frames):
-                return _NOWHERE
+                return _NO_BLOCKS
             self._held = frames[:0]
         begun = begin - len(self._held)
         frames = np.concatenate([self._held, frames[begin:]])
         blocks = len(frames) // BLOCK_FRAMES
         self._held = frames[blocks * BLOCK_FRAMES :].copy()
         if not blocks:
-            return _NOWHERE
+            return _NO_BLOCKS
         steered = self._steered(frames[: blocks * BLOCK_FRAMES], first + begun)
         azimuths, confidences = self._peaks(steered)
         sure = np.flatnonzero(confidences >= _LEAST_CONFIDENCE)
@@ -323,7 +323,7 @@ class ArrayDirections:
     """Finds the directions of an array's sound, and checks its channels."""
 
     def __init__(self, geometry: ArrayGeometry) -> None:
-        self._finder = DirectionFinder(geometry)
+        self._finder = BlockDirections(geometry)
         self._watch = ChannelWatch(len(geometry.positions))
         self.restart()
 

@@ -23,7 +23,7 @@ from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
-from hearthlog.recorder.stream.directions import DirectionFinder, array_geometry
+from hearthlog.recorder.stream.directions import BlockDirections, array_geometry
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED
@@ -135,7 +135,7 @@ def _located(
     geometry = array_geometry(places.tolist())
     frames = len(samples) // FRAME_SAMPLES
     shaped = samples[: frames * FRAME_SAMPLES].reshape(frames, FRAME_SAMPLES, -1)
-    blocks, azimuths, confidences = DirectionFinder(geometry)(shaped, 0)
+    blocks, azimuths, confidences = BlockDirections(geometry)(shaped, 0)
     middles = (blocks + BLOCK_FRAMES / 2) * FRAME_SECONDS
     located, in_sound = [], np.zeros(len(blocks), bool)
     for start, end, azimuth in truth:
@@ -161,7 +161,7 @@ def _print_cost(samples: Float32) -> None:
     for name, places in ARRAYS.items():
         count = len(places)
         frames = np.resize(samples, (1200, FRAME_SAMPLES, count)).astype(np.float32)
-        finder = DirectionFinder(array_geometry(places.tolist()))
+        finder = BlockDirections(array_geometry(places.tolist()))
         begin = time.process_time()
         for first in range(0, len(frames), _PUSHED):
             finder(frames[first : first + _PUSHED], first)

@@ -3,7 +3,7 @@
 import json
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import date, timedelta, tzinfo
 from ipaddress import IPv4Address, IPv6Address, ip_address
@@ -87,6 +87,14 @@ class HomePage:
 
     Raise `BridgeError` if the token cannot be read or created, or the port cannot be opened.
     """
+
+    actions: Mapping[str, str] = {
+        "/mark": "event",
+        "/mark-one": "event",
+        "/group": "group",
+        "/show": "show",
+        "/pause": "pause",
+    }
 
     def __init__(
         self, settings: PageSettings, home: RecorderAddress, state: Path, report: Report

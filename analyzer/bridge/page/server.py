@@ -207,14 +207,6 @@ _FILES = {
 _QUERIES = {"/days", "/day", "/kept"}  # answered as JSON
 _TEXT = re.compile(r"\{\{(page\.[a-z ]+)\}\}")  # in page.html
 _GROUND = "#f4f6f8"  # as in page.css
-# JSON field beside the label: a subject, whether the class is shown, or for how long to pause.
-_SUBJECTS = {
-    "/mark": "event",
-    "/mark-one": "event",
-    "/group": "group",
-    "/show": "show",
-    "/pause": "pause",
-}
 _JSON = "application/json"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self'; "
@@ -237,6 +229,8 @@ _ENTRANCE = (
 
 class PageContent(Protocol):
     """Content and actions of the page; called from many threads."""
+
+    actions: Mapping[str, str]  # by path of a POST request, the JSON field of its subject
 
     def words(self, accepted: str) -> Translation:
         """Return the words for an `Accept-Language`."""
@@ -387,13 +381,14 @@ class _Handler(HttpHandler):
         self.send(code, body, kind)
 
     def do_POST(self) -> None:
-        """Accept a label for an event or a group, whether a class is shown, or a pause."""
+        """Carry out an action of the page."""
         if not self._is_admitted(changes=True):
             return
-        if self._path not in _SUBJECTS:
+        subject = self._server.content.actions.get(self._path)
+        if subject is None:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
-        mark = self._label(_SUBJECTS[self._path])
+        mark = self._label(subject)
         if isinstance(mark, HTTPStatus):
             self.send_error(mark)
             return
