@@ -665,6 +665,19 @@ def test_a_microphone_that_is_away_is_not_said_to_listen(output, why):
     assert health["level"] == (0 if why else 2), "a pause needs no look"
 
 
+@pytest.mark.parametrize(
+    ("minutes", "words"), [(60, "Something like a television"), (2, "Telephone ringing")]
+)
+def test_a_ring_of_a_television_is_not_called_a_telephone_that_rings_now(tmp_path, minutes, words):
+    with serving(tmp_path) as home:
+        for ago in range(minutes, 0, -1):
+            home.log.write_segment("speech", ago, 3)
+        home.log.hears("phone_ring")
+        with home.stream() as part:
+            heard = part("now", lambda now: now["rooms"] and now["rooms"][0]["words"] != "Quiet")
+    assert heard["rooms"][0]["words"] == words
+
+
 def test_times_and_lengths_are_said_in_words():
     now = at(UTC, 2026, 5, 5, 12)
     hour = 3600 * NANOSECONDS

@@ -159,8 +159,19 @@ def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path):
     page = page_of(tmp_path / "logs", tmp_path)
     text = re.sub(r"\s+", " ", re.sub("<[^>]*>", " ", page))
     assert "Perhaps 1 bout of coughing in the night (01:30); 2 by day, perhaps 2 more." in text
-    assert re.search(r"Coughing 2 \(\+3\?\) .*Telephone ringing 1 \(\+1\?\) 15:00, 16:00", text)
+    assert re.search(r"Coughing 2 \(\+3\?\) .*Telephone ringing 1 \(\+1\?\) 15:00, 16:00\?", text)
     assert "A question mark, as in 3? or in 4 (+3?), is at those that the model is not" in text
+
+
+def test_of_several_times_those_that_are_not_sure_have_a_question_mark(tmp_path):
+    nights = [(at("23:30"), 3, "coughing", 0.9), (at("23:50"), 3, "coughing", 0.6)]
+    write_day(tmp_path / "logs", DAY - timedelta(days=1), nights)
+    write_day(tmp_path / "logs", DAY, [])
+    text = text_of(page_of(tmp_path / "logs", tmp_path))
+    assert (
+        "1 bout of coughing in the night, perhaps 1 more (Saturday 23:30, Saturday 23:50?)." in text
+    )
+    assert "Coughing in the night at Saturday 23:30, Saturday 23:50?." in text
 
 
 def test_a_count_is_said_as_labelled_or_with_the_range_that_checked_minutes_give():
@@ -1149,6 +1160,13 @@ def test_a_loud_or_worrying_sound_that_the_model_is_unsure_of_needs_a_look(tmp_p
     write_day(tmp_path, DAY, doubts=[(at(time), *sound) for time in ("14:02", "15:05")])
     lines = needing_look_in(page_of(tmp_path, tmp_path))
     assert lines == ([] if line is None else [line])
+
+
+def test_what_would_be_part_of_a_cough_that_is_counted_needs_no_look_of_its_own(tmp_path):
+    coughs = [(at("14:02:08"), 2.0, "coughing", 0.9)]
+    write_day(tmp_path, DAY, coughs, doubts=[(at(time), *COUGH) for time in ("14:02", "15:05")])
+    lines = needing_look_in(page_of(tmp_path, tmp_path))
+    assert lines == ["Needs a look, 15:05: the model is not sure; it might be coughing."]
 
 
 def test_doubtful_sounds_of_one_time_are_one_and_only_the_loudest_five_times_need_a_look(tmp_path):

@@ -49,8 +49,14 @@ class DoubtfulSound(NamedTuple):
         """Whether it was much louder than household sounds are."""
         return self.level_db >= _LOUD_DB
 
-    def needs_review(self, hidden: Collection[str] = ()) -> bool:
-        """Whether a person should review it: it was loud, or is likely coughing or crying."""
+    def needs_review(self, hidden: Collection[str] = (), near: Collection[str] = ()) -> bool:
+        """Whether a person should review it: it was loud, or is likely coughing or crying.
+
+        A sound that is not loud needs no review if all it may be sounded just before or after it
+        (`near`): were it of that class, both would be one event.
+        """
+        if not self.is_loud and {*near}.issuperset(perhaps([self], hidden)):
+            return False
         likely = (
             share >= _LIKELY for name, share in self.probabilities.items() if name not in hidden
         )

@@ -53,11 +53,11 @@ from hearthlog.models.classes import (
     SHOWER,
     SILENCE,
     UNKNOWN,
+    WORRYING,
     colour_on_paper,
     in_words,
     ordered,
 )
-from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.errors import listed
 
 
@@ -106,6 +106,7 @@ _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
 _HOME, _MICROPHONE = "home", "mic"  # names that nobody gave
 _FEW = 5  # events of which every time is written
+_FEW_WORRYING = 9
 _BESIDE = "beside a television"
 _SPACE = "\N{NO-BREAK SPACE}"
 
@@ -256,7 +257,7 @@ def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
         elif _occurs(data, name) and (value is not None or uncounted):
             cells = [
                 _with_apart(_cell(data, figure, day), _apart(figure, [day])),
-                Cell(_times(day, day.counted_events(name, day.span))),
+                Cell(_times(day, name)),
                 _with_apart(_cell(data, lasting, day), _apart(lasting, [day])),
             ]
         else:
@@ -278,10 +279,11 @@ def _apart(figure: ReportFigure, days: Sequence[DayMetrics]) -> str:
     return f"{amount} {_BESIDE}" if number or minutes >= 1 else ""
 
 
-def _times(day: DayMetrics, starts: Int64) -> str:
-    """Return the times of a few events, else the first and the last."""
-    if len(starts) <= _FEW:
-        return times_in_words(starts, day.zone)
+def _times(day: DayMetrics, name: str) -> str:
+    """Return the times of a few events of a class, else the first and the last."""
+    starts = day.counted_events(name, day.span)
+    if len(starts) <= (_FEW_WORRYING if name in WORRYING else _FEW):
+        return times_in_words(starts, day.zone, unsure=day.home.unsure.get(name))
     return "\N{NO-BREAK SPACE}to ".join(
         clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max())
     )
@@ -353,7 +355,8 @@ def _coughing(day: DayMetrics) -> str:
     if not len(starts):
         return ""
     if len(starts) <= _FEW:
-        times = times_in_words(starts, day.zone, first=day.day)
+        unsure = day.home.unsure.get(COUGHING)
+        times = times_in_words(starts, day.zone, first=day.day, unsure=unsure)
         return f"Coughing in the night at {times}."
     hours = [clock_text(time, day.zone)[:2] for time in np.sort(starts).tolist()]
     each = [f"{hours.count(hour)} after {hour}:00" for hour in dict.fromkeys(hours)]

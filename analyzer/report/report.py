@@ -33,14 +33,15 @@ from hearthlog.analyzer.activity.home_data import (
 )
 from hearthlog.analyzer.activity.values import BASELINE_DAYS
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, check_day, network_changes
+from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import Spans, intersection, joined, rows_at
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, intersection, joined, rows_at
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import ReportData
-from hearthlog.models.classes import APART_IN_REPORT
+from hearthlog.models.classes import APART_IN_REPORT, WORRYING, class_name
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.files import RELABEL_LAYER
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
@@ -185,8 +186,19 @@ def _doubts(
         own &= ~np.isin(events.labels, [*home.hidden])
         entries = [(e.path, e.start, e.end) for e in (*close, *layer) if e.node == node]
         topics = labelling_topic(microphone, name, "label"), f"/{microphone}/features"
-        found += read_doubtful_sounds(entries, topics, events.rows(own))
-    return [sound for sound in found if sound.needs_review(home.hidden)]
+        found += [
+            sound
+            for sound in read_doubtful_sounds(entries, topics, events.rows(own))
+            if sound.needs_review(home.hidden, _near(labels, sound))
+        ]
+    return found
+
+
+def _near(labels: Labelling, sound: DoubtfulSound) -> set[str]:
+    """Return which worrying classes sound so close to a sound that both would be one event."""
+    near = labels.starts <= sound.end + EVENT_PAUSE
+    near &= labels.ends >= sound.start - EVENT_PAUSE
+    return {name for label in {*labels.labels[near]} if (name := class_name(label)) in WORRYING}
 
 
 def _scenarios(

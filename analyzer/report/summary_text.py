@@ -24,6 +24,7 @@ from hearthlog.analyzer.report.wording import (
 from hearthlog.models.classes import (
     COUGHING,
     FLUSHING_WATER,
+    SHOWER,
     SILENCE,
     UNKNOWN,
     class_name,
@@ -222,7 +223,8 @@ def _still(day: DayMetrics) -> str:
     times = listed([time for time in (first, last) if time], "and")
     partly = day.span.length - day.coverage.length >= _MINUTE
     recorded = ", as far as it was recorded" * partly
-    steady = "steady sound, such as a fan's, counts as quiet"
+    water = "" if SHOWER in day.home.classes else " or a shower's"
+    steady = f"steady sound, such as a fan's{water}, counts as quiet"
     start, end = int(day.span.starts[0]), int(day.span.ends[0])
     edges = np.array([start, day.active[0], day.active[-1] + 10 * _MINUTE, end])
     short, _, late = lengths(day.home.sound, edges).tolist()

@@ -91,12 +91,23 @@ def edge_of_week(nanoseconds: int, zone: tzinfo, *, is_end: bool) -> str:
     return short_day(day) if clock == "00:00" else f"{short_day(day)} {clock}"
 
 
-def times_in_words(starts: Int64, zone: tzinfo, most: int = 16, first: date | None = None) -> str:
+def times_in_words(
+    starts: Int64,
+    zone: tzinfo,
+    most: int = 16,
+    first: date | None = None,
+    unsure: Int64 | None = None,
+) -> str:
     """List times of day (nanoseconds of UTC, any order), `most` of them, and how many more.
 
-    Those of days before the `first` have their weekday: `Sunday 23:28`.
+    Those of days before the `first` have their weekday: `Sunday 23:28`. Those that are `unsure`
+    have a question mark, if others are not.
     """
-    shown = Counter(clock_with_day(start, zone, first) for start in np.sort(starts)[:most].tolist())
+    doubted = set() if unsure is None or np.isin(starts, unsure).all() else {*unsure.tolist()}
+    shown = Counter(
+        clock_with_day(start, zone, first) + "?" * (start in doubted)
+        for start in np.sort(starts)[:most].tolist()
+    )
     more = len(starts) - shown.total()
     texts = [text if n == 1 else f"{text} {_often(n)}" for text, n in shown.items()]
     return ", ".join(texts) + (f" and {more} more" if more else "")

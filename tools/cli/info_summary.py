@@ -215,7 +215,7 @@ def day_lines(day: date, totals: Mapping[str, EventTotal]) -> Iterator[str]:
         apart += [f"{word} {television}"] * bool(television)
     note = "; of those with ? the model is not sure" * any(one.unsure for one in totals.values())
     counts = listed(parts, "and")
-    yield f"Labelled on {day:%A, %Y-%m-%d}, counted as in the report: {counts}{note}"
+    yield f"Labelled on {day:%A, %Y-%m-%d}: {counts}{note}"
     if apart:
         yield f"and beside a television, not counted: {listed(apart, 'and')}"
 

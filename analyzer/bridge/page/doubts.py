@@ -11,7 +11,6 @@ from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.doubtful_sounds import (
     DoubtfulSound,
     has_no_majority,
-    perhaps,
     read_doubtful_sounds,
 )
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
@@ -71,29 +70,20 @@ def events_to_review(
     every: Iterable[SoundEvent],
     hidden: Collection[str] = (),
 ) -> Doubts:
-    """Return the doubts on some events that need a review of their own.
-
-    A sound that is not loud needs none if all it may be sounded just before or after it: were it
-    of that class, both would be one event.
-    """
+    """Return the doubts on some events that need a review of their own."""
     worrying = [event for event in every if class_name(event.label) in WORRYING]
 
-    def is_part(event: SoundEvent, doubt: DoubtfulSound) -> bool:
-        near = {
+    def near(event: SoundEvent) -> set[str]:
+        return {
             class_name(each.label)
             for each in worrying
             if each.microphone == event.microphone
             and each.start <= event.end + EVENT_PAUSE
             and event.start <= each.end + EVENT_PAUSE
         }
-        return not doubt.is_loud and near.issuperset(perhaps([doubt], hidden))
 
     own = ((event, doubts[event.id]) for event in events if event.id in doubts)
-    return {
-        event.id: doubt
-        for event, doubt in own
-        if doubt.needs_review(hidden) and not is_part(event, doubt)
-    }
+    return {event.id: doubt for event, doubt in own if doubt.needs_review(hidden, near(event))}
 
 
 class CurrentDoubts:

@@ -4,12 +4,12 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from hearthlog.analyzer.activity import ANY_SOUND, HOLD_SECONDS
+from hearthlog.analyzer.activity import ANY_SOUND, HOLD_SECONDS, SoundEvent
 from hearthlog.analyzer.activity.segments import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.wording import ENGLISH, Translation, one_line, reason, room
-from hearthlog.models.classes import SILENCE, ordered
+from hearthlog.models.classes import ON_TELEVISION, SILENCE, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
 
@@ -45,6 +45,8 @@ class RoomStatus:
         last = self._last.get(microphone.name)
         if last is None or last.words != sound:
             since = _active_since(microphone) or (update.today.now if last is not None else 0)
+            if _beside_television(microphone):
+                since = 0  # of which of its sounds is of no interest
             last = self._last[microphone.name] = _Current(sound, since)
         since_words = words.when(last.since, update.today.now, update.zone) if last.since else ""
         health = update.state.health.get(microphone.name)
@@ -71,7 +73,9 @@ class RoomStatus:
 def _sounds_in_words(microphone: LiveMicrophone, words: Translation) -> str:
     if not microphone.is_listening():
         return words.text("now.not listening")
-    names = [words.class_words(label) for label in active_classes(microphone)]
+    active, beside = active_classes(microphone), _beside_television(microphone)
+    names = [words.class_words(label) for label in active if label not in beside]
+    names += [words.text("now.television")] * bool(beside)
     if names:
         return words.listed([names[0], *map(words.inside, names[1:])])
     is_sound_now = microphone.active.is_active(ANY_SOUND)
@@ -85,6 +89,14 @@ def active_classes(microphone: LiveMicrophone) -> list[str]:
         for label in ordered(microphone.classes)
         if is_sound(label) and microphone.active.is_active(label)
     ]
+
+
+def _beside_television(microphone: LiveMicrophone) -> set[str]:
+    """Return the active classes that do not count, as something like a television is on."""
+    active = {*active_classes(microphone)} & {*ON_TELEVISION}
+    time = microphone.active.time
+    now = [SoundEvent(microphone.name, label, time, time, 0.0, 0.0) for label in active]
+    return active - {event.label for event in microphone.without_television(now)}
 
 
 def _active_since(microphone: LiveMicrophone) -> int:
