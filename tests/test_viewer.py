@@ -275,6 +275,16 @@ def test_a_page_that_is_loaded_again_shows_what_it_showed_and_another_window_say
             assert page.evaluate("document.querySelector('button').disabled") is True
 
 
+def test_a_viewer_that_has_no_layout_yet_after_a_reload_is_aligned_later(short_sounds):
+    timeline = read_timeline([short_sounds], *day_span(DAY, UTC))
+    with hidden((768, 1024)) as viewer:
+        viewer.draw(timeline, close_up=False)
+        viewer.wait_until_drawn()
+        viewer._show_again()
+        assert viewer._align({}) is False
+        assert viewer._align(viewer._blueprint()) is True
+
+
 LOW = [(1366, 536), (1366, 650), (1000, 600)]  # a canvas below a row of buttons; of a phone
 
 

@@ -356,6 +356,9 @@ class Viewer(ABC):
         size, grid = self._size(), self._grid
         if size is None or grid is None or size == self._aligned:
             return False
+        rows = [_component(blueprint, path, _CONTAINER).get("row_shares") for path in self._names]
+        if not all(isinstance(one, list) for one in rows):
+            return False  # a viewer that opened anew has no layout yet
         self._aligned = size
         self._set_shares(blueprint, size)
         if _view(blueprint) == self._opening:  # else the user looks at another span
