@@ -31,6 +31,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.layers import Coverage
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
 from hearthlog.analyzer.review.lanes import timeline_lanes
 from hearthlog.analyzer.review.marking import Marking
@@ -193,6 +194,13 @@ def test_what_the_model_doubts_is_paler_in_its_lane_unless_a_person_reviewed_it(
     assert lane() == [pale] * len(live.unsure)
     timeline.microphones["mic"].reviewed = labelled_spans([(start, end, "person")])
     assert lane() == [colour("speech")] + [pale] * (len(live.unsure) - 1)
+    speech = live.unsure
+    event = joined(*speech[:2], EVENT_PAUSE)  # the first one, as the report counts
+    of_first = speech.starts < event.ends[0]
+    assert of_first.sum() > 1
+    live.unsure = speech.where(speech.starts != speech.starts[of_first][-1])
+    shades = [colour("speech") if own else pale for own in of_first]
+    assert lane() == shades, "one of its segments is sure, so the event is"
 
 
 def test_a_span_across_logs_is_a_mark_in_each_of_them(home):

@@ -20,7 +20,7 @@ from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, microphone_states
 from hearthlog.analyzer.logs.selection import checked_array_names
 from hearthlog.analyzer.logs.sound_vectors import as_vectors, degrees_of
-from hearthlog.analyzer.logs.spans import joined, overlay, rows_at
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined, overlay, rows_at
 from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.timeline import (
     LabelledSpans,
@@ -213,11 +213,19 @@ def _lanes_of(microphone: MicrophoneTimeline, *, marking: bool) -> Iterator[Lane
     for one in labellings:
         for name, shade in words.items():
             spans = _of_class(one.spans, name)
-            unsure = np.isin(spans.starts, _not_reviewed(one.unsure, microphone.reviewed).starts)
+            unsure = _in_unsure_events(spans, np.isin(spans.starts, one.unsure.starts))
+            doubted = _not_reviewed(one.unsure, microphone.reviewed)
+            unsure &= np.isin(spans.starts, doubted.starts)
             texts = np.where(unsure, f"{name}, {NOT_SURE}", spans.texts)
             shades = {name: shade, f"{name}, {NOT_SURE}": unsure_colour(shade)}
             yield Lane(microphone.name, one.name, name, LabelledSpans(*spans[:2], texts), shades)
     yield from _shared_lanes(microphone, labellings, marking=marking)
+
+
+def _in_unsure_events(spans: LabelledSpans, unsure: Bool) -> Bool:
+    """Return which segments of a class are of events without a sure one, as the report has them."""
+    event = rows_at(joined(spans.starts, spans.ends, EVENT_PAUSE), spans.starts)
+    return unsure & (np.bincount(event, ~unsure)[event] == 0 if len(event) else unsure)
 
 
 def unsure_colour(shade: Colour) -> Colour:
