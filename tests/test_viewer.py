@@ -1,5 +1,6 @@
 """Pictures of a real day in Rerun: headless, in a window, and in a browser."""
 
+import json
 import os
 import shutil
 import socket
@@ -39,8 +40,8 @@ from hearthlog.analyzer.review.viewer.drawing import SHARED_AXIS
 from hearthlog.analyzer.review.viewer.process import ViewerProcess
 from hearthlog.analyzer.review.viewer.recording import save_timeline
 from hearthlog.analyzer.review.viewer.row_heights import TOP_BAR
-from hearthlog.analyzer.review.viewer.viewer import WindowViewer
-from hearthlog.analyzer.review.viewer.web import open_page
+from hearthlog.analyzer.review.viewer.viewer import ViewerSize, WindowViewer
+from hearthlog.analyzer.review.viewer.web import _BLUEPRINT, _SET_BLUEPRINT, _field, open_page
 from hearthlog.models.classes import GAP, colour, ordered
 from hearthlog.schemas.logs.files import find_logs
 
@@ -283,6 +284,62 @@ def test_a_viewer_that_has_no_layout_yet_after_a_reload_is_aligned_later(short_s
         viewer._show_again()
         assert viewer._align({}) is False
         assert viewer._align(viewer._blueprint()) is True
+
+
+NAMES, ROOT, AXES = "/container/names", "/container/root", f"/{SHARED_AXIS}"
+LAYOUT = {
+    "/viewport": {"ViewportBlueprint": {"root_container": "root"}},
+    ROOT: {"ContainerBlueprint": {"contents": ["container/hours", NAMES], "row_shares": [1, 9]}},
+    NAMES: {"ContainerBlueprint": {"row_shares": [1, 1, 0.5]}},
+}
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"[",
+        b"[" * 100_000,
+        b"3",
+        *({**LAYOUT, path: {}} for path in LAYOUT),
+        *({**LAYOUT, path: 3} for path in LAYOUT),
+        {**LAYOUT, "/time_panel": {"TimePanelBlueprint": None}},
+        {**LAYOUT, ROOT: {"ContainerBlueprint": {"contents": [3, None]}}},
+        *({**LAYOUT, NAMES: {"ContainerBlueprint": {"row_shares": one}}} for one in ([], 1)),
+        *({**LAYOUT, AXES: {"TimeAxis": {"view_range": one}}} for one in ([1], {"end": 1}, {})),
+        *(
+            {**LAYOUT, "/time_panel": {"TimePanelBlueprint": {"time_selection": one}}}
+            for one in ({"min": 0, "max": 1 << 70}, {"min": "0"}, 3)
+        ),
+    ],
+    ids=str,
+)
+def test_what_a_page_sends_never_ends_a_review(page_without_browser, sent):
+    viewer = page_without_browser
+    viewer._show_again()
+    for content in (sent, LAYOUT):
+        text = content if isinstance(content, bytes) else json.dumps(content).encode()
+        answer = _field(_BLUEPRINT, _field(2, text)) + _field(_SET_BLUEPRINT, b"")
+        viewer._relay.request = lambda _, answer=answer: answer
+        viewer._size_due = 0.0
+        with suppress(ConnectionError, TimeoutError):  # as a session does
+            viewer.refresh()
+    assert viewer._aligned is not None
+
+
+def test_an_answer_that_is_no_message_is_none(page_without_browser):
+    page_without_browser._relay.request = lambda _: b"\xff"
+    with pytest.raises(ConnectionError):
+        page_without_browser.state()
+
+
+@pytest.fixture(scope="module")
+def page_without_browser(short_sounds):
+    with open_page() as viewer:
+        viewer.draw(read_timeline([short_sounds], *day_span(DAY, UTC)), close_up=False)
+        viewer._relay.size, viewer._names = ViewerSize(768, 885), [NAMES]
+        viewer._latest = viewer._opening = {}
+        viewer._page = viewer._relay.page
+        yield viewer
 
 
 LOW = [(1366, 536), (1366, 650), (1000, 600)]  # a canvas below a row of buttons; of a phone

@@ -107,8 +107,8 @@ class FittedRows:
         return (self._lanes_height(fit) - TAB_BAR - AXIS_HEIGHT) / max(count, 1)
 
     def _set_rows(self, blueprint: Blueprint, fit: _Fit) -> None:
-        root = f"/container/{blueprint['/viewport']['ViewportBlueprint']['root_container']}"
-        top = _container(blueprint, root)
+        viewport = blueprint.get("/viewport", {}).get("ViewportBlueprint", {})
+        top = _container(blueprint, f"/container/{viewport.get('root_container')}")
         contents = _contents(top)
         if len(self._rows.stacks) == 1:  # the viewer joins its rows with those above
             _set_stack(blueprint, top, fit, self._rows, [*fit.fixed])
@@ -143,7 +143,8 @@ def _set_stack(
 def _contents(own: dict[str, Any]) -> list[str]:
     """Return the paths in a container; the viewer writes a single one without a list."""
     found = own.get("contents", [])
-    return found if isinstance(found, list) else [found]
+    paths = found if isinstance(found, list) else [found]
+    return [path for path in paths if isinstance(path, str)]
 
 
 def _container(blueprint: Blueprint, path: str) -> dict[str, Any]:

@@ -61,6 +61,7 @@ _WAIT_SECONDS = 60
 _FLUSH_SECONDS = 30.0
 _SIZE_SECONDS = 3.0
 _ROUNDING = 1_000_000  # nanoseconds
+_FARTHEST = 1 << 62  # nanoseconds: a time from a viewer, in an array with any offset
 
 
 class ViewerState(NamedTuple):
@@ -319,7 +320,7 @@ class Viewer(ABC):
         Raise `ConnectionError, TimeoutError` if the viewer does not answer.
         """
         cursor = self.state().cursor
-        return None if cursor is None else self._clock.utc(cursor)
+        return None if cursor is None or cursor > _FARTHEST else self._clock.utc(cursor)
 
     def _take_layout(self) -> None:
         """Remember the layout as it was opened."""
@@ -357,7 +358,7 @@ class Viewer(ABC):
         if size is None or grid is None or size == self._aligned:
             return False
         rows = [_component(blueprint, path, _CONTAINER).get("row_shares") for path in self._names]
-        if not all(isinstance(one, list) for one in rows):
+        if not all(isinstance(one, list) and one for one in rows):
             return False  # a viewer that opened anew has no layout yet
         self._aligned = size
         self._set_shares(blueprint, size)
@@ -441,10 +442,11 @@ def _range(start: int, end: int) -> Any:
 
 def _is_near(bounds: Any, span: tuple[int, int]) -> bool:
     """Return whether a range of the axes is a span; the viewer rounds some nanoseconds."""
-    edges = [bounds[edge].get("Absolute") for edge in ("start", "end")] if bounds else []
-    pairs = zip(edges, span, strict=False)
-    return bool(edges) and all(
-        isinstance(edge, int) and abs(edge - time) < _ROUNDING for edge, time in pairs
+    ends = [bounds.get(edge) for edge in ("start", "end")] if isinstance(bounds, Mapping) else []
+    edges = [edge.get("Absolute") for edge in ends if isinstance(edge, Mapping)]
+    return len(edges) == len(span) and all(
+        isinstance(edge, int) and abs(edge - time) < _ROUNDING
+        for edge, time in zip(edges, span, strict=True)
     )
 
 
@@ -466,9 +468,9 @@ def _span(selection: Any) -> tuple[int, int] | None:
     if not isinstance(selection, Mapping):
         return None
     start, end = selection.get("min"), selection.get("max")
-    if not isinstance(start, int) or not isinstance(end, int) or start >= end:
+    if not isinstance(start, int) or not isinstance(end, int):
         return None
-    return start, end
+    return (start, end) if -_FARTHEST < start < end < _FARTHEST else None
 
 
 _LIGHT = 140  # of 255: brightness of the time cursor

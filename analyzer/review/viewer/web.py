@@ -6,7 +6,7 @@ import urllib.request
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from importlib.resources import files
@@ -104,6 +104,15 @@ def _message(content: bytes, field: int) -> bytes:
 
 def _text(content: bytes, field: int) -> str:
     return _message(content, field).decode(errors="replace")
+
+
+@contextmanager
+def _decoding() -> Iterator[None]:
+    """Raise `ConnectionError` if the answer of a page cannot be decoded."""
+    try:
+        yield
+    except (ValueError, RecursionError):
+        raise ConnectionError("the answer of the page cannot be decoded") from None
 
 
 _POLL_SECONDS = 20.0
@@ -348,6 +357,7 @@ class _PageViewer(Viewer):
         self._server = server
         server.start()
 
+    @_decoding()
     def state(self) -> ViewerState:
         state = self._request(_STATE)
         views, active = _messages(state, 5), _text(state, 2)
@@ -388,9 +398,10 @@ class _PageViewer(Viewer):
     def _size(self) -> ViewerSize | None:
         return self._relay.size
 
+    @_decoding()
     def _blueprint(self) -> Blueprint:
         blueprint: Any = json.loads(_text(self._request(_BLUEPRINT), 2))
-        return blueprint if isinstance(blueprint, dict) else {}
+        return {path: _dicts(entity) for path, entity in _dicts(blueprint).items()}
 
     def _set_blueprint(self, blueprint: Blueprint) -> None:
         text = json.dumps(blueprint).encode()
@@ -402,9 +413,16 @@ class _PageViewer(Viewer):
         state = _field(5, _PLAYING if play else _PAUSED)
         self._request(_SET_TIME, timeline + time + state)
 
+    @_decoding()
     def _request(self, operation: int, request: bytes = b"") -> bytes:
         """Let the viewer in the page do an operation; return its answer."""
         return _message(self._relay.request(_field(operation, request)), operation)
+
+
+def _dicts(found: Any) -> dict[str, Any]:
+    """Return the entries of a part of a blueprint that are dicts."""
+    entries = found.items() if isinstance(found, dict) else ()
+    return {name: entry for name, entry in entries if isinstance(entry, dict)}
 
 
 def open_page(port: int | None = None, data: str | None = None) -> Viewer:
