@@ -267,6 +267,7 @@ def test_a_page_that_is_loaded_again_shows_what_it_showed_and_another_window_say
         page.open(viewer.address)
         drawn(page)
         assert page.text() == "drag a span"
+        assert page.evaluate("before.textContent") == "", "not that it loads"
         viewer.show(start, start + HOUR, HOUR)
         with browsing(viewer.address, tmp_path / "other", "1366,1000") as other:
             patiently(other.text, lambda text: text == "drag a span")
@@ -342,7 +343,7 @@ def page_without_browser(short_sounds):
         yield viewer
 
 
-LOW = [(1366, 536), (1366, 650), (1000, 600)]  # a canvas below a row of buttons; of a phone
+LOW = [(1366, 500), (1366, 536), (1366, 650), (1000, 600)]  # a canvas above buttons; of a phone
 
 
 @pytest.mark.parametrize("size", LOW)
