@@ -278,7 +278,9 @@ def test_the_kept_sound_is_played(kept, pulse_microphone):
             check=False,
         )
         assert result.returncode == 0, result.stderr
-        assert re.fullmatch(r"hearthlog: playing 0\d:00:0\d Coughing\n", result.stderr)
+        own = [line for line in result.stderr.splitlines() if not line.startswith("ALSA lib")]
+        assert len(own) == 1, "ALSA complains on a busy machine"
+        assert re.fullmatch(r"hearthlog: playing 0\d:00:0\d Coughing", own[0])
         wait_for(lambda: np.abs(samples()).max(initial=0) > 1000)
 
 
