@@ -8,6 +8,8 @@ from homelife import at, midnight, write_day
 from servedhome import PALE_TEXTS, Phone
 from viewers import browsing
 
+pytest.importorskip("hearthlog.tools.lab.pictures", reason="the wheel leaves the lab out")
+
 from hearthlog.analyzer.bridge.wording import translation_for
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.lab.pictures.pages import served_page
