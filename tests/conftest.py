@@ -244,3 +244,13 @@ def clip_library():
 def living_room():
     """A living room as its microphone hears it."""
     return Rooms("living_room", seed=1)
+
+
+@pytest.fixture(scope="module")
+def phone(tmp_path_factory):
+    """A browser that is shown the page of a home."""
+    from servedhome import Phone  # noqa: PLC0415  only with a page
+    from viewers import browsing  # noqa: PLC0415  likewise
+
+    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
+        yield Phone(browser)

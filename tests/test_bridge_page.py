@@ -16,8 +16,8 @@ import pytest
 from homelife import GENERAL
 from livehome import LiveHome
 from pydantic import ValidationError
-from servedhome import JSON, PALE_TEXTS, Phone, pages, proxying, serving
-from viewers import address_of, browsing, patiently
+from servedhome import JSON, PALE_TEXTS, pages, proxying, serving
+from viewers import address_of, patiently
 
 from hearthlog.analyzer import http
 from hearthlog.analyzer.activity import SoundEvent
@@ -784,12 +784,6 @@ def test_a_mark_made_elsewhere_is_shown_as_that(tmp_path):
 
 
 # In a browser
-
-
-@pytest.fixture(scope="module")
-def phone(tmp_path_factory):
-    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
-        yield Phone(browser)
 
 
 @pytest.fixture(scope="module")

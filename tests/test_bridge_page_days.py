@@ -15,8 +15,8 @@ import pytest
 from homelife import GENERAL, at, write_day
 from livehome import LiveHome, midday_zone
 from pydantic import ValidationError
-from servedhome import JSON, PALE_TEXTS, Phone, proxying, serving
-from viewers import browsing, patiently
+from servedhome import JSON, PALE_TEXTS, proxying, serving
+from viewers import patiently
 
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import Sureness
@@ -865,12 +865,6 @@ def test_the_page_can_be_installed_and_is_small(lived):
         size += len(answer.read())
         connection.close()
     assert size < 200_000
-
-
-@pytest.fixture(scope="module")
-def phone(tmp_path_factory):
-    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
-        yield Phone(browser)
 
 
 def test_the_page_works_behind_the_ingress_of_home_assistant(phone, lived):

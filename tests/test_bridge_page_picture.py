@@ -5,8 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 from homelife import at, midnight, write_day
-from servedhome import PALE_TEXTS, Phone
-from viewers import browsing
+from servedhome import PALE_TEXTS
 
 pytest.importorskip("hearthlog.tools.lab.pictures", reason="the wheel leaves the lab out")
 
@@ -23,12 +22,6 @@ HEIGHTS = """
   return Math.round(lane.querySelector(kind).getBBox().height);
 })
 """
-
-
-@pytest.fixture(scope="module")
-def phone(tmp_path_factory):
-    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
-        yield Phone(browser)
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the be
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recurring import record_recurring
-from servedhome import PALE_TEXTS, Phone, serving
-from viewers import browsing, patiently
+from servedhome import PALE_TEXTS, serving
+from viewers import patiently
 
 from hearthlog.analyzer.bridge.corrections import REVIEWER
 from hearthlog.analyzer.bridge.page import recurring as group_naming
@@ -291,12 +291,6 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded") / "logs"
     record_recurring(folder, 1_772_352_000 * NANOSECONDS, seed=0, seconds=300)
     return folder
-
-
-@pytest.fixture(scope="module")
-def phone(tmp_path_factory):
-    with browsing("about:blank", tmp_path_factory.mktemp("browser")) as browser:
-        yield Phone(browser)
 
 
 def marks_of(folder):

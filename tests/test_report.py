@@ -1,5 +1,6 @@
 """The report for a carer: what its figures are, what the page says, what it refuses."""
 
+import html
 import re
 from datetime import date, timedelta
 from functools import partial
@@ -735,6 +736,16 @@ def test_the_first_sentence_of_a_headline_is_a_part_and_not_cut_at_a_full_stop(t
 def test_short_sounds_before_the_first_lively_minutes_are_not_denied(tmp_path, sounds, text):
     write_day(tmp_path / "logs", DAY, [*sounds, (at("08:00"), 300, "music", 0.9)])
     assert text in text_of(page_of(tmp_path / "logs", tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("classes", "steady"),
+    [(GENERAL, "a fan's or a shower's"), ([*GENERAL, "shower"], "a fan's")],
+)
+def test_a_shower_that_the_model_does_not_know_counts_as_quiet(tmp_path, classes, steady):
+    write_day(tmp_path / "logs", DAY, [(at("08:00"), 300, "music", 0.9)], classes=classes)
+    text = html.unescape(text_of(page_of(tmp_path / "logs", tmp_path)))
+    assert f"steady sound, such as {steady}, counts as quiet" in text
 
 
 def test_a_week_of_one_recorded_day_has_the_sentence_of_that_day(tmp_path):

@@ -332,6 +332,11 @@ class DayMetrics:
         """Return the event starts of a class, if any, on this day, in nanoseconds of UTC."""
         return self.home.events_in(name, self.span)
 
+    def unsure_events(self, name: str) -> Int64:
+        """Return the starts of the events that a count has apart: none where it has a range."""
+        unsure = NONE.starts if self.home.rates.get(name) else self.home.unsure.get(name)
+        return NONE.starts if unsure is None else unsure
+
     def counted_events(self, name: str, span: Spans) -> Int64:
         """Return the event starts of a class in a span that count, in nanoseconds of UTC."""
         return self.counting.counted(name, self.home.events_in(name, span))

@@ -265,19 +265,17 @@ def _sounds(day: DayMetrics) -> Iterator[str]:
         for span, when in times_of_day:
             starts = day.counted_events(name, span)
             if len(starts):
-                count = day.count_in(name, span)
-                unsure = day.home.unsure.get(name) if count.range is None else None
-                clocks = _when(day, starts, unsure)
+                count, clocks = day.count_in(name, span), _when(day, name, starts)
                 times = f" ({clocks})" if clocks else ""
                 parts.append(amount(name, count, when, named=not parts) + times)
         if parts:
             yield "; ".join(parts)
 
 
-def _when(day: DayMetrics, starts: Int64, unsure: Int64 | None) -> str:
+def _when(day: DayMetrics, name: str, starts: Int64) -> str:
     """Return the times of a few events; of more, how many were on the day before, if any."""
     if len(starts) <= _TIMES:
-        return times_in_words(starts, day.zone, first=day.day, unsure=unsure)
+        return times_in_words(starts, day.zone, first=day.day, unsure=day.unsure_events(name))
     number, before = int((starts < day.span.starts[0]).sum()), day.day - timedelta(days=1)
     which = f"{number} of them" if number < len(starts) else "all"
     return f"{which} on {weekday(before)}" if number else ""

@@ -283,7 +283,7 @@ def _times(day: DayMetrics, name: str) -> str:
     """Return the times of a few events of a class, else the first and the last."""
     starts = day.counted_events(name, day.span)
     if len(starts) <= (_FEW_WORRYING if name in WORRYING else _FEW):
-        return times_in_words(starts, day.zone, unsure=day.home.unsure.get(name))
+        return times_in_words(starts, day.zone, unsure=day.unsure_events(name))
     return "\N{NO-BREAK SPACE}to ".join(
         clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max())
     )
@@ -355,7 +355,7 @@ def _coughing(day: DayMetrics) -> str:
     if not len(starts):
         return ""
     if len(starts) <= _FEW:
-        unsure = day.home.unsure.get(COUGHING)
+        unsure = day.unsure_events(COUGHING)
         times = times_in_words(starts, day.zone, first=day.day, unsure=unsure)
         return f"Coughing in the night at {times}."
     hours = [clock_text(time, day.zone)[:2] for time in np.sort(starts).tolist()]

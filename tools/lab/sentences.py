@@ -59,7 +59,7 @@ from hearthlog.tools.cli.info_summary import Overview, day_lines
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.true_day import NEAR, TrueDay, TrueSound, read_sounds, true_day
 
-HOLDS, LABELLED, FALSE = "holds", "as labelled", "false"
+HOLDS, LABELLED, FALSE = "holds", "wrong as labelled", "false"
 REPORT, PAGE, INFO = "report", "page", "info"
 _TOLERANCE = 0.2
 _COMPANY = 15 * MINUTE  # a television is known by the ten minutes around
@@ -87,7 +87,7 @@ class Statement(NamedTuple):
     surface : str
         `report`, `page` or `info`.
     verdict : str
-        `HOLDS`, `LABELLED` (wrong, if it did not say that it is as labelled) or `FALSE`.
+        `HOLDS`, `LABELLED` (wrong, but it says that it is as labelled) or `FALSE`.
     is_range : bool
         Whether it is a count with a range.
     """
@@ -234,10 +234,9 @@ def report_statements(
     page = _Page(day_page(data))
     is_labelled = any("are as labelled" in text for _, text in page.paragraphs)
     for number, statement in enumerate(_statements_of(page, data.days[0], truth, before)):
-        if is_labelled and number and not statement.is_range and statement.verdict == FALSE:
-            yield statement._replace(verdict=LABELLED)
-        else:
-            yield statement
+        is_modest = is_labelled and number and not statement.is_range
+        is_wrong = is_modest and statement.verdict == FALSE
+        yield statement._replace(verdict=LABELLED) if is_wrong else statement
 
 
 def _statements_of(
@@ -690,9 +689,8 @@ def main(
     print()
     for surface in (REPORT, PAGE, INFO):
         of = [total[surface, verdict] for verdict in (HOLDS, LABELLED, FALSE)]
-        print(
-            f"{surface:7} {sum(of):4} statements: {of[0]} hold, {of[1]} as labelled, {of[2]} false"
-        )
+        verdicts = f"{of[0]} hold, {of[1]} wrong as labelled, {of[2]} false"
+        print(f"{surface:7} {sum(of):4} statements: {verdicts}")
     if ranges:
         print(f"counts with a range: {sum(ranges)} of {len(ranges)} hold")
 

@@ -45,8 +45,8 @@ class RoomStatus:
         last = self._last.get(microphone.name)
         if last is None or last.words != sound:
             since = _active_since(microphone) or (update.today.now if last is not None else 0)
-            if _beside_television(microphone):
-                since = 0  # of which of its sounds is of no interest
+            if _television_classes(microphone):
+                since = 0  # its last sound is not when it began
             last = self._last[microphone.name] = _Current(sound, since)
         since_words = words.when(last.since, update.today.now, update.zone) if last.since else ""
         health = update.state.health.get(microphone.name)
@@ -73,9 +73,9 @@ class RoomStatus:
 def _sounds_in_words(microphone: LiveMicrophone, words: Translation) -> str:
     if not microphone.is_listening():
         return words.text("now.not listening")
-    active, beside = active_classes(microphone), _beside_television(microphone)
-    names = [words.class_words(label) for label in active if label not in beside]
-    names += [words.text("now.television")] * bool(beside)
+    active, uncounted = active_classes(microphone), _television_classes(microphone)
+    names = [words.class_words(label) for label in active if label not in uncounted]
+    names += [words.text("now.television")] * bool(uncounted)
     if names:
         return words.listed([names[0], *map(words.inside, names[1:])])
     is_sound_now = microphone.active.is_active(ANY_SOUND)
@@ -91,7 +91,7 @@ def active_classes(microphone: LiveMicrophone) -> list[str]:
     ]
 
 
-def _beside_television(microphone: LiveMicrophone) -> set[str]:
+def _television_classes(microphone: LiveMicrophone) -> set[str]:
     """Return the active classes that do not count, as something like a television is on."""
     active = {*active_classes(microphone)} & {*ON_TELEVISION}
     time = microphone.active.time

@@ -28,9 +28,9 @@ class RowHeights(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """What is shown in a viewer of some height, and the heights of the rows."""
+    """Heights of the rows of a review in a viewer, in points."""
 
-    is_folded: bool  # the time panel
+    is_folded: bool  # whether the time panel is
     fixed: list[float]
     homes: float  # height of all microphones
     above: list[float]  # heights of the rows above the lanes of a stack
