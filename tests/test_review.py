@@ -194,6 +194,7 @@ def test_what_the_model_doubts_is_paler_in_its_lane_unless_a_person_reviewed_it(
     assert lane() == [pale] * len(live.unsure)
     timeline.microphones["mic"].reviewed = labelled_spans([(start, end, "person")])
     assert lane() == [colour("speech")] + [pale] * (len(live.unsure) - 1)
+    timeline.microphones["mic"].reviewed = labelled_spans([])
     speech = live.unsure
     event = joined(*speech[:2], EVENT_PAUSE)  # the first one, as the report counts
     of_first = speech.starts < event.ends[0]
