@@ -251,9 +251,17 @@ class Window:
             self.state()
 
     def drag(self, y, start, end):
-        """Drag the mouse from one x to another."""
+        """Drag the mouse from one x to another.
+
+        A button that is pressed in the frame of the move after it counts as pressed where that move
+        ends. A state may come out of a frame that began before the button; a picture does not.
+        """
         middle = (start + end) // 2
-        self.mouse(f"mousemove {start} {y}", "mousedown 1", f"mousemove {start + 12} {y}")
+        self.mouse(f"mousemove {start} {y}")
+        self.picture()
+        self.mouse("mousedown 1")
+        self.picture()
+        self.mouse(f"mousemove {start + 12} {y}")
         self.mouse(f"mousemove {middle} {y}", f"mousemove {end} {y}", "mouseup 1")
 
 
