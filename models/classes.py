@@ -42,25 +42,25 @@ class SoundClass(NamedTuple):
     aliases: tuple[str, ...] = ()
 
 
+# In the order of displays, the most important first; a home's own classes come before television.
 # Aliases are the names of AudioSet, and of FSD50K, which has "and" for their commas. The colours,
 # except those of `other` and `television`, were optimised together: any two differ by at least 19
 # (CIE 1976, in L*a*b*) in normal vision and in protanopia, deuteranopia and tritanopia (simulated
 # as by Machado et al., 2009), and by 3 in lightness, which remains on a grey print.
 # fmt: off
 CLASSES = (
-    SoundClass(SILENCE,          (112, 120, 130),   2.5, "Quiet"),
-    SoundClass(SPEECH,           (103, 166, 255),  10.0, "Talking"),
-    SoundClass(MUSIC,            (200, 129, 194),  20.0, "Music"),
-    SoundClass(PHONE_RING,       (246, 241,  66),  10.0, "Telephone ringing",
-               "Times the telephone rang", ("telephone_bell_ringing", "ringtone")),
     SoundClass(COUGHING,         (210,  94,   1),   1.0, "Coughing",
                "Bouts of coughing", ("cough",)),
     SoundClass(CRYING,           ( 11, 112, 196),  10.0, "Crying",
                "Times of crying", ("crying_sobbing", "crying_and_sobbing")),
     SoundClass(YELLING,          (232, 160,   0),  10.0, "Shouting",
                "Times of shouting", ("shout", "yell")),
+    SoundClass(PHONE_RING,       (246, 241,  66),  10.0, "Telephone ringing",
+               "Times the telephone rang", ("telephone_bell_ringing", "ringtone")),
+    SoundClass(SPEECH,           (103, 166, 255),  10.0, "Talking"),
     SoundClass(LAUGHING,         (  0, 158,  82),  10.0, "Laughing",
                "", ("laughter",)),
+    SoundClass(MUSIC,            (200, 129, 194),  20.0, "Music"),
     SoundClass(OBJECTS_ACTIVITY, (141,  76,  28),  10.0, "Household sounds"),
     SoundClass(FLUSHING_WATER,   (107,  72, 224),  10.0, "Toilet flush",
                "Toilet flushes", ("toilet_flush",)),
@@ -68,20 +68,18 @@ CLASSES = (
     SoundClass(TAP_WATER,        (169, 222, 251),  10.0, "Water tap",
                "Water taps", ("water_tap", "water_tap_faucet", "water_tap_and_faucet")),
     SoundClass(BATHROOM_OTHER,   ( 93,  83,  63),  10.0, "Bathroom other"),
-    SoundClass(OTHER_NEGATIVE,   (195, 202, 199),  10.0, "Other negative"),
     SoundClass(TELEVISION,       (164, 140, 134),  10.0, "Television",
                "", ("tv", "from_the_television")),
+    SoundClass(OTHER_NEGATIVE,   (195, 202, 199),  10.0, "Other negative"),
     SoundClass(OTHER,            (101, 111, 208),  10.0, "Other sounds"),
     SoundClass(UNKNOWN,          (255, 255, 255),  10.0, "Not sure"),
+    SoundClass(SILENCE,          (112, 120, 130),   2.5, "Quiet"),
 )
 # fmt: on
 
-# From what a person must hear of to what says least; other classes come before the last five.
-_FIRST = (
-    *(COUGHING, CRYING, YELLING, PHONE_RING, SPEECH, LAUGHING, MUSIC, OBJECTS_ACTIVITY),
-    *(FLUSHING_WATER, SHOWER, TAP_WATER, RUNNING_WATER, BATHROOM_OTHER),
-)
-_LAST = TELEVISION, OTHER_NEGATIVE, OTHER, UNKNOWN, SILENCE
+_RANKS: dict[str, float] = {row.name: number for number, row in enumerate(CLASSES)}
+_RANKS[RUNNING_WATER] = _RANKS[TAP_WATER] + 0.5
+_OWN_RANK = _RANKS[TELEVISION] - 0.5  # of a home's own classes
 
 _BY_NAME = {name: row for row in CLASSES for name in (row.name, *row.aliases)}
 
@@ -114,15 +112,7 @@ def ordered(labels: Iterable[str]) -> list[str]:
     """
     if isinstance(labels, (set, frozenset)):
         labels = sorted(labels)
-
-    def place(label: str) -> tuple[int, int]:
-        name = class_name(label)
-        for number, names in ((0, _FIRST), (2, _LAST)):
-            if name in names:
-                return number, names.index(name)
-        return 1, 0
-
-    return sorted(dict.fromkeys(labels), key=place)
+    return sorted(dict.fromkeys(labels), key=lambda label: _RANKS.get(class_name(label), _OWN_RANK))
 
 
 def meant_by(label: str, names: Collection[str]) -> list[str]:
