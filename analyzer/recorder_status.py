@@ -23,7 +23,7 @@ from hearthlog.schemas.frames import NANOSECONDS, millisecond_text
 from hearthlog.schemas.logs.columns import Columns, read_columns
 from hearthlog.schemas.logs.files import check_allowed, find_logs, is_active, is_layer, log_name
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.messages.message_types import GAP
+from hearthlog.schemas.messages.message_types import GAP, status_subject
 from hearthlog.schemas.messages.topics import DIAGNOSTICS
 
 Level = Literal["ok", "warning", "error"]
@@ -147,10 +147,11 @@ def _last_start(logs: Sequence[Path]) -> str:
 
 def _of_status(status: _Status) -> Iterator[State]:
     advice = ""
-    if "device" in status.values and _LEVELS[status.level] == "error":
+    level = _LEVELS[min(status.level, len(_LEVELS) - 1)]
+    if "device" in status.values and level == "error":
         joint = " " if status.text.endswith("?") else "; "
         advice = f"{joint}look at its cable and power; `hearthlog devices` lists what is there"
-    yield State(_LEVELS[status.level], status.subject, status.text + advice)
+    yield State(level, status.subject, status.text + advice)
     if status.values.get(_NOT_SET[0]) == _NOT_SET[1]:
         text = "is not synchronized: connect the machine to the network, or give it a clock module"
         yield State("warning", "clock", text)
@@ -170,10 +171,9 @@ def _last_statuses(logs: Sequence[Path], node: str) -> list[_Status]:
 def _statuses(columns: Columns, node: str) -> Iterator[_Status]:
     for stamp, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
         for status in statuses:
-            subject = status["name"].removeprefix("hearthlog: ").removeprefix(f"{node} ")
-            level = min(int(status["level"]), len(_LEVELS) - 1)
             values = {pair["key"]: pair["value"] for pair in status["values"]}
-            yield _Status(subject, stamp, level, status["message"], values)
+            subject = status_subject(status["name"], node)
+            yield _Status(subject, stamp, int(status["level"]), status["message"], values)
 
 
 def _folder(folder: Path) -> Iterator[State]:
@@ -309,24 +309,18 @@ def _gaps(columns: Columns) -> Iterator[dict[str, Any]]:
 def _health(columns: Columns, node: str) -> Iterator[dict[str, Any]]:
     """Yield the health of each subject whenever it changes."""
     before: dict[str, tuple[int, str]] = {}
-    for stamp, statuses in zip(columns.log_times.tolist(), columns["status"], strict=True):
-        for status in statuses:
-            subject = status["name"].removeprefix("hearthlog: ").removeprefix(f"{node} ")
-            state = int(status["level"]), status["message"]
-            if before.get(subject) == state:
-                continue
-            before[subject] = state
-            yield {
-                "time": stamp,
-                "subject": subject,
-                "level": state[0],
-                "text": state[1] if _is_shareable(subject) else "",
-                "values": _values(status),
-            }
-
-
-def _values(status: Mapping[str, Any]) -> dict[str, str]:
-    return {pair["key"]: pair["value"] for pair in status["values"] if pair["key"] in _VALUES}
+    for status in _statuses(columns, node):
+        state = status.level, status.text
+        if before.get(status.subject) == state:
+            continue
+        before[status.subject] = state
+        yield {
+            "time": status.time,
+            "subject": status.subject,
+            "level": status.level,
+            "text": status.text if _is_shareable(status.subject) else "",
+            "values": {key: value for key, value in status.values.items() if key in _VALUES},
+        }
 
 
 def _is_shareable(subject: str) -> bool:

@@ -72,9 +72,9 @@ PlainPath = Annotated[Path, BeforeValidator(_check_path)]
 
 
 def _geometry(places: list[list[float]]) -> "ArrayGeometry":
-    from hearthlog.recorder.stream.directions import array_geometry  # noqa: PLC0415  few have one
+    from hearthlog.recorder.stream.directions import geometry_of  # noqa: PLC0415  few have one
 
-    return array_geometry(places)
+    return geometry_of(places)
 
 
 def _checked_places(places: list[list[float]]) -> list[list[float]]:

@@ -37,7 +37,7 @@ from hearthlog.recorder.stream.directions import (
     ArrayDirections,
     BlockDirections,
     ChannelWatch,
-    array_geometry,
+    geometry_of,
 )
 from hearthlog.schemas.errors import ConfigurationError, LogError, SourceError
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SAMPLES, SAMPLE_RATE
@@ -49,7 +49,7 @@ PAIR = [[0.0, 0.05], [0.0, -0.05]]  # left, right
 
 
 def finder(places):
-    return BlockDirections(array_geometry(places))
+    return BlockDirections(geometry_of(places))
 
 
 def degrees_between(azimuths, azimuth):
@@ -165,7 +165,7 @@ def test_a_restart_forgets_what_was_heard():
 )
 def test_places_that_are_no_array_are_refused(places, why):
     with pytest.raises(ConfigurationError, match=why):
-        array_geometry(places)
+        geometry_of(places)
 
 
 def test_an_address_in_the_network_has_no_array():
@@ -198,7 +198,7 @@ def test_a_channel_without_sound_is_told_and_silence_is_not():
 
 
 def test_a_gap_and_frames_of_a_fallback_begin_blocks_anew():
-    frames, one = a_scene(), ArrayDirections(array_geometry(SQUARE))
+    frames, one = a_scene(), ArrayDirections(geometry_of(SQUARE))
     stamps = START + np.arange(len(frames)) * FRAME_NANOSECONDS
     expected = one(Frames(0, frames[:, :, 0], stamps, frames))
     one(Frames(0, frames[:7, :, 0], stamps[:7], frames[:7]))

@@ -427,6 +427,28 @@ def test_a_typical_change_touches_at_most_three_files_that_exist(what, paths):
         assert (ROOT / path).exists(), f"{what}: {path}"
 
 
+REPORTS = {"error", "warning", "rows", "report", "_report", "_error", "_check_array"}
+
+
+def doctor_rules():
+    """The rules of findings in the code: first arguments of what reports a finding."""
+    for path in sorted((ROOT / "analyzer/doctor").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and node.args:
+                name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+                rule = getattr(node.args[0], "value", None)
+                if name in REPORTS and isinstance(rule, str):
+                    yield rule
+
+
+def test_every_rule_of_the_doctor_has_a_row_in_its_page():
+    rows = re.findall(r"^\| (`[^|]*) \|", (ROOT / "docs/doctor.md").read_text(), re.MULTILINE)
+    documented = {rule for row in rows for rule in re.findall("`([a-z0-9-]+)`", row)}
+    rules = {*doctor_rules()}
+    assert len(rules) > 50
+    assert rules <= documented, rules - documented
+
+
 def rooms():
     """Yield package and line of each room in the table of the design."""
     package = ""

@@ -465,7 +465,7 @@ class HomeState:
 
     def _push_diagnostics(self, columns: Columns) -> None:
         for status in (each for same in columns["status"] for each in same):
-            subject = str(status["name"]).removeprefix("hearthlog: ")
+            subject = message_types.status_subject(str(status["name"]))
             if subject in self.health or len(self.health) < _MOST_CLASSES:
                 self._diagnosed.add(subject)
                 self.health[subject] = Health(int(status["level"]), str(status["message"]))

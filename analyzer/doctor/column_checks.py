@@ -233,7 +233,7 @@ class ColumnChecks:
             error("embedding-source", f"{self._topic}: does not say of which network it is")
         elif columns["values"].shape[1:] != (len(source.names),):
             what = f"{self._topic}: some messages are not of {len(source.names)} values"
-            error("values", what)
+            error("width", what)
 
     def _check_gaps(self) -> None:
         """Report every gap, and check its duration against its lost frames.

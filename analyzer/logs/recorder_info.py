@@ -52,7 +52,6 @@ TYPES = {
     "info": (message_types.STREAM_INFO, _INFO),
 }
 _UNNAMED = "?"  # feature set of a log that has only the names of its features
-_METHODS = {"auros21": "room21", "home33": "room"}  # best training method of our feature sets
 _DIGEST = re.compile("[0-9a-f]{64}")
 _FIRST: Mapping[str, Collection[str]] = {
     message_types.STREAM_INFO: _INFO,
@@ -199,7 +198,9 @@ def attachments_of(file: LogFile) -> list[Attachment]:
 
 def models_for(features: str) -> str:
     """Return advice for an error message: which models fit a feature set."""
-    method = _METHODS.get(features)
+    method = ""
+    with suppress(ModelError):  # a set that is not installed here
+        method = feature_set(features).method
     how = f"; `hearthlog train --method {method}` learns one" if method else ""
     return f"take a model for {features[:64]}{how}"
 

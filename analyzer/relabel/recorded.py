@@ -215,7 +215,7 @@ def _gaps(raw: RawMessages) -> list[Gap]:
 def _health(raw: RawMessages, microphone: str) -> list[SourceHealth | None]:
     """Read the health of the source; None for messages about other things."""
     (columns,) = decode([raw], _FIELDS[message_types.DIAGNOSTICS])
-    name = f"hearthlog: {microphone}"
+    name = message_types.status_name(microphone)
     return [
         next((_state(time, status) for status in array if status["name"] == name), None)
         for time, array in zip(columns.log_times.tolist(), columns["status"], strict=True)

@@ -264,6 +264,8 @@ class FeatureSet:
     augmented : callable or None
         Maps windows of features, shape (n, window_frames, d), and a `np.random.Generator` to the
         features that another microphone in another room would give. None if not supported.
+    method : str
+        Of `hearthlog train`, learns the best models of these features; empty if none is known.
     digest : str
         SHA-256 of the file that computes the values, in hexadecimal; empty if code computes them.
     """
@@ -279,6 +281,7 @@ class FeatureSet:
     band_powers: Callable[[Float32], Float64] | None = None
     # in quotes: recorder and bridge never load `numpy.random`, which takes 5 MB
     augmented: "Callable[[Float32, np.random.Generator], Float32] | None" = None
+    method: str = ""
     digest: str = ""
 
     @property

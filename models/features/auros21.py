@@ -397,4 +397,5 @@ AUROS21 = FeatureSet(
     power=_energy,
     band_powers=band_powers,
     augmented=augmented,
+    method="room21",
 )

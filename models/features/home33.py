@@ -114,4 +114,5 @@ HOME33 = FeatureSet(
     inputs=INPUTS,
     power=_energy,
     band_powers=band_powers,
+    method="room",
 )

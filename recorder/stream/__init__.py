@@ -17,6 +17,7 @@ from hearthlog.schemas.messages.message_types import (
     header,
     message,
     nanoseconds,
+    status_name,
     time_message,
 )
 from hearthlog.schemas.messages.topics import DIAGNOSTICS, ROSOUT, topic
@@ -132,7 +133,7 @@ def diagnostics(subject: str, health: SourceHealth, microphone: str = "") -> Enc
     status = message(
         "diagnostic_msgs/msg/DiagnosticStatus",
         level=health.level,
-        name=f"hearthlog: {subject}",
+        name=status_name(subject),
         message=health.summary,
         hardware_id=subject.partition(" ")[0],
         values=[

@@ -90,7 +90,7 @@ class ArrayGeometry:
         return delays
 
 
-def array_geometry(positions: Sequence[Sequence[float]]) -> ArrayGeometry:
+def geometry_of(positions: Sequence[Sequence[float]]) -> ArrayGeometry:
     """Check microphone positions: [x, y] or [x, y, z] of each channel, in metres.
 
     Raise `ConfigurationError` if the number of microphones is out of range, a position is invalid

@@ -50,21 +50,6 @@ RAW_AUDIO = "foxglove_msgs/msg/RawAudio"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 LOG = "rcl_interfaces/msg/Log"
 
-_DEFINED_HERE = (
-    STREAM_INFO,
-    FEATURES,
-    STATISTICS,
-    LABEL,
-    SEGMENT,
-    MARK,
-    REVIEWED,
-    GAP,
-    DIRECTION,
-    EMBEDDING,
-    RAW_AUDIO,
-)
-
-
 # Subset of ROS 2 Jazzy: importing all its types takes longer than all other imports together.
 _OF_ROS = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec",
@@ -116,11 +101,12 @@ def recorded_types() -> Typestore:
 
 
 def _types_here() -> dict[str, Any]:
-    folder = files("hearthlog.schemas.messages") / "msg"
+    others = {RAW_AUDIO.rpartition("/")[2]: RAW_AUDIO}  # Foxglove's, which ROS 2 need not have
     types: dict[str, Any] = {}
-    for name in _DEFINED_HERE:
-        text = (folder / f"{name.rpartition('/')[2]}.msg").read_text()
-        types |= get_types_from_msg(text, name)
+    for file in (files("hearthlog.schemas.messages") / "msg").iterdir():
+        name, _, suffix = file.name.partition(".")
+        if suffix == "msg":
+            types |= get_types_from_msg(file.read_text(), others.get(name, f"{PACKAGE}/msg/{name}"))
     return types
 
 
@@ -205,6 +191,20 @@ def definition(typename: str) -> str:
 def type_hash(typename: str) -> str:
     """Return the RIHS01 hash of a type, which ROS 2 compares between publisher and subscriber."""
     return store_of(typename).hash_rihs01(typename)
+
+
+_STATUS_PREFIX = "hearthlog: "
+
+
+def status_name(subject: str) -> str:
+    """Return the name of the diagnostic status of a subject, such as a microphone."""
+    return _STATUS_PREFIX + subject
+
+
+def status_subject(name: str, node: str = "") -> str:
+    """Return the subject of a diagnostic status from its name; without the recorder's name."""
+    subject = name.removeprefix(_STATUS_PREFIX)
+    return subject.removeprefix(f"{node} ") if node else subject
 
 
 LOG_DAMAGED = "the log was damaged"  # reason of gaps written by `recover`

@@ -23,7 +23,7 @@ from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classes import SILENCE
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES
-from hearthlog.recorder.stream.directions import BlockDirections, array_geometry
+from hearthlog.recorder.stream.directions import BlockDirections, geometry_of
 from hearthlog.schemas.arrays import Float32, Float64
 from hearthlog.schemas.frames import FRAME_SAMPLES, FRAME_SECONDS, SAMPLE_RATE
 from hearthlog.tools.home.clips import SHIPPED
@@ -132,7 +132,7 @@ def _located(
     samples: Float32, truth: Sequence[Placed], places: Float64
 ) -> tuple[list[Located], int, float]:
     """Return what was said of each sound, and how many blocks of the pauses have a direction."""
-    geometry = array_geometry(places.tolist())
+    geometry = geometry_of(places.tolist())
     frames = len(samples) // FRAME_SAMPLES
     shaped = samples[: frames * FRAME_SAMPLES].reshape(frames, FRAME_SAMPLES, -1)
     blocks, azimuths, confidences = BlockDirections(geometry)(shaped, 0)
@@ -161,7 +161,7 @@ def _print_cost(samples: Float32) -> None:
     for name, places in ARRAYS.items():
         count = len(places)
         frames = np.resize(samples, (1200, FRAME_SAMPLES, count)).astype(np.float32)
-        finder = BlockDirections(array_geometry(places.tolist()))
+        finder = BlockDirections(geometry_of(places.tolist()))
         begin = time.process_time()
         for first in range(0, len(frames), _PUSHED):
             finder(frames[first : first + _PUSHED], first)
