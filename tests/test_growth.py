@@ -38,7 +38,8 @@ from hearthlog.schemas.messages.message_types import (
 from hearthlog.schemas.messages.type_definitions import message_type
 
 GOLDEN = Path(__file__).parent / "golden"
-OURS = message_types._DEFINED_HERE[:-1]  # the last one is of Foxglove
+MESSAGES = Path(message_types.__file__).parent / "msg"
+OURS = [f"{message_types.PACKAGE}/msg/{path.stem}" for path in sorted(MESSAGES.glob("Audio*.msg"))]
 SEGMENTS = "/hall/segment"
 START = 1_772_348_370_123_456_789
 

@@ -565,14 +565,19 @@ def test_hours_without_logs_at_the_ends_are_not_called_not_recorded(tmp_path, ho
     assert max((float(left) + float(width) for left, width in gaps), default=0) <= hatched
 
 
-def test_the_days_of_a_week_before_the_first_log_and_after_the_last_are_not_hatched(tmp_path):
+def test_the_days_of_a_week_before_the_first_log_and_after_the_last_are_a_row_each(tmp_path):
     for ago in (3, 2):
         write_day(tmp_path / "logs", DAY - timedelta(days=ago))
     page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
     assert re.findall(r'class="unlogged".*?><span>(.*?)</span>', page) == [
-        *["before the first log"] * 3,
-        *["after the last log"] * 2,
+        "before the first log",
+        "after the last log",
     ]
+    assert re.findall(r'class="row"><span class="name">(.*?)</span>', page) == [
+        *("Mon 23 to Wed 25 Feb", "Thu 26 Feb", "Fri 27 Feb", "Sat 28 Feb to Sun 1 Mar"),
+    ]
+    heads = re.findall(r"<th[^>]*>((?:Mon|Tue|Wed|Thu|Fri|Sat|Sun) \d+)</th>", page)
+    assert {*heads} == {"Thu 26", "Fri 27"}
     assert 'class="gap"' not in page
     assert 'class="alert"' not in page
     text = text_of(page)

@@ -35,8 +35,8 @@ from hearthlog.analyzer.report.timeline import (
     DayTimeline,
     HourBar,
     hour_bars,
-    occurring_classes,
     timeline_of,
+    week_timelines,
 )
 from hearthlog.analyzer.report.wording import (
     clock_text,
@@ -141,8 +141,7 @@ def week_page(data: ReportData) -> str:
     first, last = data.days[0].day, data.days[-1].day
     spoken = dates_in_words(first, last)
     names = [name for name in data.classes if name != SILENCE and _occurs(data, name)]
-    drawn = occurring_classes(data.days)
-    days = [(short_day(day.day), timeline_of(day, drawn)) for day in data.days]
+    days = week_timelines(data.days)
     described = " ".join(f"{name}: {_description(each)}" for name, each in days)
     return _page(
         data,
@@ -222,21 +221,22 @@ def _covered_days(days: Sequence[DayMetrics]) -> str:
 
 def _scenario(data: ReportData, name: str) -> PageTable:
     """Return the minutes of each class of a scenario, a row per class, a column per day."""
-    days = data.scenarios[name]
+    each = zip(data.scenarios[name], data.days, strict=True)
+    days = [found for found, day in each if day.logged.length] or data.scenarios[name]
     classes = ordered(sorted({label for day in days for label in day}))
     rows = [
         [
             Cell(in_words(label), colour=colour_on_paper(label)),
             *(
                 Cell(_scenario_text(found.get(label, 0.0), day), unbroken=True)
-                for found, day in zip(days, data.days, strict=True)
+                for found, day in zip(days, data.logged_days, strict=True)
             ),
         ]
         for label in classes
     ]
-    if len(days) == 1:
+    if len(data.days) == 1:
         return PageTable(["Sound", "How long"], rows)
-    rests = [_rest([cell.text for cell in row[1:]], data.days) for row in rows]
+    rests = [_rest([cell.text for cell in row[1:]], data.logged_days) for row in rows]
     return PageTable(["Sound", *_day_heads(data)], rows, "wide", rests)
 
 
@@ -366,29 +366,33 @@ def _coughing(day: DayMetrics) -> str:
 def _week(
     data: ReportData, figures: Sequence[ReportFigure], *, has_share: bool = True
 ) -> PageTable:
-    """Return the figures of seven days, a column for each, and their total.
+    """Return the figures of the days of a week that have logs, a column for each, and their total.
 
     The first row is the share of each day that was recorded, unless another table has it.
     """
-    shares = [_share(figures, day) for day in data.days]
+    days = data.logged_days
+    shares = [_share(figures, day) for day in days]
     recorded = [Cell(percent(share) if share else _NOTHING) for share in shares]
     rows = [[Cell("Recorded"), *recorded, Cell("")]] if has_share else []
-    rests = [_rest([cell.text for cell in recorded], data.days)] if has_share else []
+    rests = [_rest([cell.text for cell in recorded], days)] if has_share else []
     for figure in figures:
-        values = [figure.value(day) if day.coverage.length else None for day in data.days]
+        values = [figure.value(day) if day.coverage.length else None for day in days]
         usual = _dense(data.usually(figure)) if data.comparable else ""
-        notes = [_apart(figure, data.days), f"usually {usual} a day" * bool(usual)]
+        notes = [_apart(figure, days), f"usually {usual} a day" * bool(usual)]
         texts = [*map(_short, values)]
-        rests.append(_rest(texts, data.days))
+        rests.append(_rest(texts, days))
         colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(
             [
                 Cell(figure.short, colour=colour, note=", ".join(filter(None, notes))),
                 *map(Cell, texts),
-                Cell(_total(data.days, figure)),
+                Cell(_total(days, figure)),
             ]
         )
-    return PageTable(["", *_day_heads(data), "All"], rows, "wide", rests)
+    heads = ["", *_day_heads(data), "All"]
+    if len(days) == 1:
+        heads, rows = heads[:-1], [row[:-1] for row in rows]
+    return PageTable(heads, rows, "wide", rests)
 
 
 def _rest(texts: Sequence[str], days: Sequence[DayMetrics]) -> str:
@@ -399,7 +403,7 @@ def _rest(texts: Sequence[str], days: Sequence[DayMetrics]) -> str:
 
 
 def _day_heads(data: ReportData) -> list[str]:
-    return [short_day(day.day).rpartition(" ")[0] for day in data.days]
+    return [short_day(day.day).rpartition(" ")[0] for day in data.logged_days]
 
 
 def _share(figures: Sequence[ReportFigure], day: DayMetrics) -> float:

@@ -183,6 +183,11 @@ class ReportData:
         return listed(list(self.nodes), "and") or "Home"
 
     @property
+    def logged_days(self) -> Sequence[DayMetrics]:
+        """The days from the first log to the last one; all if none has logs."""
+        return [day for day in self.days if day.logged.length] or self.days
+
+    @property
     def classes(self) -> list[str]:
         """Classes that can occur."""
         return self.days[0].home.classes

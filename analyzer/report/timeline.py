@@ -1,6 +1,7 @@
 """Timeline of a day: a lane of events for each class, night, hours, time without a record."""
 
 from collections.abc import Iterable, Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from hearthlog.analyzer.logs.spans import (
     lengths,
     single_span,
 )
-from hearthlog.analyzer.report.wording import clock_text
+from hearthlog.analyzer.report.wording import clock_text, days_in_short, short_day
 from hearthlog.models.classes import SILENCE, Colour, colour_on_paper, in_words
 from hearthlog.schemas.arrays import Bool, Float64, Int64
 
@@ -176,6 +177,20 @@ def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimel
         list(_runs(lefts, night)),
         list(_ticks(lefts, clock)),
     )
+
+
+def week_timelines(days: Sequence[DayMetrics]) -> list[tuple[str, DayTimeline]]:
+    """Return the timelines of days with their names; days without logs share one, without lanes."""
+    names = occurring_classes(days)
+    timelines = []
+    for has_logs, run in groupby(days, lambda day: bool(day.logged.length)):
+        if has_logs:
+            timelines += [(short_day(day.day), timeline_of(day, names)) for day in run]
+        else:
+            same = [*run]
+            name = days_in_short(same[0].day, same[-1].day)
+            timelines.append((name, timeline_of(same[0], [])))
+    return timelines
 
 
 def _unlogged(day: DayMetrics, span: Spans) -> Iterable[tuple[TimelineBlock, str]]:

@@ -17,10 +17,9 @@ from hearthlog.analyzer.report.timeline import (
     TimelineBlock,
     TimelineLane,
     hour_bars,
-    occurring_classes,
     timeline_of,
+    week_timelines,
 )
-from hearthlog.analyzer.report.wording import short_day
 from hearthlog.schemas.arrays import Float64
 
 _INK, _HATCH, _NIGHT, _LINE = "#1d2733", "#8a94a0", "#e9ecf1", "#c5ccd4"
@@ -32,33 +31,37 @@ _UNCOUNTED = (210 / 255, 94 / 255, 1 / 255, _PALE)
 
 def save_timelines(path: Path, days: Sequence[DayMetrics], earlier: Sequence[DayMetrics]) -> None:
     """Draw a day, with the minutes with sound of each hour, or the days of a week."""
-    names = occurring_classes(days) if len(days) > 1 else None
-    timelines = [timeline_of(day, names) for day in days]
-    lanes = [lane for timeline in timelines for lane in timeline.lanes]
+    rows = week_timelines(days) if len(days) > 1 else [("", timeline_of(days[0]))]
+    timelines = [timeline for _, timeline in rows]
     lane_height = 0.3 if len(days) == 1 else 0.11
-    heights = [lane_height * max(len(lanes), 1) + 0.1, *[1.1] * (len(days) == 1)]
+    lanes = sum(map(_lanes, timelines))
+    heights = [lane_height * lanes + 0.1, *[1.1] * (len(days) == 1)]
     figure = Figure(figsize=(10, sum(heights) + 0.9), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
-    _draw_lanes(axes[0], timelines)
+    _draw_lanes(axes[0], rows)
     if len(days) == 1:
         _draw_hours(axes[1], timelines[0], hour_bars(days[0], earlier))
     _draw_legend(figure, timelines)
     figure.savefig(path, format="png", dpi=_DOTS, metadata={"Software": None})
 
 
-def _draw_lanes(axes: Any, timelines: Sequence[DayTimeline]) -> None:
+def _lanes(timeline: DayTimeline) -> int:
+    """Return the height of a timeline in lanes: two hold a line of text."""
+    return max(len(timeline.lanes), 2)
+
+
+def _draw_lanes(axes: Any, rows: Sequence[tuple[str, DayTimeline]]) -> None:
     """Draw lanes from top to bottom, those of a day together."""
-    each = len(timelines[0].lanes)
-    height = max(each, 1) * len(timelines)
-    for number, timeline in enumerate(timelines):
-        top = number * each
-        _draw_blocks(axes, timeline, timeline.nights, (top, max(each, 1)), color=_NIGHT)
-        _draw_gaps(axes, timeline, timeline.gaps, (top, max(each, 1)))
+    top, middles = 0, []
+    for _, timeline in rows:
+        height = _lanes(timeline)
+        _draw_blocks(axes, timeline, timeline.nights, (top, height), color=_NIGHT)
+        _draw_gaps(axes, timeline, timeline.gaps, (top, height))
         for block, text in timeline.unlogged:
             middle = (block.left + block.width / 2) * timeline.steps / 100
             if block.width >= _WRITTEN:
-                level = top + max(each, 1) / 2
+                level = top + height / 2
                 axes.text(
                     middle,
                     level,
@@ -73,14 +76,17 @@ def _draw_lanes(axes: Any, timelines: Sequence[DayTimeline]) -> None:
             _draw_gaps(axes, timeline, lane.gaps, (top + place, 1))
             _draw_lane(axes, lane, top + place)
         axes.axhline(top, color=_LINE, linewidth=0.8)
-    if len(timelines) == 1:
-        axes.set_yticks(np.arange(each) + 0.5, [_plain(x.words) for x in timelines[0].lanes])
-        for place in range(1, each):
+        middles.append(top + height / 2)
+        top += height
+    timelines = [timeline for _, timeline in rows]
+    if len(rows) == 1:
+        lanes = timelines[0].lanes
+        axes.set_yticks(np.arange(len(lanes)) + 0.5, [_plain(lane.words) for lane in lanes])
+        for place in range(1, len(lanes)):
             axes.axhline(place, color=_LINE, linewidth=0.6)
     else:
-        names = [short_day(timeline.day.day) for timeline in timelines]
-        axes.set_yticks((np.arange(len(names)) + 0.5) * each, names)
-    axes.set_ylim(height, 0)
+        axes.set_yticks(middles, [name for name, _ in rows])
+    axes.set_ylim(top, 0)
     _draw_axis(axes, max(timelines, key=lambda timeline: timeline.steps))
 
 
@@ -168,7 +174,7 @@ def _draw_axis(axes: Any, timeline: DayTimeline) -> None:
 
 def _draw_legend(figure: Any, timelines: Sequence[DayTimeline]) -> None:
     """Write what colours and hatching mean; the lanes of a day have their names beside them."""
-    lanes = timelines[0].lanes if len(timelines) > 1 else []
+    lanes = max((one.lanes for one in timelines), key=len) if len(timelines) > 1 else []
     entries = [Patch(color=_shade(lane), label=_plain(lane.words)) for lane in lanes]
     if any(timeline.nights for timeline in timelines):
         entries.append(Patch(color=_NIGHT, label="night"))

@@ -57,6 +57,14 @@ def short_day(day: date) -> str:
     return f"{_WEEKDAYS[day.weekday()][:3]} {day.day} {_MONTHS[day.month - 1][:3]}"
 
 
+def days_in_short(first: date, last: date) -> str:
+    """Format one or several days, the month once: `Tue 3 to Sun 8 Mar`."""
+    if first == last:
+        return short_day(first)
+    start = short_day(first)
+    return f"{start[:-4] if first.month == last.month else start} to {short_day(last)}"
+
+
 def weekday(day: date) -> str:
     """Return the name of a day: `Sunday`."""
     return _WEEKDAYS[day.weekday()]
