@@ -293,7 +293,7 @@ def test_the_axes_begin_with_what_is_there_until_they_are_full():
     assert str(300 * SECOND) in later
 
 
-def test_the_table_of_events_is_in_the_last_tab():
+def test_the_table_of_events_is_in_the_last_tab_and_novelty_begins_as_far_right_as_other_plots():
     times = np.array([BEGIN])
     plots = {
         plot_entity(one): [one]
@@ -304,6 +304,9 @@ def test_the_table_of_events_is_in_the_last_tab():
     }
     *_, details = _stack_plots("mic", plots).contents
     assert [view.name for view in details.contents] == [NOVELTY.title, "Events"]
+    _, novelty = details.contents[0].contents
+    assert novelty.name == NOVELTY.title
+    assert sum(details.contents[0].column_shares) == 1366
 
 
 def test_lanes_are_sent_at_once_and_plots_every_few_seconds():

@@ -152,6 +152,7 @@ _PLOTS_HEIGHT = 540
 _DETAILS, _DETAILS_HEIGHT = {DIRECTION, NOVELTY, FEATURES}, 150  # plots in tabs
 # Widths of a text and of a view in a window of 1366: all plots begin at 200, after their numbers.
 _LANE_COLUMNS, _ROW_COLUMNS, _LEVEL_COLUMNS = (200, 1166), (183, 1183), (160, 1206)
+_DETAILS_COLUMNS = 182, 1184
 _STEP_SECONDS = 1, 10, 60  # between updates of a sound: in the first 10 s, the first minute, later
 _LEAST_CHANGE = 0.1  # of a confidence, for an update
 _WORDLESS, _LETTER = " ", 8.0  # after a state without its word; points of a letter
@@ -389,7 +390,9 @@ def _stack_plots(microphone: str, plots: Plots) -> rrb.Container:
         first = [plot for same in shown.values() for plot in same]
         view = plot_view(first, list(shown), live=True)
         if first[0].kind in _DETAILS:
-            details.append(view)
+            left = text_view(NOTHING)  # else its times would not lie below those of the others
+            own = rrb.Horizontal(left, view, column_shares=_DETAILS_COLUMNS, name=view.name)
+            details.append(own)
             continue
         names = [_name_entity(first[0], row) for row in range(max(map(_row_count, first)))]
         height, columns = first[0].kind.height, _LEVEL_COLUMNS
