@@ -3,6 +3,7 @@
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from homelife import at, midnight, write_day
 from servedhome import PALE_TEXTS
@@ -152,6 +153,21 @@ def test_a_day_of_the_week_is_marked_and_its_title_lies_above_its_sentence(phone
     phone.of("document.getElementById('show-week').click()")
     assert phone.of("document.getElementById('date').classList.contains('hidden')")
     assert phone.of("seen") == []
+
+
+def test_the_hours_of_a_week_lie_below_those_of_its_days(phone, show):
+    show(390)
+    phone.of("document.getElementById('show-week').click()")
+    phone.until("document.querySelectorAll('#week .axis span').length")
+    assert phone.of("document.querySelector('#week .axis').innerText.split(/\\s+/)") == [
+        *("00", "06", "12", "18"),
+    ]
+    places = phone.of(
+        "(({ left, width }) => [...document.querySelectorAll('#week .axis span')].map((each) => {"
+        "const box = each.getBoundingClientRect(); return (box.left + box.width / 2 - left) / width;"
+        "}))(document.querySelector('#week svg').getBoundingClientRect())"
+    )
+    assert np.abs(np.array(places) - (np.array([0, 6, 12, 18]) + 2) / 24).max() < 0.01
 
 
 def test_a_past_day_says_why_a_class_with_a_count_of_0_has_a_mark(phone, show):

@@ -187,15 +187,27 @@ async function showWeek() {
   });
   const important = (today?.rooms ?? []).flatMap(({ lanes }) => lanes).filter((lane) => lane.important);
   const names = [...new Set(important.map(({ words: name }) => inside(name)))].join(", ");
-  week.replaceChildren(...rows.map((row) => make("li", {}, row.button)),
+  const axis = make("li", { class: "axis", "aria-hidden": "true" });
+  week.replaceChildren(...rows.map((row) => make("li", {}, row.button)), axis,
     ...(names ? [make("li", { class: "note" }, say("week rows", { classes: names }))] : []));
   showPlaceOfDay();
   for (const row of rows) {
     const day = row.date === today?.date ? today : await readDay(row.date);
     if (week.hidden || !row.button.isConnected) return;
     if (day.error) write(row.about, day.error);
-    else showDayOfWeek(row, day);
+    else {
+      showDayOfWeek(row, day);
+      if (!axis.firstChild) axis.append(...hoursBelow(day));
+    }
   }
+}
+
+function hoursBelow(day) {
+  return day.hours.filter(([, hour]) => hour % 6 === 0).map(([where, hour]) => {
+    const text = make("span", {}, String(hour).padStart(2, "0"));
+    text.style.left = `${100 * where}%`; // the page allows no attribute of style
+    return text;
+  });
 }
 
 function showDayOfWeek(row, day) {
