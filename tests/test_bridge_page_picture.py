@@ -164,10 +164,11 @@ def test_the_hours_of_a_week_lie_below_those_of_its_days(phone, show):
     ]
     places = phone.of(
         "(({ left, width }) => [...document.querySelectorAll('#week .axis span')].map((each) => {"
-        "const box = each.getBoundingClientRect(); return (box.left + box.width / 2 - left) / width;"
+        "const box = each.getBoundingClientRect();"
+        "return (box.left + box.width / 2 - left) / width;"
         "}))(document.querySelector('#week svg').getBoundingClientRect())"
     )
-    assert np.abs(np.array(places) - (np.array([0, 6, 12, 18]) + 2) / 24).max() < 0.01
+    assert np.abs(np.array(places) - (np.array([0, 6, 12, 18]) + 2) / 26).max() < 0.01
 
 
 def test_a_past_day_says_why_a_class_with_a_count_of_0_has_a_mark(phone, show):
