@@ -23,10 +23,10 @@ OF_EVERY_SCENARIO = frozenset({SILENCE, UNKNOWN, OTHER})  # classes without a na
 WORRYING = (COUGHING, CRYING, YELLING)  # a person must look at them, also where one is only likely
 IMPORTANT = (*WORRYING, PHONE_RING)  # shown first
 WATER = (FLUSHING_WATER, SHOWER, TAP_WATER)
-# What also occurs on a television, or what a model takes its sounds for.
-ON_TELEVISION = (*IMPORTANT, LAUGHING, OBJECTS_ACTIVITY)
-# What a report neither counts nor adds up beside a television: not water, nor a home's own classes.
-APART_IN_REPORT = (*ON_TELEVISION, SPEECH, MUSIC, OTHER_NEGATIVE, OTHER, UNKNOWN)
+# What is in no count and no length beside a television: not water, nor a home's own classes.
+ON_TELEVISION = (
+    *IMPORTANT, LAUGHING, OBJECTS_ACTIVITY, SPEECH, MUSIC, OTHER_NEGATIVE, OTHER, UNKNOWN,
+)  # fmt: skip
 CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 

@@ -62,7 +62,7 @@ WATER = rule("longer_than", "water", longer_than="10m", **{"class": "tap_water"}
 QUIET = rule("none_by", "quiet", since="01:00", by="03:00", **{"class": "speech"})
 DEAF = rule("none_by", "deaf", since="03:00", by="04:30", **{"class": "speech"})
 EACH = rule("more_than", "each", count=0, window="1m", cooldown="1m", **{"class": "coughing"})
-SPEECH = rule("more_than", "speech", minutes=8, window="20m", cooldown="10m", **{"class": "speech"})
+SPEECH = rule("more_than", "speech", minutes=7, window="20m", cooldown="10m", **{"class": "speech"})
 
 
 def labels_of(columns):
@@ -79,7 +79,7 @@ def test_what_is_followed_live_rings_as_on_replay(tmp_path):
     rng = np.random.default_rng(4)
     events = [(second, 2.0, "coughing", 0.9) for second in rng.uniform(0, 5 * HOUR, 60)]
     events += [(600.0 + 3600 * n, 1500.0, "tap_water", 0.9) for n in range(2)]
-    events += [(16_300.0, 700.0, "speech", 0.8), (17_100.0, 700.0, "speech", 0.8)]
+    events += [(16_320.0, 440.0, "speech", 0.8), (18_500.0, 900.0, "speech", 0.8)]
     about = {"classes": CLASSES, "hours": range(6), "gaps": [(11_000, 4000, "unplugged")]}
     write_day(tmp_path / "logs", DAY, events, **about)
     begin = midnight(DAY)
@@ -226,9 +226,9 @@ def test_a_new_rule_does_not_ring_for_the_silence_before_it(tmp_path):
 
 def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):
     for number in range(1, 11):
-        events = [(9 * HOUR, 3000.0 if number == 10 else 300.0, "speech", 0.9)]
+        events = [(9 * HOUR, 3000.0 if number == 10 else 300.0, "tap_water", 0.9)]
         write_day(tmp_path / "logs", DAY.replace(day=number), events, classes=CLASSES, file_hours=6)
-    one = rule("unlike_usual", of="minutes", **{"class": "speech"})
+    one = rule("unlike_usual", of="minutes", **{"class": "tap_water"})
     now = midnight(DAY.replace(day=10)) + 12 * HOUR * SECOND
     watch, _, _ = watching(tmp_path, [one], now)
     requested = []
@@ -242,7 +242,7 @@ def test_weeks_are_read_once_a_day_when_they_are_judged(tmp_path):
         now += HOUR * SECOND
         found += watch.evaluate(pytest.fail, weeks, now, now)
     assert len(requested) == 1
-    assert [ring.text for ring in found] == ["Talking on 2026-03-10: 50 min, usually 5 min"]
+    assert [ring.text for ring in found] == ["Water tap on 2026-03-10: 50 min, usually 5 min"]
 
 
 def test_a_rule_that_was_changed_begins_anew_and_a_damaged_memory_too(tmp_path):

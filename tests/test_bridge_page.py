@@ -590,13 +590,13 @@ def test_an_event_from_before_midnight_is_of_the_night_and_counts_once():
     begin = at(UTC, 2026, 5, 5)
     minute = 60 * NANOSECONDS
     state = HomeState()
-    state.push([segments("mic", (begin - 60 * minute, begin + 60 * minute, "music"))])
+    state.push([segments("mic", (begin - 60 * minute, begin + 60 * minute, "shower"))])
     now = today(begin + 600 * minute, UTC)
     (lane,) = picture_of(HomeDay([*state.microphones.values()], now, UTC))["rooms"][0]["lanes"]
     assert lane["bars"] == "0" * 30 + "9" * 60 + "0" * 630
     assert (lane["counts"], lane["told"]) == (
         [1, None],
-        "Music: once since yesterday evening, by the sound of it, last at 01:00",
+        "Shower: once since yesterday evening, by the sound of it, last at 01:00",
     )
 
 

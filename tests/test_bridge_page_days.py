@@ -123,7 +123,46 @@ NIGHT = [(2.17, 3, "coughing"), (6.22, 3, "coughing")]
             [(1 + number / 10, 3, "coughing") for number in range(9)],
             "Last night: coughing 9 times (01:00 to 01:48), by the sound of it.",
         ),
-        (9, (-3, 9), [(1, 1800, "speech")], "Last night: talking once, by the sound of it."),
+        (9, (-3, 9), [(1, 400, "speech")], "Last night: talking once, by the sound of it."),
+        (
+            9,
+            (-3, 9),
+            [(-2.9, 9200, "speech"), *NIGHT],
+            (
+                "Last night: coughing twice (02:10 and 06:13); something like a television until "
+                "23:42, by the sound of it."
+            ),
+        ),
+        (
+            9,
+            (-3, 9),
+            [(1, 1800, "speech"), (4, 30, "shower")],
+            (
+                "Last night: something like a television, 00:58 to 01:32; shower once, by the "
+                "sound of it."
+            ),
+        ),
+        (
+            9,
+            (-3, 9),
+            [(hour, 1800, "music") for hour in (1, 3, 5)],
+            (
+                "Last night: now and then something like a television, 00:58 to 05:32, by the "
+                "sound of it."
+            ),
+        ),
+        (
+            3,
+            (-3, 3),
+            [(1, 7200, "music")],
+            "Tonight: something like a television since 00:58, by the sound of it.",
+        ),
+        (
+            9,
+            (-3, 9),
+            [(-3, 3700, "speech")],
+            "A quiet night, by the sound of it.",
+        ),
         (
             14,
             (-3, 14),
@@ -138,6 +177,67 @@ def test_the_sentence_is_true_and_calls_nothing_quiet_that_was_not_listened_to(
     hour, hours, sounds, sentence
 ):
     assert picture_of(home_at(hour, tiled(hours, *sounds)))["sentence"] == sentence
+
+
+@pytest.mark.parametrize(
+    ("hours", "sounds", "english", "german"),
+    [
+        (
+            (-3, 22),
+            [*NIGHT, (14, 3, "coughing")],
+            (
+                "In the night: coughing twice (02:10 and 06:13). By day: coughing once (14:00), by "
+                "the sound of it."
+            ),
+            (
+                "In der Nacht: zweimal Husten (02:10 und 06:13). Am Tag: einmal Husten (14:00), "
+                "dem Klang nach."
+            ),
+        ),
+        (
+            (-3, 22),
+            NIGHT,
+            "In the night: coughing twice (02:10 and 06:13), by the sound of it.",
+            "In der Nacht: zweimal Husten (02:10 und 06:13), dem Klang nach.",
+        ),
+        (
+            (4, 14),
+            [*NIGHT[1:], (9, 3, "coughing")],
+            (
+                "Only part of the day was heard. In the night: coughing once (06:13). By day: "
+                "coughing once (09:00), by the sound of it."
+            ),
+            (
+                "Nicht durchgehend mitgehört. In der Nacht: einmal Husten (06:13). Am Tag: einmal "
+                "Husten (09:00), dem Klang nach."
+            ),
+        ),
+        (
+            (-3, 22),
+            [
+                (3, 3, "phone_ring"),
+                *((hour, 3, "coughing") for hour in (9, 10, 11, 12)),
+                *((hour, 3, "crying") for hour in (15, 16, 17)),
+            ],
+            "By day: coughing 4 times and crying 3 times, by the sound of it.",
+            (
+                "Am Tag: 4\N{NON-BREAKING HYPHEN}mal Husten und 3\N{NON-BREAKING HYPHEN}mal "
+                "Weinen, dem Klang nach."
+            ),
+        ),
+    ],
+)
+def test_the_sentence_of_a_past_day_has_the_night_first(hours, sounds, english, german):
+    for language, sentence in (("en", english), ("de", german)):
+        home = home_at(21.99, tiled(hours, *sounds), language=language)._replace(is_past=True)
+        assert picture_of(home)["sentence"] == sentence
+
+
+def test_a_television_until_a_time_is_so_in_german():
+    home = home_at(9, tiled((-3, 9), (-2.9, 9200, "speech")), language="de")
+    assert picture_of(home)["sentence"] == (
+        "Letzte Nacht: bis 23:42 etwas wie ein Fernseher, dem Klang nach."
+    )
 
 
 @pytest.mark.parametrize(
@@ -312,21 +412,21 @@ def test_a_sentence_about_several_classes_is_short_and_begins_with_the_most_impo
     home = home_at(23, tiled((-3, 23), *sounds, *rings))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "yelling", "phone_ring"]
     assert picture_of(home)["sentence"] == (
-        "Coughing 4 times, perhaps once more; shouting once, by the sound of it."
+        "By day: coughing 4 times, perhaps once more; shouting once, by the sound of it."
     )
     counts = {lane["label"]: lane["count"] for lane in picture_of(home)["rooms"][0]["lanes"]}
     assert counts["phone_ring"] == 4, "the rest is below"
     home = home_at(23, tiled((-3, 23), *sounds[:-1], *rings))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "phone_ring"]
     assert picture_of(home)["sentence"] == (
-        "Coughing 4 times (08:00, 08:30, 09:06 and 10:06), perhaps once more (12:00), by the sound "
-        "of it."
+        "By day: coughing 4 times, perhaps once more (12:00), by the sound of it."
     )
     crying = [(hour, 3, "crying", 0.9) for hour in (13, 14, 15)]
     home = home_at(23, tiled((-3, 23), *sounds, *crying))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "crying", "yelling"]
     assert picture_of(home)["sentence"] == (
-        "Coughing 4 times, perhaps once more; crying 3 times; shouting once, by the sound of it."
+        "By day: coughing 4 times, perhaps once more; crying 3 times; shouting once, by the sound "
+        "of it."
     ), "none that worries is left out"
 
 
@@ -393,7 +493,8 @@ def test_rings_and_coughs_beside_a_television_are_not_counted_and_the_lane_says_
     assert ring["last"] == "09:15", "of what counts"
     assert ring["told"].endswith("; twice beside something like a television, not counted")
     assert picture["sentence"] == "Since 07:00: telephone ringing once (09:15), by the sound of it."
-    assert lanes["speech"]["counts"] == [0, 60], "talking of a television is talking"
+    assert lanes["speech"]["counts"] == [0, 0]
+    assert lanes["speech"]["uncounted"] == 60, "talking of a television is no talking of the home"
 
 
 def test_the_counts_of_the_sentence_are_those_below_it():
@@ -477,7 +578,7 @@ def test_what_is_not_counted_is_drawn_pale_and_its_entry_says_so():
         about = shown.describe(bout)
         texts[bout.first.label].append((about["beside"], about["look"]))
     assert texts["coughing"] == [("beside a television, not counted", False), ("", True)]
-    assert {*texts["speech"]} == {("", False)}
+    assert {*texts["speech"]} == {("beside a television, not counted", False)}
     corrected = shown._replace(correction=lambda _: "You said: Coughing")
     assert {corrected.describe(bout)["beside"] for bout in bouts(events)} == {""}
 

@@ -220,7 +220,6 @@ class CheckedMinutes:
     sounding: Bool  # [shape=(n,)]; whether the labels show any sound
     television: Bool  # [shape=(n,)]; whether the labels resemble a television
     models: list[str]  # SHA-256 of the model that labelled each minute; empty if unknown
-    apart: Collection[str] = ON_TELEVISION  # classes that do not count beside a television
 
     def __len__(self) -> int:
         return len(self.models)
@@ -235,7 +234,6 @@ class CheckedMinutes:
             self.sounding[rows],
             self.television[rows],
             [self.models[row] for row in rows.tolist()],
-            self.apart,
         )
 
     def check(self, name: str) -> ClassCheck:
@@ -255,7 +253,7 @@ class CheckedMinutes:
     def _counted(self, name: str) -> tuple[Int64, Bool]:
         """Return the events of a class, and what sounds, in the minutes that count for it."""
         events = self.events.get(name, np.zeros((4, len(self)), np.int64))
-        kept = ~self.television if name in self.apart else np.ones(len(self), bool)
+        kept = ~self.television if name in ON_TELEVISION else np.ones(len(self), bool)
         return events[:, kept], self.sounding[kept]
 
 

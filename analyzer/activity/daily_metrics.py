@@ -1,6 +1,6 @@
 """Metrics of a home and its days: coverage, durations, events, and counts with ranges."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, tzinfo
 from functools import reduce
@@ -64,7 +64,6 @@ class HomeMinutes:
     # [shape=(4, n)]; events that begin in each minute: labelled ones outside of reviewed spans, all
     # after corrections, and those of them that begin in reviewed spans, or are not sure elsewhere
     events: dict[str, Int64]
-    apart: Collection[str] = ON_TELEVISION  # classes that do not count beside a television
 
     def between(self, spans: Spans) -> "HomeMinutes":
         """Return the minutes that begin in some spans."""
@@ -74,9 +73,9 @@ class HomeMinutes:
     def count(self, name: str, rates: CheckedRates | None) -> Count:
         """Count the events of a class.
 
-        Classes `apart` count in minutes without a television, and where a person reviewed.
+        `ON_TELEVISION` classes count in minutes without a television, and where a person reviewed.
         """
-        own = self.rows(~self.television) if name in self.apart else self
+        own = self.rows(~self.television) if name in ON_TELEVISION else self
         if name not in own.events:
             return Count(rates=rates)
         labelled, corrected, certain, unsure = own.events[name]
@@ -93,14 +92,14 @@ class HomeMinutes:
 
     def counted(self, name: str, starts: Int64) -> Int64:
         """Return the events of a class, by starts within these minutes, that `count` counts."""
-        if name not in self.apart:
+        if name not in ON_TELEVISION:
             return starts
         near_television = np.isin(starts // MINUTE * MINUTE, self.starts[self.television])
         return starts[~near_television | (rows_at(self.reviewed, starts) >= 0)]
 
     def uncounted_events(self, name: str) -> int:
-        """Count the events of classes `apart` that `count` leaves out."""
-        if name not in self.apart or name not in self.events:
+        """Count the events beside a television that `count` leaves out."""
+        if name not in ON_TELEVISION or name not in self.events:
             return 0
         _, corrected, certain, _ = self.events[name]
         return int((corrected - certain)[self.television].sum())
@@ -114,7 +113,6 @@ class HomeMinutes:
             self.gone_through[rows],
             self.reviewed,
             {name: counts[:, rows] for name, counts in self.events.items()},
-            self.apart,
         )
 
 
@@ -257,7 +255,6 @@ class DayMetrics:
     night: Spans
     coverage: Spans  # covered spans of the day
     logged: Spans  # the part of the day from the first log to the last one; may have no length
-    apart: Collection[str] = ON_TELEVISION  # classes that do not count beside a television
 
     @property
     def before_logs(self) -> int:
@@ -297,16 +294,11 @@ class DayMetrics:
         """Return the share of the day covered for a class, 0 to 1; 0 if no model has it."""
         return _share(self.home.listened.get(name, NONE), self.span)
 
-    @property
-    def counting(self) -> HomeMinutes:
-        """Minutes of the home in which the classes `apart` do not count beside a television."""
-        return replace(self.home.minutes, apart=self.apart)
-
     def joined_events(self, name: str) -> tuple[Spans, Spans]:
         """Return the spans of the events of a class that count, and of those that do not."""
         spans = self.home.spans.get(name, NONE)
         events = joined(spans.starts, spans.ends, EVENT_PAUSE)
-        counts = np.isin(events.starts, self.counting.counted(name, events.starts))
+        counts = np.isin(events.starts, self.home.minutes.counted(name, events.starts))
         counted, apart = (Spans(events.starts[own], events.ends[own]) for own in (counts, ~counts))
         return counted, apart
 
@@ -339,7 +331,7 @@ class DayMetrics:
 
     def counted_events(self, name: str, span: Spans) -> Int64:
         """Return the event starts of a class in a span that count, in nanoseconds of UTC."""
-        return self.counting.counted(name, self.home.events_in(name, span))
+        return self.home.minutes.counted(name, self.home.events_in(name, span))
 
     def night_events(self, name: str) -> Int64:
         """Return the event starts that `night_count` counts for a class, in nanoseconds of UTC."""
@@ -356,11 +348,11 @@ class DayMetrics:
 
     def uncounted_events(self, name: str) -> int:
         """Return the number of events of a class not counted because of a television."""
-        return self.counting.between(self.span).uncounted_events(name)
+        return self.home.minutes.between(self.span).uncounted_events(name)
 
     def count_in(self, name: str, span: Spans) -> Count:
         """Return the number of events of a class that begin in a span of this day or its night."""
-        return self.counting.between(span).count(name, self.home.rates.get(name))
+        return self.home.minutes.between(span).count(name, self.home.rates.get(name))
 
     @property
     def sound(self) -> Duration | None:
@@ -445,7 +437,6 @@ def day_of(
     day: date,
     zone: tzinfo,
     logged: tuple[int, int] | None = None,
-    apart: Collection[str] = ON_TELEVISION,
 ) -> DayMetrics:
     """Return the figures of a local day; its night is from 22:00 on the day before to 07:00.
 
@@ -459,7 +450,7 @@ def day_of(
     first, last = (start, end) if logged is None else (min(max(t, start), end) for t in logged)
     first, last = start if first - start < MINUTE else first, end if end - last < MINUTE else last
     logs = single_span(first, last)
-    return DayMetrics(day, near, zone, span, night, coverage, logs, apart)
+    return DayMetrics(day, near, zone, span, night, coverage, logs)
 
 
 def _share(covered: Spans, span: Spans) -> float:

@@ -26,8 +26,8 @@ from hearthlog.models.classes import (
     COUGHING,
     CRYING,
     FLUSHING_WATER,
-    OBJECTS_ACTIVITY,
-    ON_TELEVISION,
+    IMPORTANT,
+    LAUGHING,
     OTHER,
     SILENCE,
     TAP_WATER,
@@ -63,8 +63,8 @@ def stretches(sound: Spans, night: Spans) -> int:
 COUNT, LENGTH, CLOCK = "count", "minutes", "clock"
 STRETCHES, SOUND, FIRST, LAST, QUIET = "stretches", "sound", "first", "last", "quiet"
 BINS = 48  # of a day: half hours
-# Household sounds are a length here, and a length is as labelled, also beside a television.
-APART_IN_LENGTH = tuple(name for name in ON_TELEVISION if name != OBJECTS_ACTIVITY)
+# Lengths of other classes, such as talking, are as labelled here, also beside a television.
+APART_IN_LENGTH = (*IMPORTANT, LAUGHING)
 _NAMELESS = {SILENCE, OTHER, UNKNOWN}
 _AT_NIGHT = (FLUSHING_WATER, TAP_WATER, COUGHING, CRYING, YELLING)
 _LEAST = 0.9  # recorded share of a span for its figures to be present

@@ -27,7 +27,7 @@ from hearthlog.analyzer.logs.hidden_classes import common_names_of, read_hidden_
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import Today
 from hearthlog.analyzer.logs.recorder_info import status_value
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, joined
+from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NONE, Spans, joined, rows_at
 from hearthlog.models.classes import (
     OF_EVERY_SCENARIO,
     ON_TELEVISION,
@@ -120,7 +120,7 @@ class LiveMicrophone:
         self._coverage = GrowingSpans()  # segments tile the time that was listened to
         self._sounds: list[tuple[int, int, str]] = []  # segments other than silence
         self._changes = 0  # of the sounds
-        self._television: tuple[int, set[int]] = (0, set())  # number of changes; minutes with one
+        self._television = 0, NONE  # number of changes; minutes with one
         self._counts: tuple[Any, dict[str, tuple[int, int]]] = (None, {})  # and their key
         self._replaced: list[SoundEvent] = []  # ended by the start of another event of the class
 
@@ -277,22 +277,22 @@ class LiveMicrophone:
 
     def without_television(self, events: Sequence[SoundEvent]) -> list[SoundEvent]:
         """Return the events of a class, or of several, that begin without a television beside."""
-        television = self._television_minutes() if events else set()
-        return [event for event in events if event.start // MINUTE not in television]
+        starts = np.array([event.start for event in events], np.int64)
+        is_apart = rows_at(self.television(), starts) >= 0
+        return [event for event, apart in zip(events, is_apart, strict=True) if not apart]
 
-    def _television_minutes(self) -> set[int]:
-        """Return the minutes, since 1970, that resemble a television."""
-        number, minutes = self._television
-        if number != self._changes:
+    def television(self) -> Spans:
+        """Return the minutes that resemble a television."""
+        if self._television[0] != self._changes:
             rows = sorted(self._sounds)
             starts, ends = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
             labels = np.array([class_name(row[2]) for row in rows], object)
-            first, last = int(starts[0]) // MINUTE - AROUND, int(ends.max()) // MINUTE + AROUND
-            edges = np.arange(max(first, last - _MOST_MINUTES), last + 1) * MINUTE
-            found = television_minutes(Labelling(starts, ends, labels), edges)
-            minutes = set((edges[:-1][found] // MINUTE).tolist())
-            self._television = self._changes, minutes
-        return minutes
+            last = int(ends.max(initial=0)) // MINUTE + AROUND
+            first = max(int(starts[:1].sum()) // MINUTE - AROUND, last - _MOST_MINUTES)
+            edges = np.arange(first, last + 1) * MINUTE
+            minutes = edges[:-1][television_minutes(Labelling(starts, ends, labels), edges)]
+            self._television = self._changes, joined(minutes, minutes + MINUTE)
+        return self._television[1]
 
     def is_night_covered(self, today: Today) -> bool:
         """Return whether enough of the night was listened to for a count of 0."""

@@ -47,9 +47,9 @@ from hearthlog.analyzer.report.wording import (
     times_in_words,
 )
 from hearthlog.models.classes import (
-    APART_IN_REPORT,
     COUGHING,
     FLUSHING_WATER,
+    ON_TELEVISION,
     SHOWER,
     SILENCE,
     UNKNOWN,
@@ -184,7 +184,7 @@ def _page(data: ReportData, picture: PagePicture, **parts: Any) -> str:
     names = [name for name in data.classes if name not in {SILENCE, UNKNOWN}]
     absent = [name for name in names if _has_count(data, name) and not _occurs(data, name)]
     uncertain = [name for name in names if not _has_count(data, name)]
-    everywhere = [name for name in names if name not in APART_IN_REPORT]
+    everywhere = [name for name in names if name not in ON_TELEVISION]
     return fill_page(
         data=data,
         picture=picture,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
@@ -41,7 +41,7 @@ from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, intersection, join
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import ReportData
-from hearthlog.models.classes import APART_IN_REPORT, WORRYING, class_name
+from hearthlog.models.classes import WORRYING, class_name
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.files import RELABEL_LAYER
 from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
@@ -123,12 +123,12 @@ def read_report_data(
     home = read_home(logs, labelling, since, close, progress)
     model = _model(logs, close) if labelling == LIVE else ""
     checked = read_checked_minutes(logs, labelling, since, close[1], home.losses)
-    checks = replace(checked.of_model(model), apart=APART_IN_REPORT)
+    checks = checked.of_model(model)
     metrics = metrics_of_home(home, checks)
     routines = Routines(Profiles(home_sound(home, metrics), zone, night_after=False))
-    past = [day_of(metrics, day, zone, apart=APART_IN_REPORT) for day in earlier]
+    past = [day_of(metrics, day, zone) for day in earlier]
     logged = _logged(logs, metrics.coverage)
-    shown = [day_of(metrics, day, zone, logged, APART_IN_REPORT) for day in days]
+    shown = [day_of(metrics, day, zone, logged) for day in days]
     span = int(shown[0].span.starts[0]), int(shown[-1].span.ends[0])
     data = ReportData(
         nodes=home.nodes,

@@ -523,12 +523,16 @@ def page_statements(
     picture = picture_of(home)
     night, day = (single_span(part.start, part.end) for part in home.times_of_day())
     both = single_span(int(night.starts[0]), int(day.ends[0]))
-    yield from _page_sentence(picture["sentence"], home, truth, both)
+    sentence = picture["sentence"]
+    for part in re.split(r"(?<=\.) (?=By day)", sentence):
+        span = night if "In the night" in part else day if "By day" in part else both
+        yield from _page_sentence(part, home, truth, span, modest=is_modest(sentence))
     morning = home._replace(
         moment=home.moment._replace(now=at_hour(truth.metrics.day, MORNING, home.zone) + HOUR),
         is_past=False,
     )
-    yield from _page_sentence(picture_of(morning)["sentence"], home, truth, truth.everywhere.night)
+    sentence, last_night = picture_of(morning)["sentence"], truth.everywhere.night
+    yield from _page_sentence(sentence, home, truth, last_night, modest=is_modest(sentence))
     for lane in (each for each in picture["rooms"][0]["lanes"] if each["label"] != UNKNOWN):
         name, modest = lane["label"], is_modest(lane["told"])
         for count, span, what in zip(lane["counts"], (night, day), picture["columns"], strict=True):
@@ -549,8 +553,10 @@ def _of_page(truth: TrueDay, lane: object, name: str, span: Spans) -> int:
     return metrics.home.minutes.between(span).count(name, None).labelled
 
 
-def _page_sentence(text: str, home: HomeDay, truth: TrueDay, span: Spans) -> Iterator[Statement]:
-    day, modest = truth.everywhere, is_modest(text)
+def _page_sentence(
+    text: str, home: HomeDay, truth: TrueDay, span: Spans, *, modest: bool
+) -> Iterator[Statement]:
+    day = truth.everywhere
     if "television" in text:
         day = truth.metrics
     minutes = day.home.minutes.between(span)

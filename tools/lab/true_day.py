@@ -127,6 +127,6 @@ def true_day(sounds: Sequence[TrueSound], day: DayMetrics) -> TrueDay:
 
     def of(television: Bool) -> DayMetrics:
         minutes = replace(home.minutes, television=television)
-        return day_of(replace(home, minutes=minutes), day.day, day.zone, apart=day.apart)
+        return day_of(replace(home, minutes=minutes), day.day, day.zone)
 
     return TrueDay(of(apart), of(np.zeros(len(apart), bool)), on)

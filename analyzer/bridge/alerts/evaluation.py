@@ -10,7 +10,6 @@ import numpy as np
 from hearthlog.analyzer.activity import ANY_SOUND
 from hearthlog.analyzer.activity.day_anomaly import Routines
 from hearthlog.analyzer.activity.day_profile import (
-    APART_IN_LENGTH,
     HomeSegments,
     Profiles,
     television_spans,
@@ -38,16 +37,18 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     SoundRule,
     UnlikeUsual,
     UnusualDay,
+    delay_of,
     duration_words,
     pause_of,
 )
 from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.local_time import day_span, local_time, night_span
 from hearthlog.analyzer.logs.spans import (
+    EVENT_PAUSE,
+    NONE,
     Spans,
     Timed,
     cut,
-    difference,
     first_of_groups,
     intersection,
     joined,
@@ -77,17 +78,27 @@ class SoundEvents(NamedTuple):
         return intersection(self.coverage, Spans(self.counted[begun], self.ends[begun]))
 
 
-def events_of_rule(rule: SoundRule, activity: HomeActivity) -> SoundEvents:
+def events_of_rule(
+    rule: SoundRule, activity: HomeActivity, television: Spans = NONE
+) -> SoundEvents:
     """Find the events that a rule counts, without too short ones.
 
     Segments of all microphones that are at most ten seconds apart form one event, unless the rule
-    sets a microphone or pause.
+    sets a microphone or pause. Those beside a `television` are left out. All times are later by the
+    delay of the rule.
     """
     sounds = activity.of(rule.label)
     rows = sounds.confidences >= np.float32(rule.confidence)
     if rule.microphone:
         rows &= sounds.microphones == rule.microphone
     spans = joined(sounds.starts[rows], sounds.ends[rows])
+    if delay := delay_of(rule):
+        television = television_spans(home_sound(activity).labels)
+    if len(television.starts):
+        events = joined(*spans, EVENT_PAUSE)
+        own = rows_at(television, events.starts) < 0
+        spans = intersection(spans, Spans(events.starts[own], events.ends[own]))
+    spans = Spans(spans.starts + delay, spans.ends + delay)
     firsts = first_of_groups(spans.starts, spans.ends, pause_of(rule))
     ends = spans.ends[np.append(firsts[1:], len(spans.ends)) - 1] if len(firsts) else spans.ends
     starts = spans.starts[firsts]
@@ -186,7 +197,7 @@ def longer_than_conditions(
 
     def text(time: int) -> str:
         began = events.starts[np.searchsorted(events.starts, time, side="right") - 1]
-        since = f"{local_time(int(began), zone):%H:%M}"
+        since = f"{local_time(int(began) - delay_of(rule), zone):%H:%M}"
         return f"{rule.words} for longer than {duration_words(rule.longer_than)}, since {since}"
 
     return [Condition(*span, text) for span in zip(times.tolist(), over.tolist(), strict=True)]
@@ -311,14 +322,18 @@ def unlike_conditions(
     days = judged_days(rule, start, end, zone)
     if not days:
         return []
-    events = events_of_rule(rule, activity)
-    spans, starts = events.counted_coverage(), events.counted
+    labelled = counted = events_of_rule(rule, activity)
     if rule.label in ON_TELEVISION:  # counted as in the report
         television = television_spans(home_sound(activity).labels)
-        starts = starts[rows_at(television, events.starts) < 0]
-        if rule.label in APART_IN_LENGTH:
-            spans = difference(spans, television)
+        counted = events_of_rule(rule, activity, television)
     listened = activity.listened(rule.label, rule.microphone)
+
+    def amounts(events: SoundEvents, day: date) -> tuple[int, float]:
+        """Return the number of events of a day, and their minutes."""
+        start, end = _part(rule, day, zone)
+        number = int(np.diff(np.searchsorted(events.counted, [start, end]))[0])
+        lump = rule.least_seconds / 60 * number
+        return number, cut(events.counted_coverage(), start, end).length / MINUTE + lump
 
     @cache
     def figure(day: date) -> Count | Duration | None:
@@ -326,12 +341,13 @@ def unlike_conditions(
         start, end = _part(rule, day, zone)
         if cut(listened, start, end).length < rule.least_share * (end - start):
             return None
-        edges = np.searchsorted(starts, [start, end])
-        number = int(edges[1] - edges[0])
-        if rule.of == "count":
-            return Count(number)
-        lump = rule.least_seconds / 60 * number
-        return Duration(cut(spans, start, end).length / MINUTE + lump)
+        number, minutes = amounts(counted, day)
+        return Count(number) if rule.of == "count" else Duration(minutes)
+
+    def most(day: date) -> float:
+        """Return the figure of a day with all that may have sounded beside a television."""
+        (number, minutes), (every, in_all) = amounts(counted, day), amounts(labelled, day)
+        return max(every, number + in_all - minutes) if rule.of == "count" else in_all
 
     conditions = []
     for day, time in days:
@@ -339,7 +355,12 @@ def unlike_conditions(
         baseline = usual_range(
             [figure(day - timedelta(days=ago)) for ago in range(1, BASELINE_DAYS + 1)]
         )
-        if own is not None and baseline is not None and _is_unlike(rule, own.middle, baseline):
+        if own is None or baseline is None:
+            continue
+        more = own.middle > baseline.highest * (1 + rule.margin)
+        # Who watches television all day is not missed.
+        less = most(day) < baseline.lowest * (1 - rule.margin)
+        if (more and rule.which != "less") or (less and rule.which != "more"):
             conditions.append(_at_once(time, _unlike_text(rule, day, own, baseline)))
     return conditions
 
@@ -354,12 +375,6 @@ def _part(rule: UnlikeUsual, day: date, zone: tzinfo) -> tuple[int, int]:
     if rule.part == "day":
         return day_span(day - timedelta(days=1), zone)
     return night_span(day, zone)
-
-
-def _is_unlike(rule: UnlikeUsual, value: float, baseline: UsualRange) -> bool:
-    more = value > baseline.highest * (1 + rule.margin)
-    less = value < baseline.lowest * (1 - rule.margin)
-    return (more and rule.which != "less") or (less and rule.which != "more")
 
 
 def _unlike_text(rule: UnlikeUsual, day: date, own: Count | Duration, baseline: UsualRange) -> str:

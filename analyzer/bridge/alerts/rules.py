@@ -10,8 +10,9 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from hearthlog.analyzer.activity import ANY_SOUND, LONGEST_PAUSE
 from hearthlog.analyzer.activity.day_anomaly import LONGEST
+from hearthlog.analyzer.activity.event_counts import AROUND
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, NEVER
-from hearthlog.models.classes import SILENCE, class_name, in_words
+from hearthlog.models.classes import IMPORTANT, ON_TELEVISION, SILENCE, class_name, in_words
 from hearthlog.recorder.pause_schedule import QuietHours, check_quiet_hours, quiet_hours
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS
@@ -277,18 +278,33 @@ def pause_of(rule: SoundRule) -> int:
     return rule.pause if isinstance(rule, LongerThan) else EVENT_PAUSE
 
 
+_DECIDED = (AROUND + 1) * MINUTE  # after the start of a minute, whether it has a television
+
+
+def delay_of(rule: SoundRule) -> int:
+    """Return how much later sounds count for a rule than they begin, in nanoseconds.
+
+    A television is known only minutes later, and its talk must not notify. Nobody waits for what a
+    person may need help for.
+    """
+    is_apart = rule.label in ON_TELEVISION and rule.label not in IMPORTANT
+    return _DECIDED if is_apart and isinstance(rule, MoreThan | LongerThan) else 0
+
+
 def history(rule: AlertRule) -> int:
     """Return the length of activity before a time that a rule needs, in nanoseconds.
 
     Events that begin earlier and reach into this history must be complete.
     """
     if isinstance(rule, MoreThan):
-        return rule.window + _MARGIN
+        return rule.window + 2 * delay_of(rule) + _MARGIN
     if isinstance(rule, RecorderSilent):
         return rule.silent_for + _MARGIN
     if isinstance(rule, DailyRule):
         return 34 * DAY
-    return _TWO_DAYS if isinstance(rule, NoneBy) else LONGEST_PAUSE + _MARGIN
+    if isinstance(rule, NoneBy):
+        return _TWO_DAYS
+    return LONGEST_PAUSE + 2 * delay_of(rule) + _MARGIN
 
 
 def live_history(rule: AlertRule) -> int:

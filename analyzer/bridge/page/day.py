@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness
+from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE
 from hearthlog.analyzer.bridge.corrections import EventCorrections
 from hearthlog.analyzer.bridge.home_state import (
     MOST,
@@ -24,7 +25,7 @@ from hearthlog.analyzer.logs.local_time import (
     evening_before,
     local_time,
 )
-from hearthlog.analyzer.logs.spans import joined
+from hearthlog.analyzer.logs.spans import cut, joined, union
 from hearthlog.models.classes import (
     IMPORTANT,
     RUNNING_WATER,
@@ -321,6 +322,8 @@ _PARTLY = ("night.partly", "day.partly", "day.past partly")
 _NOON = 12
 _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 4  # of a class
+_TELEVISION_PAUSE = 20 * MINUTE  # shorter pauses of a television are left out, as in the report
+_MOST_TELEVISION = 2  # times of a television
 _LONGEST = 72  # characters of a sentence about several classes: four lines of a phone
 _LONGEST_OF_ONE = 96  # about one of several
 
@@ -337,36 +340,45 @@ def day_sentence(home: HomeDay) -> str:
     hour = local_time(moment.now, home.zone).hour
     if home.is_past or hour >= _NOON:
         return _sentence_of_day(home)
-    end = min(moment.morning, moment.now)
-    words, found = home.words, _events_of(home, moment.night, moment.morning)
+    start, end = moment.night, min(moment.morning, moment.now)
+    words, found = home.words, _events_of(home, start, moment.morning)
     is_over = moment.now >= moment.morning
+    rooms, television = _by_room(found), _television(home, start, end)
     if not all(each.is_night_covered(moment) for each in home.microphones) or not home.microphones:
         when = words.text("night.partly")
-    elif all(_is_quiet(own, end - moment.night) for own in _by_room(found).values()):
-        when = words.text("night.quiet" if is_over else "night.quiet so far")
+    elif all(_is_quiet(each, rooms.get(each.name, {}), start, end) for each in home.microphones):
+        when, television = words.text("night.quiet" if is_over else "night.quiet so far"), ""
         found = {name: own for name, own in found.items() if name in IMPORTANT}
     else:
         when = words.text("night.last" if is_over else "night.this")
-    return _sentence(when, found, home)
+    return _sentence([DayPart(when, found, television)], home)
 
 
 def _sentence_of_day(home: HomeDay) -> str:
     moment, words, span = home.moment, home.words, home.span()
-    start = span.start if home.is_past else at_hour(home.date, MORNING, home.zone)
+    morning = at_hour(home.date, MORNING, home.zone)
+    start = span.start if home.is_past else morning
     found = _events_of(home, start, span.end)
+    since = "" if home.is_past else words.text("since", time=clock(start, home.zone))
+    parts = [DayPart(since, found)]
+    if home.is_past:
+        both = (("day.past night", start, morning), ("day.past day", morning, span.end))
+        parts = [DayPart(words.text(key), _events_of(home, *times)) for key, *times in both]
+    parts = [part for part in parts if {*part.found} & {*IMPORTANT}]
     shares = [m.listened_share(start, moment.now) for m in home.microphones]
     if min(shares, default=0) < MOST:
-        when = words.text("day.past partly" if home.is_past else "day.partly")
-        return _sentence(when, found, home)
-    when = "" if home.is_past else words.text("since", time=clock(start, home.zone))
-    if any(name in IMPORTANT for name in found):
-        return _sentence(when, found, home)
+        partly = words.text("day.past partly" if home.is_past else "day.partly")
+        is_split = home.is_past and bool(parts)
+        heads = [DayPart(partly, {}), *parts] if is_split else [DayPart(partly, found)]
+        return _sentence(heads, home)
+    if parts:
+        return _sentence(parts, home)
     detectable = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
     names = [words.inside(words.class_words(name)) for name in ordered(detectable)]
     if not names:
-        return _sentence(when, found, home) if found else ""
+        return _sentence([DayPart(since, found)], home) if found else ""
     key = "day.past none" if home.is_past else "day.none"
-    none = words.text(key, when=when, classes=words.listed(names, "or"))
+    none = words.text(key, when=since, classes=words.listed(names, "or"))
     return words.text("by its sound", sentence=none) + "."
 
 
@@ -390,42 +402,103 @@ def _by_room(found: SoundsOfRooms) -> dict[str, dict[str, Sequence[SoundEvent]]]
     return rooms
 
 
-def _is_quiet(found: Mapping[str, Sequence[SoundEvent]], length: int) -> bool:
+def _is_quiet(
+    microphone: LiveMicrophone, found: Mapping[str, Sequence[SoundEvent]], start: int, end: int
+) -> bool:
+    """Whether a night was quiet in a room, by its events that count; no television is quiet."""
     seconds = sum(event.seconds for events in found.values() for event in events)
     important = sum(len(events) for name, events in found.items() if name in IMPORTANT)
-    return important <= _QUIET_EVENTS and seconds * NANOSECONDS <= _QUIET_SHARE * length
+    sound = seconds * NANOSECONDS + cut(microphone.television(), start, end).length
+    return important <= _QUIET_EVENTS and sound <= _QUIET_SHARE * (end - start)
 
 
-def _sentence(when: str, found: SoundsOfRooms, home: HomeDay) -> str:
-    """Return a sentence that is short, if several classes are in it.
+def _television(home: HomeDay, start: int, end: int) -> str:
+    """Return when something like a television sounded, in words; empty if it was short."""
+    words = home.words
+    minutes = union(*(cut(each.television(), start, end) for each in home.microphones))
+    if minutes.length <= _QUIET_SHARE * (end - start):
+        return ""
+    pairs = [*joined(*minutes, _TELEVISION_PAUSE).pairs()]
+    clocks = [(clock(first, home.zone), clock(last, home.zone)) for first, last in pairs]
+    times = words.listed([words.text("range", first=a, last=b) for a, b in clocks])
+    key = "television.times"
+    if len(pairs) > _MOST_TELEVISION:
+        key = "television.some"
+        times = words.text("range", first=clocks[0][0], last=clocks[-1][1])
+    elif len(pairs) == 1 and end == home.moment.now and pairs[0][1] > end - AROUND * MINUTE:
+        key, times = "television.since", clocks[0][0]  # it may be on
+    elif len(pairs) == 1 and pairs[0][0] == start:
+        key, times = "television.until", clocks[0][1]
+    return words.text(key, times=times)
 
-    It has times of day and the class that worries least, as far as there is room.
+
+class DayPart(NamedTuple):
+    """A part of a day, for the sentence about it."""
+
+    when: str
+    found: SoundsOfRooms  # events
+    television: str = ""  # when there was something like one
+
+    @property
+    def names(self) -> list[str]:
+        """The classes of the sentence: the important ones, if there are any."""
+        important = [name for name in self.found if name in IMPORTANT]
+        return (important or [*self.found])[:_MOST_CLASSES]
+
+
+def _sentence(parts: Sequence[DayPart], home: HomeDay) -> str:
+    """Return a sentence for each part, all short if they are about several classes.
+
+    They have times of day and the class that worries least, as far as there is room.
     """
-    names = ([name for name in found if name in IMPORTANT] or [*found])[:_MOST_CLASSES]
-    is_brief = len(names) > 1
+    shown = [part._replace(found={name: part.found[name] for name in part.names}) for part in parts]
+    is_brief = sum(len(part.found) + bool(part.television) for part in shown) > 1
     while True:
-        shown = {name: found[name] for name in names}
+        count = sum(len(part.found) for part in shown)
+        limit = _LONGEST if count > 1 and len(shown) == 1 else _LONGEST_OF_ONE
+        limit += sum(len(part.television) for part in shown)  # is never left out
+        limit += sum(len(part.when) for part in shown) if len(shown) > 1 else 0
+        dispensable = [n for n, part in enumerate(shown) if {*part.found} - {*WORRYING}]
         # Times of the first class matter more than a last one that worries nobody.
-        is_dispensable = bool(names[1:]) and names[-1] not in WORRYING
+        is_dispensable = bool(dispensable) and count > 1
         for times in (_MOST_CLOCKS,) if is_dispensable else (_MOST_CLOCKS, 1, 0):
-            sentence = _sentence_of(when, shown, home, times if is_brief else None)
-            if not is_brief or len(sentence) <= (_LONGEST if names[1:] else _LONGEST_OF_ONE):
+            sentence = _sentence_of(shown, home, times if is_brief else None)
+            if not is_brief or len(sentence) <= limit:
                 return sentence
         if not is_dispensable:
             return sentence
-        names.pop()
+        last = shown[dispensable[-1]]
+        name = [name for name in last.found if name not in WORRYING][-1]
+        rest = {each: own for each, own in last.found.items() if each != name}
+        shown[dispensable[-1]] = last._replace(found=rest)
+        if not rest and not last.television:
+            del shown[dispensable[-1]]
 
 
-def _sentence_of(when: str, found: SoundsOfRooms, home: HomeDay, most: int | None) -> str:
+def _sentence_of(parts: Sequence[DayPart], home: HomeDay, most: int | None) -> str:
     words = home.words
-    parts = [_class_and_times(name, found[name], home, most) for name in found]
-    is_simple = all(len(part) == 1 for part in parts)
-    texts = [", ".join(part) for part in parts]
+    sentences = [_part_in_words(part, home, most) for part in parts]
+    text = ". ".join(each[:1].upper() + each[1:] for each in sentences if each)
+    if not any(part.found or part.television for part in parts) and parts[0].when in map(
+        words.text, _PARTLY
+    ):
+        return f"{text}."
+    return words.text("by its sound", sentence=text) + "."
+
+
+def _part_in_words(part: DayPart, home: HomeDay, most: int | None) -> str:
+    words = home.words
+    parts = [_class_and_times(name, part.found[name], home, most) for name in part.found]
+    texts = [", ".join(each) for each in parts]
+    is_simple = all(len(each) == 1 for each in parts) and not part.television
+    if part.television:
+        texts.insert(sum(name in IMPORTANT for name in part.found), part.television)
     what = words.listed(texts) if is_simple else "; ".join(texts)
-    if not parts and when in map(words.text, _PARTLY):
-        return f"{when}."
-    text = words.text("sentence", when=when, what=what) if parts and when else when or what
-    return words.text("by its sound", sentence=text[:1].upper() + text[1:]) + "."
+    return (
+        words.text("sentence", when=part.when, what=what)
+        if what and part.when
+        else (part.when or what)
+    )
 
 
 def _class_and_times(
