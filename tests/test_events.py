@@ -218,17 +218,28 @@ def test_sound_that_was_not_kept_cannot_be_played_and_is_said_so(home, hearthlog
 
 
 def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path, hearthlog):
-    rings = [(at("08:00"), 5, "phone_ring", 0.95), (at("09:00"), 5, "phone_ring", 0.4)]
-    write_day(tmp_path, DAY, rings)
-    found = hearthlog("events", tmp_path, "--day", DAY, "--label", "phone_ring")
-    assert found.stdout.splitlines()[-1] == (
-        "Telephone ringing on Monday, 2026-03-02: 1, and perhaps 1 more"
-    )
+    coughs = [(at("08:00"), 5, "coughing", 0.95), (at("09:00"), 5, "coughing", 0.4)]
+    rings = [(at("10:00"), 5, "phone_ring", 0.95), (at("11:00"), 5, "phone_ring", 0.69)]
+    write_day(tmp_path, DAY, [*coughs, *rings], classes=GENERAL)
+    found = hearthlog("events", tmp_path, "--day", DAY, "--label", "coughing")
+    assert found.stdout.splitlines()[-1] == "Coughing on Monday, 2026-03-02: 1, and perhaps 1 more"
     found = hearthlog("events", tmp_path, "--day", DAY, "--json")
-    assert json.loads(found.stdout)["counts"]["phone_ring"] == {
-        "counted": 2, "television": 0, "unsure": 1,
-    }  # fmt: skip
-    assert "telephone ringing 1 (+1?)" in hearthlog("info", tmp_path).stdout
+    counts = json.loads(found.stdout)["counts"]
+    assert counts["coughing"] == {"counted": 2, "television": 0, "unsure": 1}
+    assert counts["phone_ring"] == {"counted": 1, "television": 0, "unsure": 0}
+    assert "coughing 1 (+1?) and telephone ringing 1;" in hearthlog("info", tmp_path).stdout
+
+
+def test_a_telephone_of_which_the_model_is_not_sure_counts_where_a_person_reviewed_it(
+    tmp_path, hearthlog
+):
+    log = write_day(tmp_path, DAY, [(at("11:00"), 5, "phone_ring", 0.6)])[11]
+    counts = json.loads(hearthlog("events", tmp_path, "--day", DAY, "--json").stdout)["counts"]
+    assert "phone_ring" not in counts
+    begin = midnight(DAY) + int(at("11:00")) * NANOSECONDS
+    write_marks(log, [Mark("mic", begin, begin + 5 * NANOSECONDS, "phone_ring")])
+    counts = json.loads(hearthlog("events", tmp_path, "--day", DAY, "--json").stdout)["counts"]
+    assert counts["phone_ring"] == {"counted": 1, "television": 0, "unsure": 0}
 
 
 def test_time_that_nobody_listened_to_is_said(tmp_path, hearthlog):

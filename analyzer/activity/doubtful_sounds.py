@@ -1,19 +1,24 @@
 """Doubtful sounds: those that a model is not sure of, and that are loud or may be of a person."""
 
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
 from hearthlog.analyzer.activity.event_counts import events_and_confidences
 from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.selection import array_names
+from hearthlog.analyzer.logs.spans import NONE, Spans, rows_at
 from hearthlog.models.classes import (
+    COUNTED_IF_SURE,
     IMPORTANT,
     SILENCE,
     TELEVISION,
+    UNKNOWN,
     WORRYING,
     class_name,
 )
@@ -85,6 +90,22 @@ def perhaps(sounds: Collection[DoubtfulSound], hidden: Collection[str] = ()) -> 
 def has_no_majority(label: str, confidence: float) -> bool:
     """Whether no class has most of the probability of an event, unless it is listed anyway."""
     return confidence < _NO_MAJORITY_BELOW and class_name(label) not in _LISTED
+
+
+def is_too_doubtful(label: str, confidence: float) -> bool:
+    """Whether an event that nobody reviewed is in no count, because the model is not sure."""
+    return confidence < UNSURE_BELOW and class_name(label) in COUNTED_IF_SURE
+
+
+def without_too_doubtful(labels: Labelling, reviewed: Spans = NONE) -> Labelling:
+    """Call events that are too doubtful to count `unknown`, outside of reviewed spans."""
+    names = labels.labels.copy()
+    for name in COUNTED_IF_SURE:
+        events, highest = events_and_confidences(labels, name)
+        unsure = (highest < UNSURE_BELOW) & (rows_at(reviewed, events.starts) < 0)
+        spans = Spans(events.starts[unsure], events.ends[unsure])
+        names[(labels.labels == name) & (rows_at(spans, labels.starts) >= 0)] = UNKNOWN
+    return replace(labels, labels=names)
 
 
 def doubtful_events(labels: Labelling) -> Labelling:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hearthlog.analyzer.activity.checked_minutes import labelling_of_marks
+from hearthlog.analyzer.activity.doubtful_sounds import without_too_doubtful
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
@@ -21,7 +22,7 @@ from hearthlog.analyzer.logs.labelling import (
 )
 from hearthlog.analyzer.logs.recorder_info import Trouble, gaps_of, troubles_of
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
-from hearthlog.analyzer.logs.spans import SEGMENT_DELAY, Spans, cut, joined
+from hearthlog.analyzer.logs.spans import NONE, SEGMENT_DELAY, Spans, cut, joined
 from hearthlog.analyzer.marks.label_files import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import CLASS_NAME, OF_EVERY_SCENARIO, OTHER, class_name
@@ -110,6 +111,9 @@ def read_home(
         home.gone_through[source] = joined(starts, ends)
     _check(home, logs, labelling, close)
     _name_classes(home, logs.between(*close, layer), name)
+    for source, labels in home.segments.items():
+        reviewed_spans = home.gone_through.get(source, NONE)
+        home.segments[source] = without_too_doubtful(labels, reviewed_spans)
     try:
         home.hidden = logs.hidden_classes()
     except LogError as error:

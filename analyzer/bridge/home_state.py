@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.activity import ActiveClasses, EventRecord, SoundEvent
+from hearthlog.analyzer.activity.doubtful_sounds import is_too_doubtful
 from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE, television_minutes
 from hearthlog.analyzer.activity.segments import (
     GrowingSpans,
@@ -231,6 +232,8 @@ class LiveMicrophone:
             given = corrections.labels(events)
             counted = {event.id for event in self.counted(events)}
             for event in events:
+                if event.id not in given and is_too_doubtful(event.label, event.confidence):
+                    continue
                 name = given.get(event.id, label)
                 own = found.get(names.get(name, name))
                 if own is not None:
@@ -334,10 +337,8 @@ class LiveMicrophone:
         for record in self._records.values():
             record.forget(before, after)
         self._coverage.forget_before(before)
-        around = AROUND * MINUTE
-        kept = [
-            row for row in self._sounds if before - around <= row[1] and row[0] <= after + around
-        ]
+        first, last = before - AROUND * MINUTE, after + AROUND * MINUTE
+        kept = [row for row in self._sounds if first <= row[1] and row[0] <= last]
         if len(kept) < len(self._sounds):
             self._sounds = kept
             self._changes += 1

@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.activity import ANY_SOUND
+from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
 from hearthlog.analyzer.activity.day_anomaly import Routines
 from hearthlog.analyzer.activity.day_profile import (
     HomeSegments,
     Profiles,
     television_spans,
 )
+from hearthlog.analyzer.activity.doubtful_sounds import without_too_doubtful
 from hearthlog.analyzer.activity.segments import HomeActivity, is_of_scenario
 from hearthlog.analyzer.activity.values import (
     BASELINE_DAYS,
@@ -47,7 +49,6 @@ from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
     NONE,
     Spans,
-    Timed,
     cut,
     first_of_groups,
     intersection,
@@ -56,7 +57,7 @@ from hearthlog.analyzer.logs.spans import (
     rows_at,
 )
 from hearthlog.analyzer.report.wording import differences_text, rarity_text, short_day
-from hearthlog.models.classes import ON_TELEVISION, SILENCE
+from hearthlog.models.classes import COUNTED_IF_SURE, ON_TELEVISION, SILENCE
 from hearthlog.recorder.pause_schedule import QuietHours
 from hearthlog.schemas.arrays import Int64
 from hearthlog.schemas.frames import NANOSECONDS
@@ -322,6 +323,8 @@ def unlike_conditions(
     days = judged_days(rule, start, end, zone)
     if not days:
         return []
+    sure = UNSURE_BELOW if rule.label in COUNTED_IF_SURE else 0.0
+    rule = rule.model_copy(update={"confidence": max(rule.confidence, sure)})
     labelled = counted = events_of_rule(rule, activity)
     if rule.label in ON_TELEVISION:  # counted as in the report
         television = television_spans(home_sound(activity).labels)
@@ -357,12 +360,17 @@ def unlike_conditions(
         )
         if own is None or baseline is None:
             continue
-        more = own.middle > baseline.highest * (1 + rule.margin)
         # Who watches television all day is not missed.
-        less = most(day) < baseline.lowest * (1 - rule.margin)
-        if (more and rule.which != "less") or (less and rule.which != "more"):
+        if _is_unlike(rule, (own.middle, most(day)), baseline):
             conditions.append(_at_once(time, _unlike_text(rule, day, own, baseline)))
     return conditions
+
+
+def _is_unlike(rule: UnlikeUsual, values: tuple[float, float], baseline: UsualRange) -> bool:
+    """Whether the least value is above the usual range, or the most is below it."""
+    more = values[0] > baseline.highest * (1 + rule.margin)
+    less = values[1] < baseline.lowest * (1 - rule.margin)
+    return (more and rule.which != "less") or (less and rule.which != "more")
 
 
 def judged_days(rule: DailyRule, start: int, end: int, zone: tzinfo) -> list[tuple[date, int]]:
@@ -409,11 +417,12 @@ def unusual_conditions(
 def home_sound(activity: HomeActivity) -> HomeSegments:
     """Return the segments and coverage from which routines are fitted."""
     sounds = {name: own for (name, of_scenario), own in activity.sounds.items() if not of_scenario}
-    parts: dict[str, Timed] = {SILENCE: activity.listened(ANY_SOUND, ""), **sounds}
-    labels = in_order(
-        Labelling(own.starts, own.ends, np.full(len(own.starts), name, object))
-        for name, own in parts.items()
-    )
+    quiet = activity.listened(ANY_SOUND, "")
+    parts = [Labelling(*quiet, np.full(len(quiet.starts), SILENCE, object))]
+    for name, own in sounds.items():
+        label = np.full(len(own.starts), name, object)
+        parts.append(Labelling(own.starts, own.ends, label, own.confidences))
+    labels = without_too_doubtful(in_order(parts))
     of_home = [own for name, own in activity.classes.items() if not is_of_scenario(name)]
     names = sorted(set(sounds).union(*of_home))
     return HomeSegments(labels, {name: activity.listened(name, "") for name in names})
