@@ -355,7 +355,7 @@ def test_the_sentence_names_a_minute_once_and_times_once(sounds, english, german
 
 
 def test_a_count_with_what_is_not_sure_is_one_grammar_in_the_day_and_beside_other_classes():
-    rings = [(hour, 4, "phone_ring", 0.6) for hour in (9, 9.5, 10, 11.1)]
+    rings = [(hour, 4, "phone_ring", 0.9) for hour in (9, 9.5, 10, 11.1)]
     coughs = [
         *coughs_at(8, 8.5, 9.1, 10.1),
         *coughs_at(*(12 + n / 2 for n in range(11)), sure=False),
@@ -599,7 +599,7 @@ def test_the_page_says_which_sounds_that_people_ask_about_it_does_not_know():
 
 
 def test_times_of_the_first_class_are_there_though_a_telephone_rang():
-    rings = [(hour, 4, "phone_ring", 0.6) for hour in (-1.7, -1.6)]
+    rings = [(hour, 4, "phone_ring", 0.9) for hour in (-1.7, -1.6)]
     coughs = coughs_at(-0.53, 1.86, 2.27, 6.02, sure=False)
     home = home_at(9, tiled((-3, 9), *rings, *coughs, (1, 400, "speech", 0.9)))
     assert picture_of(home)["sentence"] == (
