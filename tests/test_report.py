@@ -434,7 +434,7 @@ def test_what_no_model_listens_for_is_not_said_to_be_absent_though_a_person_mark
     write_marks(logs[0], [Mark("mic", start + 10**9, start + 61 * 10**9, "flushing_water")])
     assert look(tmp_path / "logs").count("flushing_water") is None
     page = page_of(tmp_path / "logs", tmp_path)
-    assert "toilet flush" not in re.search("never labelled: coughing[^<]*", page)[0]
+    assert "toilet flush" not in re.search("never counted: coughing[^<]*", page)[0]
     assert "does not know these sounds" in page
     assert "toilet flush" in re.search("says nothing about them: [^.]*", page)[0]
 

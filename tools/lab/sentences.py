@@ -273,7 +273,7 @@ def _paragraph(kind: str, text: str, day: DayMetrics, truth: TrueDay) -> Iterato
         for name in names:
             yield _counted(
                 REPORT,
-                f"never labelled: {in_words(name)}",
+                f"never counted: {in_words(name)}",
                 (0, 0),
                 _count(truth, name),
                 modest=True,
