@@ -138,7 +138,9 @@ class Overview:
             for name in sounds
             if class_name(name) not in self._hidden
         ][:_MOST_NAMED]
-        return f"{text}; labelled most: {listed(most, 'and')}" if most else text
+        if not most:
+            return text
+        return f"{text}; labelled most, a television included: {listed(most, 'and')}"
 
     def _trouble(self) -> str:
         summary = self._summary
