@@ -38,6 +38,8 @@ _LEFT_OUT = (  # not of the product, or with threads, which a fork would lose
     "hearthlog.analyzer.review.viewer",
 )
 _SET_CHILD_SUBREAPER = 36  # of prctl(2)
+_MADV_COLLAPSE = 25  # of madvise(2)
+_HUGE = 1 << 21
 
 
 class CommandPopen(subprocess.Popen):
@@ -121,6 +123,22 @@ def _import_all():
                 import_module(found.name)
     gc.collect()
     gc.freeze()
+    _collapse_pages()
+
+
+def _collapse_pages():
+    """Have the memory in huge pages where the kernel can (6.1 and newer): a fork takes half as long.
+
+    It copies the table of pages, and each one that it then writes to.
+    """
+    madvise = ctypes.CDLL(None, use_errno=True).madvise
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        span, rights, *others = line.split()
+        start, end = (int(each, 16) for each in span.split("-"))
+        start, end = -(-start // _HUGE) * _HUGE, end // _HUGE * _HUGE
+        if rights == "rw-p" and (len(others) == 3 or others[3] == "[heap]"):
+            for place in range(start, end, _HUGE):
+                madvise(ctypes.c_void_p(place), ctypes.c_size_t(_HUGE), _MADV_COLLAPSE)
 
 
 def _serve(requests, parent):
