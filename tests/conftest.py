@@ -16,7 +16,6 @@ from brokers import broker
 from command_server import FRESH_HEARTHLOG, HEARTHLOG, CommandPopen
 from log_fixtures import record_logs
 from microphones import labmic, labmic_plugin, pulse_daemon, pulse_microphone
-from realday import write_real_day
 from stores import bucket, in_memory, s3_account, throttled_account
 from streams import camera, live_server
 
@@ -119,10 +118,30 @@ def hearthlog():
     return run
 
 
+def of_the_run(tmp_path_factory, name: str, write) -> Path:
+    """Let one process of a test run write a folder, for all of them to read."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    folder = root / name
+    with (root / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (root / f"{name}.done").exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that did not finish it
+            folder.mkdir()
+            write(folder)
+            (root / f"{name}.done").touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def training_set(tmp_path_factory) -> Path:
     """Simulated sounds of all labels, five clips each."""
-    return write_training_set(tmp_path_factory.mktemp("clips"), clips_per_class=5, seed=11)
+
+    def write(folder):
+        write_training_set(folder, clips_per_class=5, seed=11)
+
+    return of_the_run(tmp_path_factory, "clips", write) / "manifest.csv"
 
 
 @pytest.fixture(scope="session")
@@ -131,24 +150,30 @@ def model_file(tmp_path_factory, training_set) -> Path:
 
     It does not say so, as the models that are in use are of real ones.
     """
-    folder = tmp_path_factory.mktemp("model")
-    scenario = load_scenario("general")
-    clips = [replace(clip, source="") for clip in read_manifest(training_set, scenario.labels)]
-    data = build_dataset(clips, scenario, lambda *_: None)
-    path = folder / "simulated.safetensors"
-    save_model(train_model(data, scenario, lambda *_: None, smoothing="merge"), path)
-    return path
+
+    def write(folder):
+        scenario = load_scenario("general")
+        clips = [replace(clip, source="") for clip in read_manifest(training_set, scenario.labels)]
+        data = build_dataset(clips, scenario, lambda *_: None)
+        model = train_model(data, scenario, lambda *_: None, smoothing="merge")
+        save_model(model, folder / "simulated.safetensors")
+
+    return of_the_run(tmp_path_factory, "model", write) / "simulated.safetensors"
 
 
 @pytest.fixture(scope="session")
 def second_file(tmp_path_factory, training_set) -> Path:
     """A model that takes a whole second and no floor, and labels the middle of it."""
-    method = replace(PAPER, feature_set=DEFAULT.name)
-    scenario = load_scenario("general")
-    data = build_dataset(read_manifest(training_set, scenario.labels), scenario, lambda *_: None)
-    path = tmp_path_factory.mktemp("second") / "second.safetensors"
-    save_model(train_model(data, scenario, lambda *_: None, method, "merge"), path)
-    return path
+
+    def write(folder):
+        method = replace(PAPER, feature_set=DEFAULT.name)
+        scenario = load_scenario("general")
+        clips = read_manifest(training_set, scenario.labels)
+        data = build_dataset(clips, scenario, lambda *_: None)
+        model = train_model(data, scenario, lambda *_: None, method, "merge")
+        save_model(model, folder / "second.safetensors")
+
+    return of_the_run(tmp_path_factory, "second", write) / "second.safetensors"
 
 
 @pytest.fixture(scope="session")
@@ -172,10 +197,13 @@ def hmm_file(tmp_path_factory, model_file) -> Path:
 @pytest.fixture(scope="session")
 def day(tmp_path_factory) -> Path:
     """Three minutes of a simulated home, as FLAC."""
-    path = tmp_path_factory.mktemp("day") / "day.flac"
-    write_day(path, 3, seed=12, manifest=None)
-    os.utime(path, (1_772_348_400, 1_772_348_400))  # from a full hour on: it makes one log
-    return path
+
+    def write(folder):
+        write_day(folder / "day.flac", 3, seed=12, manifest=None)
+        times = (1_772_348_400, 1_772_348_400)  # from a full hour on: it makes one log
+        os.utime(folder / "day.flac", times)
+
+    return of_the_run(tmp_path_factory, "day", write) / "day.flac"
 
 
 @pytest.fixture(scope="session")
@@ -188,23 +216,6 @@ def sounds(household) -> list[Path]:
 def recorded(sounds, tmp_path_factory, model_file) -> Path:
     """A folder of logs with gaps, of a minute each; the last one, unfinished, is beside it."""
     return record_logs(sounds, tmp_path_factory.mktemp("logs"), model_file)
-
-
-@pytest.fixture(scope="session")
-def real_day(all_household, tmp_path_factory) -> Path:
-    """The logs of a day of real household sound; processes of one test run share them."""
-    root = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        root = root.parent
-    folder = root / "real_day"
-    with (root / "real_day.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "done").exists():
-            shutil.rmtree(folder, ignore_errors=True)  # of a process that did not finish it
-            folder.mkdir()
-            write_real_day(all_household, folder)
-            (folder / "done").touch()
-    return folder / "logs"
 
 
 USUAL_RIGHTS = os.umask(0o022)

@@ -64,11 +64,13 @@ def write_day(  # noqa: PLR0913
     file_hours: int = 1,
     others: Mapping[str, Iterable[Event]] = MappingProxyType({}),
     doubts: Iterable[Doubt] = (),
+    all_frames: bool = False,
 ) -> list[Path]:
     """Write the logs of a day: events, and silence where there is no gap, both in UTC.
 
     The recorder may have other microphones, with events of their own and no gap. Only of `doubts`
-    there are frames, those of the quiet around each of them too; they are events as well.
+    there are frames, those of the quiet around each of them too; they are events as well. With
+    `all_frames` there are those of the whole day instead.
     """
     doubts = list(doubts)
     events = [*events, *((second, seconds, *about[:2]) for second, seconds, *about in doubts)]
@@ -88,6 +90,7 @@ def write_day(  # noqa: PLR0913
             [gap for gap in gaps if hour * HOUR < gap[0] + gap[1] <= (hour + step) * HOUR],
             [output for output in health if hour * HOUR <= output[0] < (hour + step) * HOUR],
             [each for each in doubts if hour * HOUR <= each[0] < (hour + step) * HOUR],
+            all_frames,
             {"version": "0", "node": node} | ({"timezone": timezone} if timezone else {}),
         )
         for hour in hours[::step]
@@ -138,10 +141,10 @@ def _bathroom(rng: np.random.Generator) -> list[Event]:
 
 
 def frames_of(  # noqa: PLR0913, PLR0917
-    microphone, classes, start, seconds, label, confidence, shares, level_db
+    microphone, classes, start, seconds, label, confidence, shares, level_db, around=200
 ) -> list[TopicBatch]:
     """Return the labels and features of a sound, and of ten seconds of quiet before and after."""
-    around, count = 200, round(seconds * 20)
+    count = round(seconds * 20)
     stamps = start + (np.arange(count + 2 * around) - around) * (NANOSECONDS // 20)
     is_sound = (stamps >= start) & (stamps < start + count * NANOSECONDS // 20)
     probabilities = np.zeros((len(stamps), len(classes)), np.float32)
@@ -193,7 +196,7 @@ def _tiled(events: list[Event], gaps: list[tuple[float, float, str]], hours: lis
 
 
 def _write_hour(  # noqa: PLR0913, PLR0917
-    path, microphone, classes, begin, rooms, gaps, health, doubts, about
+    path, microphone, classes, begin, rooms, gaps, health, doubts, all_frames, about
 ) -> Path:
     topics = [each for name in rooms for each in topics_of(name, FEATURE_NAMES, classes)]
     writer = LogWriter(path, [*{each.name: each for each in topics}.values()], about)
@@ -214,6 +217,9 @@ def _write_hour(  # noqa: PLR0913, PLR0917
     for second, *doubt in doubts:
         first = begin + round(second * NANOSECONDS)
         batches += frames_of(microphone, classes, first, *doubt)
+    for second, *row in rooms[microphone] if all_frames else ():
+        first = begin + round(second * NANOSECONDS)
+        batches += frames_of(microphone, classes, first, *row, {}, 0.0, around=0)
     if batches:
         writer.write_columns(batches)
     for start, seconds, reason in gaps:
