@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
-from conftest import FRESH_HEARTHLOG
+from conftest import FRESH_HEARTHLOG, HEARTHLOG
 from log_fixtures import small_disk
 from systemd import PREFIX, PROGRAM
 from test_service import LOGS, UNIT, USER_ID, machine, service, wait_for_labels
@@ -168,7 +168,11 @@ def test_a_clap_moves_the_bar_and_the_answers_are_written(home, pulse_microphone
     assert [path for path in folder.rglob("*") if path.stat().st_mode & 0o077] == []
 
 
-@pytest.mark.parametrize("last", QUESTIONS)
+# One of each kind: a choice with a bar, a text, a password, yes or no, and what comes after all.
+@pytest.mark.parametrize(
+    "last",
+    ["Number, or several", "Room of nullsink", "Password (not shown)", "Send alerts", "Do this"],
+)
 def test_ctrl_c_at_any_question_leaves_nothing_changed(home, last):
     folder, env = home
     with dialogue(folder, env, "--no-service", "--config", "home.toml") as seen:
@@ -230,7 +234,7 @@ def test_two_microphones_that_cannot_be_told_apart_are_refused_before_the_rest(
 
 def run(folder, env, *options):
     return subprocess.run(
-        [*FRESH_HEARTHLOG, "setup", *options], cwd=folder, env=env, stdin=subprocess.DEVNULL,
+        [*HEARTHLOG, "setup", *options], cwd=folder, env=env, stdin=subprocess.DEVNULL,
         capture_output=True, text=True, timeout=SECONDS, check=False,
     )  # fmt: skip
 
