@@ -116,18 +116,20 @@ def _adopting():
 
 def _import_all():
     import hearthlog  # noqa: PLC0415
+    from hearthlog.schemas.messages.message_types import recorded_types  # noqa: PLC0415
 
     for found in pkgutil.walk_packages(hearthlog.__path__, "hearthlog.", onerror=lambda _: None):
         if not found.name.startswith(_LEFT_OUT):
             with contextlib.suppress(Exception):
                 import_module(found.name)
+    recorded_types()
     gc.collect()
     gc.freeze()
     _collapse_pages()
 
 
 def _collapse_pages():
-    """Have the memory in huge pages where the kernel can (6.1 and newer): a fork takes half as long.
+    """Have the memory in huge pages where the kernel can, as of 6.1: a fork takes half as long.
 
     It copies the table of pages, and each one that it then writes to.
     """

@@ -24,7 +24,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_fixtures import run
 from lossy_source import LossySource
-from viewers import Window, browsing, display, find_ruler, patiently, reviewing
+from viewers import COARSE, Window, browsing, display, find_ruler, patiently, reviewing
 
 from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
 from hearthlog.analyzer.errors import DataError
@@ -120,7 +120,7 @@ def cells_of(spans):
     return found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(operations, min_size=1, max_size=6))
 def test_marks_are_what_was_said_last_and_undone_they_are_as_before(shared_home, done):
     for log in find_logs(shared_home):
@@ -1148,10 +1148,7 @@ def test_a_drag_with_the_mouse_in_the_page_ends_as_a_mark_in_the_layer(home, tmp
             assert review.process.wait(60) == 0
 
 
-@pytest.mark.parametrize(("width", "height"), [(1366, 768), (390, 844)])
-def test_the_page_shows_the_line_before_and_the_last_one_whole_above_the_buttons(
-    home, tmp_path, width, height
-):
+def test_the_page_shows_the_line_before_and_the_last_one_whole_above_the_buttons(home, tmp_path):
     options = ("--web", "--port", free_port(), "--queue", "uncertain")
     lines = """[...document.querySelectorAll("#lines p")].map((line) => {
         const box = line.getBoundingClientRect(), whole = document.createRange();
@@ -1166,19 +1163,20 @@ def test_the_page_shows_the_line_before_and_the_last_one_whole_above_the_buttons
     with reviewing(home, *options, BROWSER="true") as review:
         line = review.wait_for("http://127.0.0.1:")
         address = line[line.index("http:") :].split()[0]
-        with browsing(address, tmp_path / "browser") as page:
-            page.call(
-                "Emulation.setDeviceMetricsOverride",
-                width=width, height=height, deviceScaleFactor=1, mobile=False,
-            )  # fmt: skip
+        with browsing(address, tmp_path / "browser", flags=COARSE) as page:
             review.wait_for("1 of ")
-            review.press("u")
-            requested = review.wait_for("2 of ")
-            patiently(page.text, lambda text: text == requested)
-            (done, is_complete), (last, also) = page.evaluate(lines)
-            assert done.startswith("marked as not sure: ")
-            assert (last, is_complete, also) == (requested, True, True)
-            assert min(page.evaluate(tops)) >= 0
+            for following, (width, height) in enumerate([(1366, 768), (390, 844)], start=2):
+                page.call(
+                    "Emulation.setDeviceMetricsOverride",
+                    width=width, height=height, deviceScaleFactor=0.5, mobile=False,
+                )  # fmt: skip
+                review.press("u")
+                requested = review.wait_for(f"{following} of ")
+                patiently(page.text, lambda text, wanted=requested: text == wanted)
+                (done, is_complete), (last, also) = page.evaluate(lines)
+                assert done.startswith("marked as not sure: ")
+                assert (last, is_complete, also) == (requested, True, True)
+                assert min(page.evaluate(tops)) >= 0
 
 
 def test_on_a_phone_the_page_has_the_question_and_large_buttons_of_its_answers(home, tmp_path):
@@ -1190,7 +1188,7 @@ def test_on_a_phone_the_page_has_the_question_and_large_buttons_of_its_answers(h
     with reviewing(home, *options, BROWSER="true") as review:
         line = review.wait_for("http://127.0.0.1:")
         address = line[line.index("http:") :].split()[0]
-        with browsing(address, tmp_path / "browser", "1366,768") as page:
+        with browsing(address, tmp_path / "browser", "1366,768", COARSE) as page:
             review.wait_for("1 of ")
             patiently(page.text, lambda text: text.startswith("1 of "))
             every = page.evaluate(buttons)
@@ -1203,7 +1201,7 @@ def test_on_a_phone_the_page_has_the_question_and_large_buttons_of_its_answers(h
             assert page.evaluate(f"{ends} - innerHeight") == 0
             page.call(
                 "Emulation.setDeviceMetricsOverride",
-                width=390, height=844, deviceScaleFactor=1, mobile=False,
+                width=390, height=844, deviceScaleFactor=0.5, mobile=False,
             )  # fmt: skip
             found = patiently(
                 lambda: page.evaluate(buttons), lambda each: max(right for *_, right in each) <= 390
@@ -1245,7 +1243,7 @@ def test_the_page_plays_the_kept_sound_of_the_span_and_nobody_else_gets_it(home,
         line = review.wait_for("http://127.0.0.1:")
         address = line[line.index("http:") :].split()[0]
         secret = urlsplit(address).path
-        flags = ("--autoplay-policy=no-user-gesture-required",)
+        flags = (*COARSE, "--autoplay-policy=no-user-gesture-required")
         with browsing(address, tmp_path / "browser", flags=flags) as page:
             review.wait_for("1 of 2")
             status, kind, content = request(port, f"{secret}sound")
