@@ -231,7 +231,7 @@ def test_a_day_is_saved_within_the_memory_and_the_space_of_a_small_machine(revie
     path = tmp_path / "day.rrd"
     command = [sys.executable, "-c", _SAVING, str(reviewed_day), str(path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert int(done.stdout) < 400_000  # kilobytes; with every frame of the day it was 630,000
+    assert int(done.stdout) < 330_000  # kilobytes; with every frame of the day it was 375,000
     assert path.stat().st_size < 10_000_000
 
 
