@@ -8,17 +8,17 @@ from homelife import at, write_day
 pytest.importorskip("hearthlog.tools.lab.sentences", reason="the wheel leaves the lab out")
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.tools.lab.sentences import (
+from hearthlog.tools.lab.sentences import statements
+from hearthlog.tools.lab.statements import (
     FALSE,
     HOLDS,
     INFO,
     LABELLED,
     PAGE,
     REPORT,
-    _counted,
+    judge_count,
     read_count,
     read_minutes,
-    statements,
 )
 
 DAY = date(2026, 3, 2)
@@ -73,7 +73,7 @@ def test_what_is_told_without_a_word_of_doubt_is_false_if_it_is_not_so():
         ("coughing", (1, 1), 3, True),
         ("coughing", (1, 4), 3, False),
     ]
-    verdicts = [_counted(PAGE, *row[:3], modest=row[3]).verdict for row in day]
+    verdicts = [judge_count(PAGE, *row[:3], modest=row[3]).verdict for row in day]
     assert verdicts == [FALSE, LABELLED, HOLDS]
 
 

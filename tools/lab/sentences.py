@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, date
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -57,46 +57,35 @@ from hearthlog.models.classes import (
 )
 from hearthlog.tools.cli.info_summary import Overview, day_lines
 from hearthlog.tools.lab.command import run
+from hearthlog.tools.lab.statements import (
+    FALSE,
+    HOLDS,
+    INFO,
+    LABELLED,
+    NUMBER,
+    PAGE,
+    REPORT,
+    TOLERANCE,
+    Statement,
+    is_close,
+    is_modest,
+    judge,
+    judge_count,
+    judge_length,
+    judge_times,
+    read_count,
+    read_minutes,
+    read_number,
+    time_at,
+)
 from hearthlog.tools.lab.true_day import NEAR, TrueDay, TrueSound, read_sounds, true_day
 
-HOLDS, LABELLED, FALSE = "holds", "wrong as labelled", "false"
-REPORT, PAGE, INFO = "report", "page", "info"
-_TOLERANCE = 0.2
 _COMPANY = 15 * MINUTE  # a television is known by the ten minutes around
 _SURE = 0.9
 _NO_SOUNDS = {SILENCE, UNKNOWN}
 _SHORTEST = MINUTE // 60  # of a sound that breaks a quiet stretch
-_MODEST = re.compile(r"labelled|up to|perhaps|by the sound of it", re.IGNORECASE)
 _CLOCK = re.compile(r"\b([0-2]\d:[0-5]\d)\b")
 _RUN = re.compile(r"\b([0-2]\d:[0-5]\d) to ([0-2]\d:[0-5]\d)\b")
-_WORDS = (
-    *("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"),
-    *("eleven", "twelve", "once", "twice"),
-)
-_NUMBERS = dict(zip(_WORDS, [*range(13), 1, 2], strict=True))
-_NUMBER = rf"(?:\d+|{'|'.join(_NUMBERS)})"
-_COUNT = re.compile(rf"({_NUMBER})(?: to ({_NUMBER}))?(?: times)?", re.IGNORECASE)
-_LENGTH = re.compile(r"(?:(\d+) h )?([\d.]+) (min|s|h)\b")
-
-
-class Statement(NamedTuple):
-    """A statement on a surface, and the truth.
-
-    Attributes
-    ----------
-    surface : str
-        `report`, `page` or `info`.
-    verdict : str
-        `HOLDS`, `LABELLED` (wrong, but it says that it is as labelled) or `FALSE`.
-    is_range : bool
-        Whether it is a count with a range.
-    """
-
-    surface: str
-    text: str
-    truth: str
-    verdict: str
-    is_range: bool = False
 
 
 class _Page(HTMLParser):
@@ -148,75 +137,6 @@ class _Page(HTMLParser):
             self.paragraphs.append((kind or outer or self._title, text))
         elif tag in {"th", "td"}:
             self._cells.append(text)
-
-
-def is_modest(text: str) -> bool:
-    """Whether a text says that it is only as labelled."""
-    return bool(_MODEST.search(text))
-
-
-def is_close(number: float, true: float) -> bool:
-    """Whether a number without a range is true: within a fifth, or within one."""
-    return abs(number - true) <= max(1.0, _TOLERANCE * true)
-
-
-def read_count(text: str) -> tuple[int, int] | None:
-    """Read a count or its range: `4 to 9 (12 labelled)`, `8`, `twice`; None if there is none."""
-    match = _COUNT.match(text.strip())
-    if match is None:
-        return None
-    low, high = (_number(each) for each in (match[1], match[2] or match[1]))
-    return low, high
-
-
-def read_minutes(text: str) -> float | None:
-    """Read a length of time in minutes: `1 h 05 min`, `under 1 min`; None if there is none."""
-    match = _LENGTH.search(text)
-    if match is None:
-        return None
-    number = float(match[2]) * {"min": 1, "s": 1 / 60, "h": 60}[match[3]]
-    return 60 * int(match[1] or 0) + number * (0.5 if "under" in text else 1)
-
-
-def _number(text: str) -> int:
-    return int(text) if text.isdigit() else _NUMBERS[text.lower()]
-
-
-def _judged(surface: str, text: str, truth: str, *, right: bool, modest: bool) -> Statement:
-    return Statement(surface, text, truth, HOLDS if right else LABELLED if modest else FALSE)
-
-
-def _counted(
-    surface: str, text: str, stated: tuple[int, int], true: float, *, modest: bool
-) -> Statement:
-    low, high = stated
-    if low == high:
-        return _judged(surface, text, f"{true:g}", right=is_close(low, true), modest=modest)
-    right = low <= true <= high
-    return Statement(surface, text, f"{true:g}", HOLDS if right else FALSE, is_range=True)
-
-
-def _lasted(surface: str, text: str, stated: float, true: float, *, modest: bool) -> Statement:
-    return _judged(surface, text, f"{true:.1f} min", right=is_close(stated, true), modest=modest)
-
-
-def _at_times(
-    surface: str, text: str, name: str, clocks: Sequence[str], truth: TrueDay, *, modest: bool
-) -> Statement:
-    wrong = [each for each in clocks if not _is_true_time(truth, name, each)]
-    stated = f"none at {', '.join(wrong)}" if wrong else "so it is"
-    return _judged(surface, text, stated, right=not wrong, modest=modest)
-
-
-def _is_true_time(truth: TrueDay, name: str, clock: str) -> bool:
-    day = truth.metrics
-    times = [_time(day, clock), _time(day, clock) - 24 * HOUR]  # the evening before
-    return any(truth.near(name, time) for time in times)
-
-
-def _time(day: DayMetrics, clock: str) -> int:
-    hours, minutes = map(int, clock.split(":"))
-    return int(day.span.starts[0]) + hours * HOUR + minutes * MINUTE
 
 
 def report_statements(
@@ -271,7 +191,7 @@ def _paragraph(kind: str, text: str, day: DayMetrics, truth: TrueDay) -> Iterato
     elif text.startswith("Listened for"):
         names = [n for n in day.home.classes if _mentions(text.partition(":")[2], n)]
         for name in names:
-            yield _counted(
+            yield judge_count(
                 REPORT,
                 f"never counted: {in_words(name)}",
                 (0, 0),
@@ -304,11 +224,11 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
         has_sound = np.zeros(len(hours), bool)
         for start, end in runs:
             has_sound[int(start[:2]) : int(end[:2])] = True
-        slack = 1 + _TOLERANCE
+        slack = 1 + TOLERANCE
         wrong = (has_sound & (hours * slack < LIVELY_MINUTES)) | (
             ~has_sound & (hours > LIVELY_MINUTES * slack)
         )
-        yield _judged(
+        yield judge(
             REPORT,
             first,
             f"wrong at {np.flatnonzero(wrong).tolist()} h",
@@ -316,10 +236,10 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
             modest=modest,
         )
     elif match := re.search(r"sound in (\d+) of|for (\w+) hours", first):
-        stated = _number(match[1] or match[2])
-        yield _counted(REPORT, first, (stated, stated), int(lively.sum()), modest=modest)
+        stated = read_number(match[1] or match[2])
+        yield judge_count(REPORT, first, (stated, stated), int(lively.sum()), modest=modest)
     elif "quiet" in first:
-        yield _judged(
+        yield judge(
             REPORT, first, f"{lively.sum()} hours with sound", right=not lively.any(), modest=modest
         )
     for sentence in rest:
@@ -345,25 +265,25 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
         words = f"(?:{'|'.join(map(re.escape, sorted(known)))})"
         after_number = rf"(?:bouts? of |times of )?{words}|by day|after|in the night"
         bare = re.sub(r"\([^)]*\)", "", part).lower()
-        match = re.search(rf"{words} ({_NUMBER})", bare) or re.search(
-            rf"({_NUMBER})(?: to ({_NUMBER}))? (?={after_number})", bare
+        match = re.search(rf"{words} ({NUMBER})", bare) or re.search(
+            rf"({NUMBER})(?: to ({NUMBER}))? (?={after_number})", bare
         )
         if match is None:
             continue
-        low = _number(match[1])
-        high = _number(match[2]) if match.lastindex == 2 else low
+        low = read_number(match[1])
+        high = read_number(match[2]) if match.lastindex == 2 else low
         where = sentence if sentence.startswith("In the night") else part
         span = next((own for when, own in parts.items() if when in where), day.span)
         true = day.count_in(name, span).labelled
         if "perhaps" in part:
-            more = re.search(rf"perhaps ({_NUMBER}) more", part)
-            least, most = (low, low + _number(more[1])) if more else (0, low)
+            more = re.search(rf"perhaps ({NUMBER}) more", part)
+            least, most = (low, low + read_number(more[1])) if more else (0, low)
             right = least <= true <= most or is_close(least, true) or is_close(most, true)
-            yield _judged(surface, part, f"{true:g}", right=right, modest=modest)
+            yield judge(surface, part, f"{true:g}", right=right, modest=modest)
         else:
-            yield _counted(surface, part, (low, high), true, modest=modest)
+            yield judge_count(surface, part, (low, high), true, modest=modest)
         if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
-            yield _at_times(surface, part, name, clocks, truth, modest=modest)
+            yield judge_times(surface, part, name, clocks, truth, modest=modest)
 
 
 def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
@@ -374,40 +294,38 @@ def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
         stated = [name for name in names if _mentions(match[1], name)]
         most = lasting[: len(stated)]
         shown = ", ".join(f"{in_words(n)} {_counted_minutes(true, n):.0f}" for n in most)
-        yield _judged(REPORT, text, shown, right={*stated} == {*most}, modest=modest)
+        yield judge(REPORT, text, shown, right={*stated} == {*most}, modest=modest)
     elif "It was quiet." in text:
-        yield _judged(
-            REPORT, text, f"{_sound(true):.1f} min", right=_sound(true) <= 2, modest=modest
-        )
+        yield judge(REPORT, text, f"{_sound(true):.1f} min", right=_sound(true) <= 2, modest=modest)
     elif "television" in text and (runs := _RUN.findall(text)):
         for run_ in runs:
-            start, end = (_time(true, each) for each in run_)
+            start, end = (time_at(true, each) for each in run_)
             end += 24 * HOUR * (end < start)
             wide = joined(truth.television.starts - _COMPANY, truth.television.ends + _COMPANY)
             inside = cut(wide, start, end).length / max(end - start, 1)
             statement = f"{' to '.join(run_)}: {text}"
-            yield _judged(
+            yield judge(
                 REPORT,
                 statement,
                 f"{inside:.0%} of it",
-                right=inside >= 1 - _TOLERANCE,
+                right=inside >= 1 - TOLERANCE,
                 modest=modest,
             )
     elif text.startswith("In the night"):
         yield from _counts_in(REPORT, text, truth)
         if (stated := read_minutes(text)) is not None and true.night_sound is not None:
-            yield _lasted(REPORT, text, stated, true.night_sound.minutes, modest=modest)
+            yield judge_length(REPORT, text, stated, true.night_sound.minutes, modest=modest)
     elif match := re.search(r"Only short sounds|Nothing was labelled", text):
         before = re.search(r"until (\d\d:\d\d)", text)
         after = re.search(r"after (\d\d:\d\d)", text)
-        spans = [(int(true.span.starts[0]), _time(true, before[1]))] if before else []
-        spans += [(_time(true, after[1]) + MINUTE, int(true.span.ends[0]))] if after else []
+        spans = [(int(true.span.starts[0]), time_at(true, before[1]))] if before else []
+        spans += [(time_at(true, after[1]) + MINUTE, int(true.span.ends[0]))] if after else []
         most = max(_busiest(true.home.sound, start, end) for start, end in spans)
-        yield _judged(
+        yield judge(
             REPORT,
             text,
             f"at most {most:.1f} of ten minutes",
-            right=most <= 1 + _TOLERANCE,
+            right=most <= 1 + TOLERANCE,
             modest=modest,
         )
 
@@ -433,10 +351,10 @@ def _sound(day: DayMetrics) -> float:
 def _quiet(text: str, truth: TrueDay) -> Statement:
     """Check that no sound of a second lies in a quiet stretch, a minute at its ends aside."""
     day = truth.metrics
-    start, end = (_time(day, each) for each in _CLOCK.findall(text)[:2])
+    start, end = (time_at(day, each) for each in _CLOCK.findall(text)[:2])
     inside = cut(day.home.sound, start + NEAR, end - NEAR)
     long = int((inside.ends - inside.starts >= _SHORTEST).sum())
-    return _judged(
+    return judge(
         REPORT,
         text,
         f"{long} sounds, {inside.length / MINUTE:.1f} min",
@@ -449,14 +367,14 @@ def _night_coughs(text: str, truth: TrueDay) -> Iterator[Statement]:
     modest = is_modest(text)
     if hours := re.findall(r"(\d+) after (\d\d):00", text):
         for number, hour in hours:
-            start = _time(truth.metrics, f"{hour}:00") - 24 * HOUR * (int(hour) >= 22)
+            start = time_at(truth.metrics, f"{hour}:00") - 24 * HOUR * (int(hour) >= 22)
             starts = truth.everywhere.home.events.get(COUGHING, NONE.starts)
             true = int(((starts >= start) & (starts < start + HOUR)).sum())
-            yield _counted(
+            yield judge_count(
                 REPORT, f"{number} after {hour}:00", (int(number),) * 2, true, modest=modest
             )
     else:
-        yield _at_times(REPORT, text, COUGHING, _CLOCK.findall(text)[-16:], truth, modest=modest)
+        yield judge_times(REPORT, text, COUGHING, _CLOCK.findall(text)[-16:], truth, modest=modest)
 
 
 def _sound_counts(
@@ -473,15 +391,17 @@ def _sound_counts(
     where = f"{cells[0]}: "
     if (stated := read_count(often.partition(" | ")[0])) is not None:
         modest = is_modest(heads[1] + cells[0] + re.sub(r"\(\d+ labelled\)", "", often))
-        yield _counted(REPORT, where + often, stated, _count(truth, name), modest=modest)
+        yield judge_count(REPORT, where + often, stated, _count(truth, name), modest=modest)
     if clocks := _CLOCK.findall(when):
-        yield _at_times(
+        yield judge_times(
             REPORT, where + when, name, clocks, truth, modest=is_modest(heads[2] + when)
         )
     if (minutes := read_minutes(lasting.partition(" | ")[0])) is not None:
         value = minutes_figure(name).value(truth.metrics)
         true = 0 if value is None else value.middle
-        yield _lasted(REPORT, where + lasting, minutes, true, modest=is_modest(heads[3] + lasting))
+        yield judge_length(
+            REPORT, where + lasting, minutes, true, modest=is_modest(heads[3] + lasting)
+        )
 
 
 def _figure(
@@ -493,11 +413,11 @@ def _figure(
     if _CLOCK.fullmatch(shown):
         hours, minutes = map(int, shown.split(":"))
         right = abs(60 * hours + minutes - middle) <= 10
-        yield _judged(REPORT, text, getattr(value, "text", "never"), right=right, modest=modest)
+        yield judge(REPORT, text, getattr(value, "text", "never"), right=right, modest=modest)
     elif (lasting := read_minutes(shown)) is not None:
-        yield _lasted(REPORT, text, lasting, middle, modest=modest)
+        yield judge_length(REPORT, text, lasting, middle, modest=modest)
     elif (stated := read_count(shown)) is not None:
-        yield _counted(REPORT, text, stated, middle, modest=modest)
+        yield judge_count(REPORT, text, stated, middle, modest=modest)
 
 
 def _assessed(
@@ -511,9 +431,9 @@ def _assessed(
     text = f"interRAI, {cells[0]}: {cells[2]}"
     modest = is_modest(heads[2] + re.sub(r"\(\d+ labelled\)", "", cells[2]))
     if (lasting := read_minutes(cells[2])) is not None:
-        yield _lasted(REPORT, text, lasting, true, modest=modest)
+        yield judge_length(REPORT, text, lasting, true, modest=modest)
     elif (stated := read_count(cells[2])) is not None:
-        yield _counted(REPORT, text, stated, true, modest=modest)
+        yield judge_count(REPORT, text, stated, true, modest=modest)
 
 
 def page_statements(
@@ -539,11 +459,11 @@ def page_statements(
             if count is not None:
                 text = f"{lane['words']}, {what}: {count}"
                 true = _of_page(truth, lane, name, span)
-                yield _counted(PAGE, text, (count, count), true, modest=modest)
+                yield judge_count(PAGE, text, (count, count), true, modest=modest)
         times = [time for time, *_ in lane["times"][0]["times"]]
         if times and len(times) <= 5:
             text = f"{lane['words']} at {', '.join(times)}"
-            yield _at_times(PAGE, text, name, times, truth, modest=modest)
+            yield judge_times(PAGE, text, name, times, truth, modest=modest)
     yield from _sureness(home, truth, sureness)
 
 
@@ -566,25 +486,25 @@ def _page_sentence(
     if match := re.search(r"[Nn]o ([^.:(]*)\.$", text):
         for name in (n for n in names if _mentions(match[1], n)):
             true = minutes.count(name, None).labelled
-            yield _counted(PAGE, f"{text} [{in_words(name)}]", (0, 0), true, modest=modest)
+            yield judge_count(PAGE, f"{text} [{in_words(name)}]", (0, 0), true, modest=modest)
         return
     if "quiet night" in text:
         sound = intersection(day.home.sound, span).length / MINUTE
-        limit = (1 + _TOLERANCE) * 0.01 * span.length / MINUTE
-        yield _judged(PAGE, text, f"{sound:.1f} min of sound", right=sound <= limit, modest=modest)
+        limit = (1 + TOLERANCE) * 0.01 * span.length / MINUTE
+        yield judge(PAGE, text, f"{sound:.1f} min of sound", right=sound <= limit, modest=modest)
     for name in names:
         words = re.escape(in_words(name).lower())
         match = re.search(
-            rf"(perhaps )?{words} ({_NUMBER})(?: times)?(?: \(([^)]*)\))?"
-            rf"(?:, perhaps ({_NUMBER}) more(?: times)?(?: \(([^)]*)\))?)?",
+            rf"(perhaps )?{words} ({NUMBER})(?: times)?(?: \(([^)]*)\))?"
+            rf"(?:, perhaps ({NUMBER}) more(?: times)?(?: \(([^)]*)\))?)?",
             text,
             re.IGNORECASE,
         )
         if match is None:
             continue
         perhaps, count, times, more, more_times = match.groups(default="")
-        total = _number(count) + (_number(more) if more else 0)  # labelled, sure or not
-        yield _counted(
+        total = read_number(count) + (read_number(more) if more else 0)  # labelled, sure or not
+        yield judge_count(
             PAGE,
             f"{text} [{in_words(name)}]",
             (0 if perhaps else total, total),
@@ -592,7 +512,9 @@ def _page_sentence(
             modest=modest,
         )
         if clocks := _CLOCK.findall(f"{times} {more_times}"):
-            yield _at_times(PAGE, f"{text} [{in_words(name)}]", name, clocks, truth, modest=modest)
+            yield judge_times(
+                PAGE, f"{text} [{in_words(name)}]", name, clocks, truth, modest=modest
+            )
 
 
 def _sureness(home: HomeDay, truth: TrueDay, measured: Sureness) -> Iterator[Statement]:
@@ -610,7 +532,7 @@ def _sureness(home: HomeDay, truth: TrueDay, measured: Sureness) -> Iterator[Sta
         text = f"{len(right)} sounds {words or 'without a word'}"
         share = sum(right) / len(right)
         holds = words != "sure" or share >= _SURE or sum(right) == len(right)
-        yield _judged(PAGE, text, f"{sum(right)} are of their class", right=holds, modest=False)
+        yield judge(PAGE, text, f"{sum(right)} are of their class", right=holds, modest=False)
 
 
 def info_statements(
@@ -628,7 +550,7 @@ def info_statements(
             text = f"{in_words(name)} {total.counted}"
             minutes = truth.metrics.home.minutes.between(day.span)
             number = minutes.count(name, None).labelled
-            yield _counted(INFO, text, stated, number, modest=is_modest(line))
+            yield judge_count(INFO, text, stated, number, modest=is_modest(line))
     for line in Overview(summary, day.zone).lines(None):
         for name in (n for n in _sounds_of(day) if _mentions(line, n)):
             words = re.escape(in_words(name).lower())
@@ -637,7 +559,7 @@ def info_statements(
                 stated = read_minutes(match[1])
                 assert stated is not None
                 text = f"{in_words(name)} {match[1]}"
-                yield _lasted(INFO, text, stated, _minutes(true, name), modest=is_modest(line))
+                yield judge_length(INFO, text, stated, _minutes(true, name), modest=is_modest(line))
 
 
 def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
