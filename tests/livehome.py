@@ -3,7 +3,7 @@
 import time
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta, timezone
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 
 import numpy as np
 from homelife import GENERAL, frames_of
@@ -59,6 +59,7 @@ class LiveHome:
             for microphone in microphones
             for topic in topics_of(microphone, FEATURE_NAMES, self.classes, neighbour)
         }
+        self._lock = Lock()
         path = log_path(folder, metadata.get("node", "home"), self.start)
         self._writer = LogWriter(
             path, list(topics.values()), {"version": "0", "node": "home"} | metadata
@@ -106,6 +107,24 @@ class LiveHome:
         }
         self._write(f"/{microphone}/label", stamps, fields)
 
+    @contextmanager
+    def listening(self, label, microphone="mic"):
+        """Write labels of now every few seconds: without them, a microphone is away after 15 s."""
+        ended = Event()
+
+        def write():
+            while not ended.wait(3):
+                self.hears(label, microphone)
+
+        thread = Thread(target=write, daemon=True)
+        self.hears(label, microphone)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
     def not_heard(self, minutes_ago, minutes, microphone="mic"):
         """Write a gap."""
         start = time.time_ns() - minutes_ago * MINUTE
@@ -138,8 +157,9 @@ class LiveHome:
         self._writer.finish()
 
     def _write(self, topic, times, fields):
-        self._writer.write_columns([TopicBatch(topic, np.atleast_1d(times), fields)])
-        self._writer.flush()
+        with self._lock:
+            self._writer.write_columns([TopicBatch(topic, np.atleast_1d(times), fields)])
+            self._writer.flush()
 
 
 @contextmanager

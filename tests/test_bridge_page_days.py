@@ -1313,8 +1313,8 @@ def test_nothing_moves_while_the_page_loads_and_is_updated(phone, tmp_path, widt
         phone.open(home, width)
         for label, words in (("speech", "Talking"), ("silence", "Quiet")):
             home.log.write_segment(label, 0.05)
-            home.log.hears(label)
-            phone.shows("#heard", words)
+            with home.log.listening(label):
+                phone.shows("#heard", words)
         home.log.write_status("mic", 1, "too loud for this microphone, in one second of five")
         phone.until("document.querySelector('.warning #attention')")
         phone.wait_until_drawn()

@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from log_fixtures import run
 from logs import read
+from matplotlib.figure import Figure
 from PIL import Image
 
 from hearthlog.analyzer.activity.daily_metrics import day_of, metrics_of_home
@@ -39,7 +40,8 @@ from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.analyzer.report.headline import day_headline
 from hearthlog.analyzer.report.report import Period, make_report, read_report_data
-from hearthlog.analyzer.report.timeline_plot import save_timelines
+from hearthlog.analyzer.report.timeline import timeline_of
+from hearthlog.analyzer.report.timeline_plot import _draw_lanes, save_timelines
 from hearthlog.models.classes import COUNTED_IF_SURE, colour, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
@@ -587,6 +589,14 @@ def test_the_days_of_a_week_before_the_first_log_and_after_the_last_are_a_row_ea
     assert "Both of the two recorded days" in text
     assert "there are no logs of the other five days." in text
     assert "There are logs only from Thu 26 Feb to Fri 27 Feb." in text
+
+
+def test_the_lane_of_a_model_of_one_class_fills_its_picture(tmp_path):
+    write_day(tmp_path, DAY, [(at("10:00"), 3600, "coughing", 0.9)], classes=["coughing"])
+    data, _ = read_report_data(find_home_logs([tmp_path]), Period(DAY, 1, UTC))
+    axes = Figure().subplots()
+    _draw_lanes(axes, [("", timeline_of(data.days[0]))])
+    assert axes.get_ylim() == (1, 0)
 
 
 def test_a_minute_of_a_day_is_no_hour_and_leaves_the_rest_of_the_day(tmp_path):

@@ -290,9 +290,9 @@ class LiveMicrophone:
             rows = sorted(self._sounds)
             starts, ends = (np.array([row[i] for row in rows], np.int64) for i in (0, 1))
             labels = np.array([class_name(row[2]) for row in rows], object)
-            last = int(ends.max(initial=0)) // MINUTE + AROUND
-            first = max(int(starts[:1].sum()) // MINUTE - AROUND, last - _MOST_MINUTES)
-            edges = np.arange(first, last + 1) * MINUTE
+            end = int(ends.max(initial=0))
+            first, last = int(starts.min(initial=end)) // MINUTE - AROUND, end // MINUTE + AROUND
+            edges = np.arange(max(first, last - _MOST_MINUTES), last + 1) * MINUTE
             minutes = edges[:-1][television_minutes(Labelling(starts, ends, labels), edges)]
             self._television = self._changes, joined(minutes, minutes + MINUTE)
         return self._television[1]

@@ -47,8 +47,8 @@ def save_timelines(path: Path, days: Sequence[DayMetrics], earlier: Sequence[Day
 
 
 def _lanes(timeline: DayTimeline) -> int:
-    """Return the height of a timeline in lanes: two hold a line of text."""
-    return max(len(timeline.lanes), 2)
+    """Return the height of a timeline in lanes: without lanes, two, which hold a line of text."""
+    return len(timeline.lanes) or 2
 
 
 def _draw_lanes(axes: Any, rows: Sequence[tuple[str, DayTimeline]]) -> None:
