@@ -52,6 +52,9 @@ def test_a_fleet_is_labelled_while_workers_are_killed(
     run = relabel_under_fire(fleet, model_file, tmp_path, every_layers(fleet, 15))
     assert run.status == 0, run
     assert run.kills >= 3
+    with open_workers() as workers:  # a task may have been given out twice, and end after the run
+        again = relabel([fleet], load_model(model_file), model_file, workers)
+    assert len(again.current) == 12 * 6
     assert [layers(home) for home in fleet.iterdir()] == [full] * 12
 
 

@@ -251,6 +251,19 @@ def test_a_run_that_is_killed_goes_on_where_it_was(model, logs, layers):
     assert written(logs) == layers
 
 
+@of_one_kind
+def test_what_a_killed_worker_left_of_a_complete_layer_is_deleted_by_the_next_run(model, logs):
+    (first, *_) = relabelled(model, logs).layers
+    remains = [first.with_name(f".{first.name}.0123456789abcdef.{end}") for end in ("part", "tmp")]
+    others = [first.with_name(".notes.part"), first.with_name(f".{first.name}.0123.txt")]
+    for path in (*remains, *others):
+        path.write_bytes(b"labels")
+    again = relabelled(model, logs)
+    assert first in again.current
+    assert not any(path.exists() for path in remains)
+    assert all(path.exists() for path in others)
+
+
 def complete(folder, layers):
     return sum(map(is_layer, find_logs(folder))) == len(layers)
 

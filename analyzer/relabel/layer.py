@@ -1,9 +1,8 @@
 """Relabel layers: job, labels and segments, metadata."""
 
-import glob
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -31,6 +30,7 @@ from hearthlog.models.labels import Segment, StateRun
 from hearthlog.models.labels.labeller import FrameLabels, label_columns, segment_columns
 from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.errors import HearthlogError, LogError, ModelError
+from hearthlog.schemas.files import store_errors
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import stem
 from hearthlog.schemas.logs.metadata import (
@@ -377,9 +377,22 @@ def complete_layer(job: Job, labelled: UnfinishedLayer) -> None:
     except LogError:
         if read_layer_metadata(job.layer) != metadata:  # otherwise another run was quicker
             raise
-    for part in job.layer.parent.glob(f".{glob.escape(job.layer.name)}.*"):  # also of other runs
-        with suppress(OSError):
-            part.unlink()
+    labelled.delete()
+
+
+def delete_remains(layers: Iterable[Path]) -> None:
+    """Delete the files that killed workers left of complete layers.
+
+    Each folder is listed once, since a store answers each request after some time.
+    """
+    names = {(layer.parent, layer.name) for layer in layers}
+    for folder in {folder for folder, _ in names}:
+        with suppress(LogError), store_errors(folder):
+            for path in folder.glob(".*"):
+                name, _, suffix = path.name.removeprefix(".").rpartition(".")
+                if suffix in {"part", "tmp"} and (folder, name.rpartition(".")[0]) in names:
+                    with suppress(OSError):
+                        path.unlink()
 
 
 def _batches(

@@ -15,6 +15,7 @@ from hearthlog.analyzer.relabel.layer import (
     OpenRuns,
     UnfinishedLayer,
     complete_layer,
+    delete_remains,
     is_current,
     label_logs,
     read_layer_metadata,
@@ -121,9 +122,10 @@ class _Relabelling:
                     self._submit(*some)
                 progress(self.result.logs)
                 if not self._running:
-                    return
+                    break
                 for future in wait(self._running, return_when=FIRST_COMPLETED).done:
                     self._receive(future)
+            delete_remains([*self.result.layers, *self.result.current])
         finally:
             for layer in self._unfinished.values():  # none, unless an error stopped the run
                 layer.delete()
