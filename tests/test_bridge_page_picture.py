@@ -197,3 +197,22 @@ def test_what_is_not_sure_has_a_question_mark_in_the_folded_list_too(phone, show
     about = phone.text("#look .fold .about")
     assert "02:40" in about.split(", ")
     assert any(each.endswith("?") for each in about.split(", ")), about
+
+
+def test_sounds_beside_a_television_are_behind_one_tap(phone, show):
+    show(390)
+    phone.shows("#events .fold .what", "Beside something like a television · 61 sounds, not counted")
+    about = phone.text("#events .fold .about").replace("\u00a0", " ")
+    assert about == "19:00 to 19:59 · Talking 60, Telephone ringing 1", about
+    beside = (
+        "[...document.querySelectorAll('#events > li')]"
+        ".filter((e) => e.innerText.includes('beside a television')).length"
+    )
+    assert phone.of(beside) == 0
+    button = "document.querySelector('#events button.fold')"
+    phone.of(f"{button}.click()")
+    assert phone.of(beside) == 3, "a bout has fifty sounds at most"
+    assert phone.of(f"{button}.getAttribute('aria-expanded')") == "true"
+    phone.of(f"{button}.click()")
+    assert phone.of(beside) == 0
+    assert phone.of("seen") == []

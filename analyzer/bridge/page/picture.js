@@ -92,7 +92,7 @@ function uncountedNote({ uncounted, uncounted_times: times }) {
 
 // The count of a lane; if it is 0, why the lane has marks nevertheless.
 function figureOf({ count: value, unsure, uncounted }) {
-  if (value) return unsure[0] ? counted(value, unsure[0]) : `${value}×`;
+  if (value) return counted(value, unsure[0]);
   return uncounted ? `${value ?? "–"} · ${count("uncounted", uncounted)}` : "";
 }
 const capital = (text) => text[0].toUpperCase() + text.slice(1);

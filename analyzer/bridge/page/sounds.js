@@ -1,5 +1,5 @@
 // Lists of sounds: what they were, what they really were, and their kept sound.
-import { ask, breakable, count, inside, keep, make, place, say, send, swatch, write } from "./elements.js";
+import { ask, breakable, count, counted, inside, keep, make, place, say, send, swatch, write } from "./elements.js";
 
 const REST = 8000; // milliseconds without a touch, after which a list may change
 const SEPARATOR = "\u00a0· "; // ends a line, and begins none
@@ -119,7 +119,9 @@ function showAnswer(item, said) {
 }
 
 // Sounds that need a look: of each class the newest, and the others behind one tap.
-const unfolded = new Set(); // classes
+const TELEVISION = "television"; // the fold of what does not count
+const unfolded = new Set(); // keys of folds
+const sum = (numbers) => numbers.reduce((total, each) => total + each, 0);
 
 function folded(look) {
   const entries = [], seen = new Map();
@@ -130,11 +132,30 @@ function folded(look) {
     if (same.length <= SINGLE + 1 || number < SINGLE) entries.push({ ...entry, isFolded: false });
     else if (number === SINGLE) {
       const earlier = same.slice(SINGLE);
-      entries.push({ id: `fold ${key}`, key, earlier, colour: entry.colour, words: entry.words },
+      const often = count("earlier", sum(earlier.map(({ ids }) => ids.length)), sum(earlier.map(({ unsure }) => unsure)));
+      const about = earlier.map((each) => [timeOf(each), each.room].filter(Boolean).join(" ")).join(", ");
+      entries.push({ id: `fold ${key}`, key, colour: entry.colour, words: entry.words, often, about },
         ...earlier.map((each) => ({ ...each, isFolded: !unfolded.has(key) })));
     }
   }
   return entries;
+}
+
+// Other sounds: those of a television, which do not count, behind one tap at the place of the newest.
+function withTelevisionFolded(others) {
+  const key = TELEVISION, uncounted = others.filter((entry) => entry.is_uncounted);
+  if (uncounted.length <= SINGLE) return others;
+  const [oldest, newest] = [uncounted, uncounted].map(([...all], end) =>
+    all.sort((a, b) => (end ? b.span[1] - a.span[1] : a.span[0] - b.span[0]))[0].span_words[end]);
+  const often = new Map();
+  for (const { words, ids } of uncounted) often.set(words, (often.get(words) ?? 0) + ids.length);
+  const classesOften = [...often].sort((a, b) => b[1] - a[1]).map(([words, number]) => `${words} ${counted(number)}`).join(", ");
+  const fold = { id: `fold ${key}`, key, colour: uncounted[0].colour, words: say("beside television"),
+    often: count("not counted", sum(often.values())), about: `${say("span", { first: oldest, last: newest })}${SEPARATOR}${classesOften}` };
+  return others.flatMap((entry) => {
+    if (!entry.is_uncounted) return [entry];
+    return [...(entry === uncounted[0] ? [fold] : []), ...(unfolded.has(key) ? [entry] : [])];
+  });
 }
 
 function beginFold({ key, colour, words }) {
@@ -144,6 +165,7 @@ function beginFold({ key, colour, words }) {
     make("p", { class: "what" }, swatch(colour), breakable(words), item.often), item.about), item.button);
   item.button.addEventListener("click", () => {
     if (!unfolded.delete(key)) unfolded.add(key);
+    if (key === TELEVISION) place("events").classList.remove("brief");
     showList(shownEvents);
   });
   return item;
@@ -155,11 +177,10 @@ function timeOf({ time, unsure, ids }) {
   return unsure === ids.length ? `${time}?` : `${time} (${unsure}?)`;
 }
 
-function showFold(item, { key, earlier, words }) {
-  const sum = (numbers) => numbers.reduce((total, each) => total + each, 0), isOpen = unfolded.has(key);
-  const often = count("earlier", sum(earlier.map(({ ids }) => ids.length)), sum(earlier.map(({ unsure }) => unsure)));
+function showFold(item, { key, often, about, words }) {
+  const isOpen = unfolded.has(key);
   write(item.often, `${SEPARATOR}${often}`);
-  write(item.about, earlier.map((each) => [timeOf(each), each.room].filter(Boolean).join(" ")).join(", "));
+  write(item.about, about);
   item.button.setAttribute("aria-expanded", String(isOpen));
   item.button.setAttribute("aria-label", `${say(isOpen ? "fold" : "unfold")}: ${words}, ${often}`);
   write(item.button, say(isOpen ? "fold" : "unfold"));
@@ -246,10 +267,11 @@ let touched = -Infinity;
 
 function showList(events) {
   shownEvents = events;
-  const look = events.filter((each) => each.look), others = events.filter((each) => !each.look);
-  arrange(place("look"), lists.look, folded(look),
-    (entry) => (entry.key ? beginFold : beginBout)(entry), (item, entry) => (entry.key ? showFold : showBout)(item, entry));
-  arrange(place("events"), lists.events, others, beginBout, showBout);
+  const look = events.filter((each) => each.look), others = withTelevisionFolded(events.filter((each) => !each.look));
+  const begun = (entry) => (entry.key ? beginFold : beginBout)(entry);
+  const show = (item, entry) => (entry.key ? showFold : showBout)(item, entry);
+  arrange(place("look"), lists.look, folded(look), begun, show);
+  arrange(place("events"), lists.events, others, begun, show);
   place("looked-at").hidden = !look.length;
   place("no-events").hidden = events.length > 0;
   write(place("all-events"), say("all", { count: others.length }));

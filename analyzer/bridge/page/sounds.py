@@ -161,10 +161,9 @@ class ShownBouts(NamedTuple):
         words, first = self.words, bout.first
         is_mixed = len(bout.labels) > 1  # events that are no count of one sound
         count = len(bout.events)
-        time = words.when(first.start, self.now, self.zone, is_past=self.is_past)
+        start = words.when(first.start, self.now, self.zone, is_past=self.is_past)
         end = clock(bout.end, self.zone)
-        if count > 1 and end != clock(first.start, self.zone):
-            time = words.text("range", first=time, last=end)
+        is_range = count > 1 and end != clock(first.start, self.zone)
         corrections = [text for text in map(self.correction, bout.events) if text]
         length = words.length(sum(event.seconds for event in bout.events))
         return {
@@ -173,11 +172,14 @@ class ShownBouts(NamedTuple):
             "words": self._heading(bout),
             "colour": colour_on_paper(UNKNOWN if bout.doubts else first.label),
             "times": words.times(count) if count > 1 and not is_mixed else "",
-            "time": time,
+            "time": words.text("range", first=start, last=end) if is_range else start,
             "length": "" if is_mixed else length,
             "sure": self._sureness(bout),
             "unsure": self._unsure_of(bout.events),
             "beside": self._uncounted_note(bout),
+            "is_uncounted": self._uncounted_of(bout) == count,
+            "span": (first.start // NANOSECONDS, bout.end // NANOSECONDS),
+            "span_words": (start, end),
             "doubtful": bool(bout.doubts),
             "room": "" if self.is_alone else room(first.microphone),
             "said": corrections[-1] if corrections else "",
