@@ -201,7 +201,9 @@ def test_what_is_not_sure_has_a_question_mark_in_the_folded_list_too(phone, show
 
 def test_sounds_beside_a_television_are_behind_one_tap(phone, show):
     show(390)
-    phone.shows("#events .fold .what", "Beside something like a television · 61 sounds, not counted")
+    phone.shows(
+        "#events .fold .what", "Beside something like a television · 61 sounds, not counted"
+    )
     about = phone.text("#events .fold .about").replace("\u00a0", " ")
     assert about == "19:00 to 19:59 · Talking 60, Telephone ringing 1", about
     beside = (

@@ -1,7 +1,7 @@
 """A day on the page: its picture, counts, times, and one sentence about it."""
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import date, tzinfo
 from typing import Any, NamedTuple
 
@@ -447,32 +447,43 @@ class DayPart(NamedTuple):
 
 
 def _sentence(parts: Sequence[DayPart], home: HomeDay) -> str:
-    """Return a sentence for each part, all short if they are about several classes.
-
-    They have times of day and the class that worries least, as far as there is room.
-    """
-    shown = [part._replace(found={name: part.found[name] for name in part.names}) for part in parts]
-    is_brief = sum(len(part.found) + bool(part.television) for part in shown) > 1
-    while True:
-        count = sum(len(part.found) for part in shown)
-        limit = _LONGEST if count > 1 and len(shown) == 1 else _LONGEST_OF_ONE
-        limit += sum(len(part.television) for part in shown)  # is never left out
-        limit += sum(len(part.when) for part in shown) if len(shown) > 1 else 0
-        dispensable = [n for n, part in enumerate(shown) if {*part.found} - {*WORRYING}]
-        # Times of the first class matter more than a last one that worries nobody.
-        is_dispensable = bool(dispensable) and count > 1
-        for times in (_MOST_CLOCKS,) if is_dispensable else (_MOST_CLOCKS, 1, 0):
-            sentence = _sentence_of(shown, home, times if is_brief else None)
-            if not is_brief or len(sentence) <= limit:
-                return sentence
-        if not is_dispensable:
+    """Return a sentence for each part, all short if they are about several classes."""
+    full = [part._replace(found={name: part.found[name] for name in part.names}) for part in parts]
+    if sum(len(part.found) + bool(part.television) for part in full) <= 1:
+        return _sentence_of(full, home, None)
+    # Times of the first class matter more than a last one that worries nobody.
+    for shown in _ever_fewer_classes(full):
+        sentence = _sentence_of(shown, home, _MOST_CLOCKS)
+        if len(sentence) <= _room_for(shown):
             return sentence
-        last = shown[dispensable[-1]]
+    for most in (1, 0):
+        sentence = _sentence_of(shown, home, most)
+        if len(sentence) <= _room_for(shown):
+            break
+    return sentence
+
+
+def _ever_fewer_classes(parts: list[DayPart]) -> Iterator[list[DayPart]]:
+    """Yield the parts, then without the last class that worries nobody, while one class is left."""
+    yield parts
+    while sum(len(part.found) for part in parts) > 1:
+        places = [n for n, part in enumerate(parts) if {*part.found} - {*WORRYING}]
+        if not places:
+            return
+        last = parts[places[-1]]
         name = [name for name in last.found if name not in WORRYING][-1]
         rest = {each: own for each, own in last.found.items() if each != name}
-        shown[dispensable[-1]] = last._replace(found=rest)
-        if not rest and not last.television:
-            del shown[dispensable[-1]]
+        left = [last._replace(found=rest)] if rest or last.television else []
+        parts = [*parts[: places[-1]], *left, *parts[places[-1] + 1 :]]
+        yield parts
+
+
+def _room_for(parts: Sequence[DayPart]) -> int:
+    """Return the most characters of the sentences about some parts of a day."""
+    count = sum(len(part.found) for part in parts)
+    limit = _LONGEST if count > 1 and len(parts) == 1 else _LONGEST_OF_ONE
+    limit += sum(len(part.television) for part in parts)  # is never left out
+    return limit + (sum(len(part.when) for part in parts) if len(parts) > 1 else 0)
 
 
 def _sentence_of(parts: Sequence[DayPart], home: HomeDay, most: int | None) -> str:
