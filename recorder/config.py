@@ -104,8 +104,8 @@ class MicrophoneSettings(BaseModel):
     device: str = Field(
         default="",
         examples=["USB PnP Sound Device"],
-        description="Name from `hearthlog devices`, or an rtsp://, http:// or ros2:// address; "
-        "empty: the default device.",
+        description="Name from `hearthlog devices`, or an address such as rtsp://camera/stream or "
+        "ros2:///robot/audio; empty: the default device.",
     )
     fallback: str = Field(
         default="",

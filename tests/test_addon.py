@@ -224,7 +224,7 @@ def refusal(addon, capfd):
         ({"microphones": [{"room": "Küche"}]}, "microphones.*room: .*cannot be a topic"),
         ({"microphones": [{"room": "a", "source": 'x" }'}]}, "source: .*ha audio info"),
         ({"microphones": [{"room": "a"}, {"room": "A"}]}, "options: two microphones have name 'a'"),
-        ({"language": "fr"}, "language: "),
+        ({"language": "xx"}, "language: "),
         ({"mqtt_host": "mqtt://a"}, "options: bridge.mqtt.host: "),
         ({"hidden_sounds": ["a", 3]}, "hidden_sounds"),
     ],

@@ -278,7 +278,7 @@ class PageSettings(_Table):
         default="",
         pattern=r"^([a-z]{2,3})?$",
         examples=["de"],
-        description="Language of the page; empty: that of the browser, English or German.",
+        description="Language of the page; empty: that of the browser, else English.",
     )
 
     @model_validator(mode="after")

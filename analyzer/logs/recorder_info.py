@@ -18,8 +18,7 @@ from hearthlog.analyzer.logs.selection import array_names, decode_types, is_comp
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.auros21 import AUROS21
-from hearthlog.models.features.home33 import HOME33
-from hearthlog.models.features.installed import feature_set
+from hearthlog.models.features.installed import BUILT_IN, feature_set
 from hearthlog.schemas.errors import LogError, ModelError
 from hearthlog.schemas.logs.columns import Columns
 from hearthlog.schemas.logs.contents import Status
@@ -162,7 +161,7 @@ def _set_of_names(file: LogFile, name: str) -> str:
     Programs that copy topics drop metadata records, but keep the names.
     """
     names = next((array_names(one.metadata, "values") for one in _channels(file, name)), [])
-    ours = {each.feature_names: each.name for each in (HOME33, AUROS21)}
+    ours = {each.feature_names: each.name for each in BUILT_IN}
     return ours.get(tuple(names), _UNNAMED) if names else ""
 
 

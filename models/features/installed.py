@@ -14,7 +14,8 @@ from hearthlog.schemas.errors import ModelError
 from hearthlog.schemas.logs.metadata import feature_entries
 
 DEFAULT = HOME33
-FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", [HOME33, AUROS21])
+BUILT_IN = (HOME33, AUROS21)
+FEATURE_SETS = Extensions("hearthlog.feature_sets", FeatureSet, "feature set", BUILT_IN)
 
 
 def feature_set(name: str = DEFAULT.name) -> FeatureSet:

@@ -63,8 +63,8 @@ def record(
     device: Annotated[
         str | None,
         typer.Option(
-            help="Microphone, as `hearthlog devices` lists it, or an rtsp://, http:// or ros2:// "
-            "address."
+            help="Microphone, as `hearthlog devices` lists it, or an address such as "
+            "rtsp://camera/stream or ros2:///robot/audio."
         ),
     ] = None,
     channel: Annotated[
