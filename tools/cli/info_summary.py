@@ -108,20 +108,20 @@ class Overview:
         nodes = (
             sorted({log_name(path).node for path in self._summary.files} - {""}) if names else []
         )
-        whose = f"Home {listed(nodes, 'and')}" if nodes else "Logs"
+        subject = f"Home {listed(nodes, 'and')}" if nodes else "Logs"
         if nodes == ["home"]:  # the default name
-            whose = "Home"
+            subject = "Home"
         if names:
-            whose += (
+            subject += (
                 f", {'microphone' if len(names) == 1 else 'microphones'} {listed(names, 'and')}"
             )
         if self._summary.span is None:
-            return f"{whose}: no messages"
+            return f"{subject}: no messages"
         first, last = self._summary.span
         length = _hours(self._summary.seconds)
         begin, end = (f"{local_time(time, self._zone):%Y-%m-%d %H:%M}" for time in (first, last))
         span = f"{begin} to {end} ({zone_name(self._zone)})"
-        return f"{whose}: {length}, {span}"
+        return f"{subject}: {length}, {span}"
 
     def _activity(self) -> str:
         span, listened = self._summary.seconds, self._listened()

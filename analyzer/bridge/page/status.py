@@ -179,8 +179,8 @@ def _of_microphone(microphone: LiveMicrophone, state: HomeState, words: Translat
 
 
 def _thing(subject: str, node: str, words: Translation) -> str:
-    whose, _, part = subject.partition(" ")
-    if whose == node and part in _THINGS:
+    owner, _, part = subject.partition(" ")
+    if owner == node and part in _THINGS:
         return words.text(_THINGS[part])
     return one_line(subject.replace("_", " ")).capitalize()
 
