@@ -158,6 +158,16 @@ def test_a_minute_is_one_of_the_clock_that_is_labelled_from_start_to_end():
     assert found.has_sound.tolist() == [False, False, True, False]
 
 
+def test_a_minute_with_a_television_counts_as_one_without_sound():
+    talk = [(60 * minute, 60 * minute + 30, "speech") for minute in range(60, 90)]
+    pauses = [(end, end + 30, "silence") for _, end, _ in talk]
+    evening = sorted([*talk, *pauses])
+    found = complete_minutes(
+        labelled((0, 1200, "silence"), (1200, 1205, "coughing"), (1205, 3600, "silence"), *evening)
+    )
+    assert np.flatnonzero(found.has_sound).tolist() == [20]
+
+
 def test_three_of_four_minutes_that_are_drawn_have_a_sound():
     night = RecordedMinutes(np.arange(1000) * MINUTE, np.arange(1000) % 20 == 0)
     drawn = draw_minutes(night, 20)

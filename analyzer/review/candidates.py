@@ -7,11 +7,26 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hearthlog.analyzer.activity.day_profile import television_spans
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation import Events, indexed_events
-from hearthlog.analyzer.logs.labelling import LabelledFile, Labelling, Labellings, NamedLabelling
+from hearthlog.analyzer.logs.labelling import (
+    LabelledFile,
+    Labelling,
+    Labellings,
+    NamedLabelling,
+    unified,
+)
 from hearthlog.analyzer.logs.sound_vectors import EMBEDDING_FIELDS, embeddings_of
-from hearthlog.analyzer.logs.spans import NONE, Spans, intersection, joined, lengths, overlay
+from hearthlog.analyzer.logs.spans import (
+    NONE,
+    Spans,
+    intersection,
+    joined,
+    lengths,
+    overlay,
+    rows_at,
+)
 from hearthlog.analyzer.marks.marks import RANDOM, read_review
 from hearthlog.analyzer.promotion.paired_labels import ChangedTime, find_changed_time
 from hearthlog.analyzer.promotion.promotion_check import find_champion, other_features
@@ -159,20 +174,23 @@ class RecordedMinutes(NamedTuple):
     """Completely labelled minutes of the clock."""
 
     starts: Int64  # [shape=(n,)], in nanoseconds of UTC, ascending
-    has_sound: Bool  # [shape=(n,)]; whether any label in it is not silence
+    # [shape=(n,)]; whether any label in it is not silence, and no television seems to be on
+    has_sound: Bool
 
 
 def complete_minutes(labelling: Labelling) -> RecordedMinutes:
-    """Find the complete minutes of a labelling, and which have a sound."""
+    """Find the complete minutes of a labelling, and which have a sound.
+
+    Minutes with a television say little about counts, since hardly a class counts in them.
+    """
     if not len(labelling):
         return RecordedMinutes(np.empty(0, np.int64), np.empty(0, bool))
     stretches = joined(labelling.starts, labelling.ends, _UNLABELLED)
     numbers = [np.arange(-(-start // MINUTE), end // MINUTE) for start, end in stretches.pairs()]
     starts = np.concatenate(numbers) * MINUTE
-    names = {name: class_name(name) != SILENCE for name in set(labelling.labels)}
-    loud = np.array([names[name] for name in labelling.labels], bool)
-    sounds = joined(labelling.starts[loud], labelling.ends[loud])
-    return RecordedMinutes(starts, _length_in(sounds, starts) > 0)
+    labels = unified(labelling)
+    has_sound = _length_in(labels.spans(labels.labels != SILENCE), starts) > 0
+    return RecordedMinutes(starts, has_sound & (rows_at(television_spans(labels), starts) < 0))
 
 
 def draw_minutes(

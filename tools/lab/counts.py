@@ -144,12 +144,13 @@ def check_counts(home: Home, name: str) -> Iterator[Checked]:
     Checked
     """
     whole = sum(int(events.sum()) + 1 for events in home.labelled.values())
+    has_sound = home.sounding & ~home.television  # as in the queue of a review
     for day in range(int(home.day[-1]) + 1):
         others = np.flatnonzero(home.day != day)
         for number in _CHECKED:
             for draw in range(_DRAWS):
                 shift = np.roll(others, 7919 * draw)  # other minutes for the same draw
-                minutes = RecordedMinutes(home.starts[: len(others)], home.sounding[shift])
+                minutes = RecordedMinutes(home.starts[: len(others)], has_sound[shift])
                 rows = shift[np.searchsorted(minutes.starts, draw_minutes(minutes, number))]
                 checks = _checks(home, rows)
                 for one in home.labelled:
