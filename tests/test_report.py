@@ -500,6 +500,29 @@ def test_a_day_is_quiet_if_at_most_six_of_its_hours_have_five_minutes_of_sound(
 
 
 @pytest.mark.parametrize(
+    ("other", "text"),
+    [
+        ([], "Sunday was quiet but for something like a television from 19:58 to 22:02."),
+        (
+            [9, 10],
+            (
+                "Sunday was quiet but for 09:00 to 11:00 and something like a television from "
+                "19:58 to 22:02."
+            ),
+        ),
+        ([9, 11, 13], "Sunday was quiet but for five hours."),
+    ],
+)
+def test_the_headline_of_a_quiet_day_names_a_television_that_makes_its_hours_lively(
+    tmp_path, other, text
+):
+    talking = [(at("20:00") + 30 * number, 15, "speech", 0.9) for number in range(240)]
+    sounds = [(at(f"{hour:02}:20"), 310, "music", 0.9) for hour in other]
+    write_day(tmp_path / "logs", DAY, [*sounds, *talking])
+    assert headline(tmp_path / "logs", tmp_path) == text
+
+
+@pytest.mark.parametrize(
     ("hours", "text"),
     [
         ([0, *range(6, 24)], "Sunday was quiet (19 of 24 hours recorded)."),
@@ -767,7 +790,7 @@ def test_a_shower_that_the_model_does_not_know_counts_as_quiet(tmp_path, classes
 
 
 def test_a_week_of_one_recorded_day_has_the_sentence_of_that_day(tmp_path):
-    write_day(tmp_path / "logs", DAY, [(at("19:20"), 600, "music", 0.9)])
+    write_day(tmp_path / "logs", DAY, [(at("19:20"), 600, "objects_activity", 0.9)])
     week = {"first": DAY - timedelta(days=6), "days": 7}
     assert headline(tmp_path / "logs", tmp_path, **week).startswith(
         "Sunday was quiet but for 19:00 to 20:00; there are no logs of the other six days."

@@ -10,8 +10,16 @@ from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Count, Duration, rounded
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
-from hearthlog.analyzer.logs.spans import intersection, joined, single_span
-from hearthlog.analyzer.report.report_data import day_television
+from hearthlog.analyzer.logs.spans import (
+    Spans,
+    difference,
+    intersection,
+    intersection_rows,
+    joined,
+    lengths,
+    single_span,
+)
+from hearthlog.analyzer.report.report_data import TELEVISION_PAUSE, day_television
 from hearthlog.analyzer.report.wording import (
     clock_text,
     edge_of_week,
@@ -154,11 +162,21 @@ def _day(day: DayMetrics) -> str:
         return f"{name} had sound in {lively.sum()} of {hours_of_day} hours{partly}"
     if not lively.any():
         return f"{name} was quiet{partly}"
-    runs = _runs(day, lively)
-    but = (
-        listed(runs, "and") if len(runs) <= _RUNS else f"{number_in_words(int(lively.sum()))} hours"
-    )
-    return f"{name} was quiet but for {but}{partly}"
+    return f"{name} was quiet but for {_exceptions(day, lively)}{partly}"
+
+
+def _exceptions(day: DayMetrics, lively: Bool) -> str:
+    """Return the lively hours of a quiet day, and the television that made some of them lively."""
+    apart = difference(day.home.sound, day_television(day))
+    due = lively & (lengths(apart, day.hours) < LIVELY_MINUTES * MINUTE)
+    runs, spans = _runs(day, lively & ~due), day_television(day, TELEVISION_PAUSE)
+    rows = np.unique(intersection_rows(spans, _hours(day, due))[1])
+    television = _times(day, Spans(spans.starts[rows], spans.ends[rows]))
+    if len(runs) + len(television) > _RUNS:
+        return f"{number_in_words(int(lively.sum()))} hours"
+    if television:
+        runs.append(f"something like a television from {listed(television, 'and')}")
+    return listed(runs, "and")
 
 
 def states_missing_time(day: DayMetrics) -> bool:
@@ -243,10 +261,17 @@ def _lively(day: DayMetrics) -> Bool:
 
 def _runs(day: DayMetrics, lively: Bool) -> list[str]:
     """Return the times of successive lively hours: `19:00 to 22:00`."""
-    bounds = np.flatnonzero(np.diff(np.concatenate([[False], lively, [False]]).astype(int)))
-    texts = [clock_text(int(day.hours[place]), day.zone) for place in bounds.tolist()]
-    texts[1::2] = ["24:00" if text == "00:00" else text for text in texts[1::2]]
-    return [f"{a} to {b}" for a, b in zip(texts[::2], texts[1::2], strict=True)]
+    return _times(day, _hours(day, lively))
+
+
+def _hours(day: DayMetrics, which: Bool) -> Spans:
+    return joined(day.hours[:-1][which], day.hours[1:][which])
+
+
+def _times(day: DayMetrics, spans: Spans) -> list[str]:
+    """Return spans of a day in words: `19:00 to 22:00`."""
+    edges = [[clock_text(time, day.zone) for time in pair] for pair in spans.pairs()]
+    return [f"{start} to {'24:00' if end == '00:00' else end}" for start, end in edges]
 
 
 def _sounds(day: DayMetrics) -> Iterator[str]:

@@ -65,6 +65,9 @@ class FigureSection(NamedTuple):
     note: str
 
 
+TELEVISION_PAUSE = 20 * MINUTE  # shorter pauses of a television are left out
+
+
 def day_television(day: DayMetrics, pause: int = 0) -> Spans:
     """Return when something like a television sounded, with short pauses closed."""
     starts = day.home.minutes.starts[day.home.minutes.television]

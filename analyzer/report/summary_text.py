@@ -13,7 +13,7 @@ from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import difference, joined, lengths
 from hearthlog.analyzer.report.headline import amount, states_missing_time, unlogged
-from hearthlog.analyzer.report.report_data import ReportData, day_television
+from hearthlog.analyzer.report.report_data import TELEVISION_PAUSE, ReportData, day_television
 from hearthlog.analyzer.report.wording import (
     WEEK,
     clock_text,
@@ -34,7 +34,6 @@ from hearthlog.schemas.errors import listed
 
 _MOST = 6  # kinds of gaps or troubles
 _MINUTE = HOUR // 60
-_PAUSE = 20 * _MINUTE  # shorter pauses of a television are not told
 _TIMES = 3
 _MOST_LABELS = 3  # of one doubtful time
 _BREAK = 5 * _MINUTE  # longest pause between doubtful sounds of one time
@@ -200,7 +199,7 @@ def _loudest(day: DayMetrics) -> str:
 
 def _television(day: DayMetrics) -> str:
     """Return when something like a television sounded."""
-    spans = day_television(day, _PAUSE)
+    spans = day_television(day, TELEVISION_PAUSE)
     if not len(spans.starts):
         return ""
     longest = np.sort(np.argsort(spans.starts - spans.ends, kind="stable")[:_TIMES])

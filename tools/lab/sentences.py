@@ -220,13 +220,16 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
         first = ""
     hours, modest = day.sound_by_hour, is_modest(first)
     lively = hours >= LIVELY_MINUTES
-    if runs := _RUN.findall(first):
-        has_sound = np.zeros(len(hours), bool)
-        for start, end in runs:
+    but, _, television = first.partition("something like a television")
+    if _RUN.search(first):
+        has_sound, may_have = np.zeros(len(hours), bool), np.zeros(len(hours), bool)
+        for start, end in _RUN.findall(but):
             has_sound[int(start[:2]) : int(end[:2])] = True
+        for start, end in _RUN.findall(television):  # to the minute
+            may_have[int(start[:2]) : int(end[:2]) + 1] = True
         slack = 1 + TOLERANCE
         wrong = (has_sound & (hours * slack < LIVELY_MINUTES)) | (
-            ~has_sound & (hours > LIVELY_MINUTES * slack)
+            ~has_sound & ~may_have & (hours > LIVELY_MINUTES * slack)
         )
         yield judge(
             REPORT,
@@ -235,6 +238,7 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
             right=not wrong.any(),
             modest=modest,
         )
+        yield from _televisions(television, truth, modest=modest)
     elif match := re.search(r"sound in (\d+) of|for (\w+) hours", first):
         stated = read_number(match[1] or match[2])
         yield judge_count(REPORT, first, (stated, stated), int(lively.sum()), modest=modest)
@@ -244,6 +248,18 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
         )
     for sentence in rest:
         yield from _counts_in(REPORT, sentence, truth)
+
+
+def _televisions(text: str, truth: TrueDay, *, modest: bool) -> Iterator[Statement]:
+    """Check the times of a television."""
+    for run_ in _RUN.findall(text):
+        start, end = (time_at(truth.metrics, each) for each in run_)
+        end += 24 * HOUR * (end < start)
+        wide = joined(truth.television.starts - _COMPANY, truth.television.ends + _COMPANY)
+        inside = cut(wide, start, end).length / max(end - start, 1)
+        right = inside >= 1 - TOLERANCE
+        statement = f"{' to '.join(run_)}: {text}"
+        yield judge(REPORT, statement, f"{inside:.0%} of it", right=right, modest=modest)
 
 
 def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statement]:
@@ -297,20 +313,8 @@ def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
         yield judge(REPORT, text, shown, right={*stated} == {*most}, modest=modest)
     elif "It was quiet." in text:
         yield judge(REPORT, text, f"{_sound(true):.1f} min", right=_sound(true) <= 2, modest=modest)
-    elif "television" in text and (runs := _RUN.findall(text)):
-        for run_ in runs:
-            start, end = (time_at(true, each) for each in run_)
-            end += 24 * HOUR * (end < start)
-            wide = joined(truth.television.starts - _COMPANY, truth.television.ends + _COMPANY)
-            inside = cut(wide, start, end).length / max(end - start, 1)
-            statement = f"{' to '.join(run_)}: {text}"
-            yield judge(
-                REPORT,
-                statement,
-                f"{inside:.0%} of it",
-                right=inside >= 1 - TOLERANCE,
-                modest=modest,
-            )
+    elif "television" in text and _RUN.search(text):
+        yield from _televisions(text, truth, modest=modest)
     elif text.startswith("In the night"):
         yield from _counts_in(REPORT, text, truth)
         if (stated := read_minutes(text)) is not None and true.night_sound is not None:
