@@ -397,6 +397,18 @@ def test_an_entry_says_in_few_words_how_many_of_it_are_not_sure_or_not_counted()
         assert about["unsure"] == 2
 
 
+def test_a_ring_that_is_not_sure_is_listed_as_not_counted_until_somebody_confirms_it():
+    home = home_at(9, tiled((-3, 9), (2, 4, "phone_ring")))
+    (ring,) = home.microphones[0].events("phone_ring", 0)
+    ring = ring._replace(confidence=0.6)
+    (bout,) = bouts([ring])
+    shown = ShownBouts(home.moment.now, UTC, home.words, lambda _: "", True)
+    about = shown.describe(bout)
+    assert (about["sure"], about["look"]) == ("not sure, so not counted", False)
+    confirmed = shown._replace(correction=lambda _: "You said: Telephone ringing")
+    assert confirmed.describe(bout)["sure"] == ""
+
+
 @pytest.mark.parametrize("language", sorted(languages()))
 def test_no_text_promises_that_the_box_learns_by_itself(language):
     texts = translation_for(language).texts
@@ -1002,11 +1014,11 @@ def test_a_telephone_that_may_be_something_else_is_in_no_count_and_no_picture_an
         Bout([SoundEvent("mic", "phone_ring", start, start + NANOSECONDS, confidence, 1.0)])
         for start, confidence in ((MIDNIGHT, 0.95), (MIDNIGHT + NANOSECONDS, 0.4))
     )
-    assert [needs_review(bout, 0, Sureness()) for bout in (sure, unsure)] == [True, False]
+    assert [needs_review(bout, 0) for bout in (sure, unsure)] == [True, False]
     both = Bout([*sure.events, *unsure.events])
     cough = Bout([sure.first._replace(label="coughing", confidence=0.4)])
-    assert needs_review(both, 0, Sureness())
-    assert needs_review(cough, 0, Sureness())
+    assert needs_review(both, 0)
+    assert needs_review(cough, 0)
 
 
 SCREAM = 4.0, "music", 0.33, {"coughing": 0.05, "yelling": 0.12}, 48.0

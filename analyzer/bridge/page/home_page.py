@@ -263,7 +263,7 @@ class HomePage:
         found = []
         for bout in self._bouts.values():
             uncounted = sum(event.id in self._uncounted for event in bout.events)
-            look = needs_review(bout, uncounted, self._sureness)
+            look = needs_review(bout, uncounted)
             if left[look]:
                 left[look] -= 1
                 found.append(bout)

@@ -119,7 +119,7 @@ function showAnswer(item, said) {
 }
 
 // Sounds that need a look: of each class the newest, and the others behind one tap.
-const TELEVISION = "television"; // the fold of what does not count
+const TELEVISION = "television", GREY = [150, 158, 170]; // the fold of what does not count, of all classes
 const unfolded = new Set(); // keys of folds
 const sum = (numbers) => numbers.reduce((total, each) => total + each, 0);
 
@@ -150,7 +150,7 @@ function withTelevisionFolded(others) {
   const often = new Map();
   for (const { words, ids } of uncounted) often.set(words, (often.get(words) ?? 0) + ids.length);
   const classesOften = [...often].sort((a, b) => b[1] - a[1]).map(([words, number]) => `${words} ${counted(number)}`).join(", ");
-  const fold = { id: `fold ${key}`, key, colour: uncounted[0].colour, words: say("beside television"),
+  const fold = { id: `fold ${key}`, key, colour: GREY, words: say("beside television"),
     often: count("not counted", sum(often.values())), about: `${say("span", { first: oldest, last: newest })}${SEPARATOR}${classesOften}` };
   return others.flatMap((entry) => {
     if (!entry.is_uncounted) return [entry];

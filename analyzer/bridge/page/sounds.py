@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import SURE, UNMEASURED, Sureness
-from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
+from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, is_too_doubtful, perhaps
 from hearthlog.analyzer.activity.segments import source_microphone
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
 from hearthlog.analyzer.bridge.page.doubts import Doubts
@@ -20,7 +20,6 @@ from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.models.classes import (
     IMPORTANT,
     ON_TELEVISION,
-    PHONE_RING,
     SILENCE,
     UNKNOWN,
     class_name,
@@ -76,14 +75,14 @@ class Bout(NamedTuple):
         return bool(self.doubts) or self.first.label in IMPORTANT
 
 
-def needs_review(bout: Bout, uncounted: int, sureness: Sureness) -> bool:
+def needs_review(bout: Bout, uncounted: int) -> bool:
     """Whether a bout needs review, of which so many events do not count.
 
     Nobody has to look at a telephone that may be something else.
     """
-    unsure = [sureness.is_unsure(event.confidence) for event in bout.events]
-    is_doubtful_ring = bout.first.label == PHONE_RING and not bout.doubts and all(unsure)
-    return bout.is_important and uncounted < len(bout.events) and not is_doubtful_ring
+    doubtful = [is_too_doubtful(event.label, event.confidence) for event in bout.events]
+    is_uncounted = not bout.doubts and all(doubtful)
+    return bout.is_important and uncounted < len(bout.events) and not is_uncounted
 
 
 def bouts(events: Iterable[SoundEvent], doubts: Doubts = MappingProxyType({})) -> list[Bout]:
@@ -183,7 +182,7 @@ class ShownBouts(NamedTuple):
             "doubtful": bool(bout.doubts),
             "room": "" if self.is_alone else room(first.microphone),
             "said": corrections[-1] if corrections else "",
-            "look": needs_review(bout, self._uncounted_of(bout), self.sureness),
+            "look": needs_review(bout, self._uncounted_of(bout)),
             "ids": [event.id for event in reversed(bout.events)],
         }
 
@@ -213,6 +212,8 @@ class ShownBouts(NamedTuple):
     def _sureness_of(self, events: Sequence[SoundEvent]) -> str:
         """Return how many of some events are not sure; whether the likeliest is if none are."""
         unsure = self._unsure_of(events)
+        if all(is_too_doubtful(e.label, e.confidence) and not self.correction(e) for e in events):
+            return self.words.text("not sure.not counted")
         if 0 < unsure < len(events):
             return self.words.count("not sure.some", unsure)
         word = self.sureness.word(max(event.confidence for event in events))
