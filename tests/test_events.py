@@ -220,14 +220,16 @@ def test_sound_that_was_not_kept_cannot_be_played_and_is_said_so(home, hearthlog
 def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path, hearthlog):
     coughs = [(at("08:00"), 5, "coughing", 0.95), (at("09:00"), 5, "coughing", 0.4)]
     rings = [(at("10:00"), 5, "phone_ring", 0.95), (at("11:00"), 5, "phone_ring", 0.69)]
-    write_day(tmp_path, DAY, [*coughs, *rings], classes=GENERAL)
+    shout = at("12:00"), 2, "yelling", 0.5
+    write_day(tmp_path, DAY, [*coughs, *rings, shout], classes=GENERAL)
     found = hearthlog("events", tmp_path, "--day", DAY, "--label", "coughing")
     assert found.stdout.splitlines()[-1] == "Coughing on Monday, 2026-03-02: 1, and perhaps 1 more"
     found = hearthlog("events", tmp_path, "--day", DAY, "--json")
     counts = json.loads(found.stdout)["counts"]
     assert counts["coughing"] == {"counted": 2, "television": 0, "unsure": 1}
     assert counts["phone_ring"] == {"counted": 1, "television": 0, "unsure": 0}
-    assert "coughing 1 (+1?) and telephone ringing 1;" in hearthlog("info", tmp_path).stdout
+    about = hearthlog("info", tmp_path).stdout
+    assert "2026-03-02: coughing 1 (+1?), shouting 1? and telephone ringing 1; of" in about
 
 
 def test_a_telephone_of_which_the_model_is_not_sure_counts_where_a_person_reviewed_it(

@@ -212,8 +212,11 @@ def day_lines(day: date, totals: Mapping[str, EventTotal]) -> Iterator[str]:
     """Yield how often each sound occurred on a day, and what is left out beside a television."""
     parts, apart = [], []
     for name, (counted, television, unsure) in totals.items():
-        word = in_words(name).lower()
-        parts.append(f"{word} {counted - unsure or 'none'}{f' (+{unsure}?)' * bool(unsure)}")
+        if name == UNKNOWN:
+            continue  # is no sound that is counted
+        word, sure = in_words(name).lower(), counted - unsure
+        more = f" (+{unsure}?)" if sure and unsure else f"{unsure}?" if unsure else ""
+        parts.append(f"{word} {sure or ('' if unsure else 'none')}{more}")
         apart += [f"{word} {television}"] * bool(television)
     note = "; of those with ? the model is not sure" * any(one.unsure for one in totals.values())
     counts = listed(parts, "and")
