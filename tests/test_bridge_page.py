@@ -26,14 +26,13 @@ from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import REVIEWER, EventCorrections
 from hearthlog.analyzer.bridge.home_state import Health, HomeState
 from hearthlog.analyzer.bridge.output import OutputUpdate
-from hearthlog.analyzer.bridge.page import server
+from hearthlog.analyzer.bridge.page import ENGLISH, clock, server, translation_for
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.home_page import HomePage
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list
 from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
-from hearthlog.analyzer.bridge.wording import ENGLISH, clock, translation_for
 from hearthlog.analyzer.http import HttpServer, free_port
 from hearthlog.analyzer.logs.local_time import today
 from hearthlog.analyzer.marks.marks import Mark, write_marks

@@ -23,7 +23,7 @@ from hearthlog.analyzer.activity.checked_minutes import Sureness
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
 from hearthlog.analyzer.bridge.corrections import EventCorrections, user_error
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.page import past_days
+from hearthlog.analyzer.bridge.page import languages, past_days, preferred_language, translation_for
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.doubts import events_to_review
 from hearthlog.analyzer.bridge.page.past_days import PastDays
@@ -37,7 +37,6 @@ from hearthlog.analyzer.bridge.page.sounds import (
 )
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import languages, preferred_language, translation_for
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time, today
 from hearthlog.analyzer.marks.marks import Mark

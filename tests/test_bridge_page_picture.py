@@ -10,7 +10,7 @@ from servedhome import PALE_TEXTS
 
 pytest.importorskip("hearthlog.tools.lab.pictures", reason="the wheel leaves the lab out")
 
-from hearthlog.analyzer.bridge.wording import translation_for
+from hearthlog.analyzer.bridge.page import translation_for
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.lab.pictures.pages import served_page
 

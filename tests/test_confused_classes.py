@@ -10,10 +10,10 @@ from hearthlog.models.classes import WATER
 pytest.importorskip("hearthlog.tools.lab.home", reason="the wheel leaves the lab out")
 
 from hearthlog.analyzer.activity.home_data import read_home
+from hearthlog.analyzer.bridge.page import translation_for
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.settings import RecorderAddress
-from hearthlog.analyzer.bridge.wording import translation_for
 from hearthlog.analyzer.logs.hidden_classes import common_names, common_names_of
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings

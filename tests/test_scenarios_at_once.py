@@ -29,11 +29,11 @@ from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.mqtt.home_assistant import discovery
 from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import OutputUpdate
+from hearthlog.analyzer.bridge.page import ENGLISH
 from hearthlog.analyzer.bridge.page.status import scenario_lines
 from hearthlog.analyzer.bridge.prometheus import PrometheusOutput
 from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
-from hearthlog.analyzer.bridge.wording import ENGLISH
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.local_time import today

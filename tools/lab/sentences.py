@@ -22,11 +22,11 @@ import typer
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness, read_sureness
 from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics, event_totals
 from hearthlog.analyzer.activity.event_counts import MINUTE
+from hearthlog.analyzer.bridge.page import ENGLISH
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import ShownBouts, bouts, events_between
 from hearthlog.analyzer.bridge.settings import RecorderAddress
-from hearthlog.analyzer.bridge.wording import ENGLISH
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
 from hearthlog.analyzer.logs.spans import (

@@ -15,7 +15,7 @@ from hearthlog.analyzer.bridge.home_state import (
     ClassSounds,
     LiveMicrophone,
 )
-from hearthlog.analyzer.bridge.wording import ENGLISH, Translation, clock, room
+from hearthlog.analyzer.bridge.page import ENGLISH, Translation, clock, room
 from hearthlog.analyzer.logs.local_time import (
     EVENING,
     MORNING,

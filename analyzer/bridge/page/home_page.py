@@ -17,6 +17,13 @@ from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import EventCorrections, user_error
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.output import OutputUpdate
+from hearthlog.analyzer.bridge.page import (
+    Translation,
+    clock,
+    preferred_language,
+    room,
+    translation_for,
+)
 from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.doubts import CurrentDoubts, doubtful, events_to_review
 from hearthlog.analyzer.bridge.page.past_days import PastDay, PastDays
@@ -35,13 +42,6 @@ from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scena
 from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, page_token
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError, Report
-from hearthlog.analyzer.bridge.wording import (
-    Translation,
-    clock,
-    preferred_language,
-    room,
-    translation_for,
-)
 from hearthlog.analyzer.logs.hidden_classes import read_hidden_classes, write_hidden_classes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time

@@ -11,8 +11,8 @@ from typing import IO, Any, NamedTuple, cast
 
 from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import READ_ONLY, REVIEWER
+from hearthlog.analyzer.bridge.page import ENGLISH, Translation, one_line, room
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import ENGLISH, Translation, one_line, room
 from hearthlog.analyzer.discover.summary import (
     SUMMARY,
     GroupsSummary,

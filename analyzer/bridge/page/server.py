@@ -18,8 +18,8 @@ from time import monotonic
 from typing import Any, NamedTuple, Protocol, cast
 from urllib.parse import unquote
 
+from hearthlog.analyzer.bridge.page import ENGLISH, Translation
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import ENGLISH, Translation
 from hearthlog.analyzer.http import (
     SECONDS,
     HttpHandler,

@@ -13,9 +13,9 @@ from hearthlog.analyzer.activity.checked_minutes import SURE, UNMEASURED, Surene
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, is_too_doubtful, perhaps
 from hearthlog.analyzer.activity.segments import source_microphone
 from hearthlog.analyzer.bridge.home_state import LiveMicrophone
+from hearthlog.analyzer.bridge.page import Translation, clock, room
 from hearthlog.analyzer.bridge.page.doubts import Doubts
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.bridge.wording import Translation, clock, room
 from hearthlog.analyzer.logs.clips import kept_sound, kept_time, wav_bytes
 from hearthlog.models.classes import (
     IMPORTANT,

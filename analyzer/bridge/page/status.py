@@ -8,7 +8,7 @@ from hearthlog.analyzer.activity import ANY_SOUND, HOLD_SECONDS, SoundEvent
 from hearthlog.analyzer.activity.segments import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import OutputUpdate
-from hearthlog.analyzer.bridge.wording import ENGLISH, Translation, one_line, reason, room
+from hearthlog.analyzer.bridge.page import ENGLISH, Translation, one_line, reason, room
 from hearthlog.models.classes import ON_TELEVISION, SILENCE, ordered
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
