@@ -13,7 +13,7 @@ from hearthlog.analyzer.activity import ANY_SOUND, ActiveClasses, EventRecord
 from hearthlog.analyzer.activity.event_counts import events_of
 from hearthlog.analyzer.bridge.bridge import ProblemReporter
 from hearthlog.analyzer.bridge.home_state import Health, HomeState, LiveMicrophone
-from hearthlog.analyzer.bridge.mqtt.topics import TopicKey, Topics, identifier
+from hearthlog.analyzer.bridge.mqtt import TopicKey, Topics, identifier
 from hearthlog.analyzer.bridge.output import Total, Totals
 from hearthlog.analyzer.bridge.settings import load_bridge_settings
 from hearthlog.analyzer.bridge.state import BridgeState

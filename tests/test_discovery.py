@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from hearthlog.analyzer.bridge.mqtt import Topics, identifier
 from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     command_discovery,
     device_id,
     discovery,
     home_id,
 )
-from hearthlog.analyzer.bridge.mqtt.topics import Topics, identifier
 from hearthlog.models.modelfile import load_model
 
 pytestmark = pytest.mark.fast

@@ -17,9 +17,9 @@ from livehome import LiveHome, following, midday_zone
 from paho.mqtt.client import MQTTMessage
 
 from hearthlog.analyzer.bridge import state as bridge_state
+from hearthlog.analyzer.bridge.mqtt import RetainedTopics, Topics
 from hearthlog.analyzer.bridge.mqtt.home_assistant import device_id, discovery, topics_in_discovery
 from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
-from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics, Topics
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.hidden_classes import NEVER_TELL_FILE, write_hidden_classes

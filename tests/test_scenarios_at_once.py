@@ -26,8 +26,8 @@ from test_model_changes import MICROPHONE, block, wait_for
 from hearthlog.analyzer.activity.live import FIELDS, LiveActivity, is_of_alerts
 from hearthlog.analyzer.activity.segments import is_of_activity, read_activity
 from hearthlog.analyzer.bridge.home_state import HomeState
+from hearthlog.analyzer.bridge.mqtt import Topics
 from hearthlog.analyzer.bridge.mqtt.home_assistant import discovery
-from hearthlog.analyzer.bridge.mqtt.topics import Topics
 from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.page import ENGLISH
 from hearthlog.analyzer.bridge.page.status import scenario_lines

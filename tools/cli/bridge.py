@@ -109,7 +109,7 @@ def bridge(
 
 
 def _unmute(state: "BridgeState", classes: list[str], report: "Callable[[str], None]") -> None:
-    from hearthlog.analyzer.bridge.mqtt.topics import RetainedTopics
+    from hearthlog.analyzer.bridge.mqtt import RetainedTopics
 
     topics = RetainedTopics(state, report)
     muted = topics.muted()

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from hearthlog._version import __version__
-from hearthlog.analyzer.bridge.mqtt.topics import CONFIG, PUBLISHED, TopicKey, Topics, identifier
+from hearthlog.analyzer.bridge.mqtt import CONFIG, PUBLISHED, TopicKey, Topics, identifier
 from hearthlog.models.classes import SILENCE, in_words
 
 Component = dict[str, Any]  # of a discovery payload, as Home Assistant defines it

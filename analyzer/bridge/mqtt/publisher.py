@@ -10,6 +10,13 @@ from paho.mqtt.client import MQTTMessage
 
 from hearthlog.analyzer.activity import ANY_SOUND, SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
+from hearthlog.analyzer.bridge.mqtt import (
+    CONFIG,
+    PUBLISHED,
+    RetainedTopics,
+    TopicKey,
+    Topics,
+)
 from hearthlog.analyzer.bridge.mqtt.connection import Connection
 from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     command_discovery,
@@ -17,13 +24,6 @@ from hearthlog.analyzer.bridge.mqtt.home_assistant import (
     discovery,
     home_id,
     topics_in_discovery,
-)
-from hearthlog.analyzer.bridge.mqtt.topics import (
-    CONFIG,
-    PUBLISHED,
-    RetainedTopics,
-    TopicKey,
-    Topics,
 )
 from hearthlog.analyzer.bridge.output import RECENT, OutputUpdate
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
