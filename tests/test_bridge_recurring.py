@@ -26,8 +26,7 @@ from hearthlog.analyzer.bridge.page.recurring import (
     recurring_list,
 )
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.discover.groups import GROUPS
-from hearthlog.analyzer.discover.summary import (
+from hearthlog.analyzer.discover import (
     SUMMARY,
     Example,
     GroupsSummary,
@@ -36,6 +35,7 @@ from hearthlog.analyzer.discover.summary import (
     save_summary,
     summary_path,
 )
+from hearthlog.analyzer.discover.groups import GROUPS
 from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs

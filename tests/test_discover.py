@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from recurring import RECURRING, names_of, two_recurring_days
 from sklearn.metrics import adjusted_rand_score
 
-from hearthlog.analyzer.discover import NO_CLUSTER, groups
+from hearthlog.analyzer.discover import NO_CLUSTER, busiest_hours, groups, summary_path
 from hearthlog.analyzer.discover import sounds as sounds_module
 from hearthlog.analyzer.discover.groups import (
     GROUPS,
@@ -33,7 +33,6 @@ from hearthlog.analyzer.discover.groups import (
     save_groups,
 )
 from hearthlog.analyzer.discover.sounds import discover, group_spans, read_sounds
-from hearthlog.analyzer.discover.summary import busiest_hours, summary_path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, write_marks

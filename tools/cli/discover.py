@@ -35,11 +35,17 @@ from hearthlog.tools.cli.terminal import (
 if TYPE_CHECKING:
     from datetime import tzinfo
 
-    from hearthlog.analyzer.discover import ClusterKind, Clusters, NamedSpans
+    from hearthlog.analyzer.discover import (
+        ClusterKind,
+        Clusters,
+        GroupsSummary,
+        GroupSummary,
+        NamedSpans,
+        VoiceSummary,
+    )
     from hearthlog.analyzer.discover.groups import Groups
     from hearthlog.analyzer.discover.sounds import SoundSelection
     from hearthlog.analyzer.discover.speech import HomeSpeech
-    from hearthlog.analyzer.discover.summary import GroupsSummary, GroupSummary, VoiceSummary
     from hearthlog.analyzer.discover.voices import HomeVoices
     from hearthlog.analyzer.errors import DataError
     from hearthlog.analyzer.logs.home_logs import HomeLogs
@@ -162,15 +168,15 @@ def _group(
     home: "HomeLogs", file: Path, selection: "SoundSelection", least: int, zone: "tzinfo"
 ) -> tuple["GroupsSummary", list[str]]:
     """Group the sounds, and save the groups and their summary."""
-    from hearthlog.analyzer.discover.groups import load_groups, save_groups
-    from hearthlog.analyzer.discover.sounds import discover as find_groups
-    from hearthlog.analyzer.discover.sounds import read_sounds, unembedded_note
-    from hearthlog.analyzer.discover.summary import (
+    from hearthlog.analyzer.discover import (
         GroupsSummary,
         save_summary,
         summarise,
         summary_path,
     )
+    from hearthlog.analyzer.discover.groups import load_groups, save_groups
+    from hearthlog.analyzer.discover.sounds import discover as find_groups
+    from hearthlog.analyzer.discover.sounds import read_sounds, unembedded_note
 
     earlier = load_groups(file)
     with (
@@ -203,9 +209,9 @@ def _name(
     reviewer: str,
 ) -> tuple["GroupsSummary", list[str]]:
     """Remove and assign names of existing groups, without new grouping."""
+    from hearthlog.analyzer.discover import load_summary, summary_path
     from hearthlog.analyzer.discover.groups import GROUPS, load_groups
     from hearthlog.analyzer.discover.sounds import name_groups, reason_of, unmark_group
-    from hearthlog.analyzer.discover.summary import load_summary, summary_path
 
     groups = load_groups(file)
     _check_numbers(GROUPS, groups, [*undo, *names])
@@ -230,8 +236,8 @@ def _renamed(
     groups: "Groups", summary: "GroupsSummary", names: Mapping[int, str], file: Path
 ) -> tuple["Groups", "GroupsSummary"]:
     """Rename groups and save them; an empty name removes a name."""
+    from hearthlog.analyzer.discover import save_summary, summary_path
     from hearthlog.analyzer.discover.groups import save_groups
-    from hearthlog.analyzer.discover.summary import save_summary, summary_path
 
     groups, summary = groups.named(names), summary.named(names)
     save_groups(groups, file)
@@ -240,7 +246,7 @@ def _renamed(
 
 
 def _print(summary: "GroupsSummary", zone: "tzinfo") -> None:
-    from hearthlog.analyzer.discover.summary import busiest_hours
+    from hearthlog.analyzer.discover import busiest_hours
     from hearthlog.models.classes import in_words
 
     head = ("group", "name", "heard as", "listen to", "times", "days", "hours", "seconds", "alike")
@@ -325,9 +331,8 @@ def voices(
     Voices keep their numbers in later runs. Exit status 3: a log is damaged, or its features
     cannot separate voices; the others were used.
     """
-    from hearthlog.analyzer.discover import locked_file
+    from hearthlog.analyzer.discover import locked_file, summarise_voices
     from hearthlog.analyzer.discover.speech import find_voices, read_speech
-    from hearthlog.analyzer.discover.summary import summarise_voices
     from hearthlog.analyzer.discover.voices import VOICES, load_voices, save_voices
 
     check_output("--output", output, ".csv", "a table")
@@ -405,7 +410,7 @@ def _write_turns(output: Path, speech: "HomeSpeech", voices: "HomeVoices", of: "
 def _print_voices(
     summaries: "Sequence[VoiceSummary]", speech: "HomeSpeech", zone: "tzinfo"
 ) -> None:
-    from hearthlog.analyzer.discover.summary import busiest_hours
+    from hearthlog.analyzer.discover import busiest_hours
 
     head = ("voice", "name", "listen to", "minutes", "turns", "days", "hours")
     rows = [

@@ -13,7 +13,7 @@ from hearthlog.analyzer.bridge.commands import class_of
 from hearthlog.analyzer.bridge.corrections import READ_ONLY, REVIEWER
 from hearthlog.analyzer.bridge.page import ENGLISH, Translation, one_line, room
 from hearthlog.analyzer.bridge.state import BridgeError
-from hearthlog.analyzer.discover.summary import (
+from hearthlog.analyzer.discover import (
     SUMMARY,
     GroupsSummary,
     GroupSummary,
