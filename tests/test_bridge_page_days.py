@@ -25,13 +25,13 @@ from hearthlog.analyzer.bridge.corrections import EventCorrections, user_error
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import languages, past_days, preferred_language, translation_for
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
-from hearthlog.analyzer.bridge.page.doubts import events_to_review
 from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import (
     Bout,
     ShownBouts,
     bouts,
     events_between,
+    events_to_review,
     needs_review,
     uncounted_ids,
 )

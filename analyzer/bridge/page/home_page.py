@@ -25,16 +25,18 @@ from hearthlog.analyzer.bridge.page import (
     translation_for,
 )
 from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
-from hearthlog.analyzer.bridge.page.doubts import CurrentDoubts, doubtful, events_to_review
 from hearthlog.analyzer.bridge.page.past_days import PastDay, PastDays
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
 from hearthlog.analyzer.bridge.page.sounds import (
     Bout,
+    CurrentDoubts,
     KeptSounds,
     ShownBouts,
     bouts,
+    doubtful,
     events_between,
+    events_to_review,
     needs_review,
     uncounted_ids,
 )

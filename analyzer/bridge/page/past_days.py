@@ -11,7 +11,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.segments import is_of_activity, is_of_scenario, labelling_source
 from hearthlog.analyzer.bridge.home_state import FIELDS, HomeState
-from hearthlog.analyzer.bridge.page.doubts import Doubts, doubtful, read_doubts
+from hearthlog.analyzer.bridge.page.sounds import Doubts, doubtful, read_doubts
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.logs.hidden_classes import common_names_of
