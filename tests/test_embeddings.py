@@ -13,8 +13,7 @@ from hearthlog.analyzer.training.manifest import LABELS, read_manifest
 from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.evidence import NO_AUXILIARY, Auxiliary, EmbeddingEvidence
 from hearthlog.models.embedding import NO_EMBEDDINGS, WINDOW_FRAMES, Embeddings
-from hearthlog.models.embedding.networks import YAMNET, load_embedder
-from hearthlog.models.embedding.stream import EmbeddingStream, SteadyNoise
+from hearthlog.models.embedding.networks import YAMNET, EmbeddingStream, SteadyNoise, load_embedder
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file, with_network

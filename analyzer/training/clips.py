@@ -11,8 +11,7 @@ import numpy as np
 from hearthlog.analyzer.training.manifest import LabelledClip
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.embedding import WINDOW_FRAMES, Int8
-from hearthlog.models.embedding.networks import find_network, load_embedder
-from hearthlog.models.embedding.stream import SteadyNoise
+from hearthlog.models.embedding.networks import SteadyNoise, find_network, load_embedder
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.floor import low_power
 from hearthlog.models.features.infrasound import InfrasoundFilter

@@ -108,7 +108,7 @@ class MicrophoneEmbeddings:
     """Computes embeddings of sound above the noise floor."""
 
     def __init__(self, embedder: Embedder, features: FeatureSet) -> None:
-        from hearthlog.models.embedding.stream import (  # noqa: PLC0415  only with a network
+        from hearthlog.models.embedding.networks import (  # noqa: PLC0415  only with a network
             EmbeddingStream,
         )
 

@@ -23,8 +23,13 @@ from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.manifest import LABELS, LabelledClip, read_manifest
 from hearthlog.models.classes import SPEECH
 from hearthlog.models.embedding import WINDOW_FRAMES
-from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
-from hearthlog.models.embedding.stream import EmbeddingStream
+from hearthlog.models.embedding.networks import (
+    YAMNET,
+    Embedder,
+    EmbeddingStream,
+    find_network,
+    load_embedder,
+)
 from hearthlog.models.features import FeatureSet
 from hearthlog.models.features.auros21 import AUROS21, ENERGY, FLUX
 from hearthlog.models.features.home33 import HOME33

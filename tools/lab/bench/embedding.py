@@ -5,9 +5,14 @@ from io import BytesIO
 import numpy as np
 
 from hearthlog.models.embedding import HOP_FRAMES, WINDOW_FRAMES
-from hearthlog.models.embedding.networks import YAMNET, Embedder, find_network, load_embedder
+from hearthlog.models.embedding.networks import (
+    YAMNET,
+    Embedder,
+    EmbeddingStream,
+    find_network,
+    load_embedder,
+)
 from hearthlog.models.embedding.session import TfliteSession
-from hearthlog.models.embedding.stream import EmbeddingStream
 from hearthlog.recorder.labelling.embedder_probe import probe_network
 from hearthlog.recorder.stream.stages import embedding_messages
 from hearthlog.schemas.frames import FRAME_NANOSECONDS, FRAME_SECONDS
