@@ -19,7 +19,7 @@ from logreader import LogReader
 from rosbags import rosbag1, rosbag2
 
 from hearthlog.analyzer.marks.marks import read_marks
-from hearthlog.analyzer.review.live_timeline import LiveTimeline
+from hearthlog.analyzer.review.live import LiveTimeline
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.modelfile import load_model
 from hearthlog.schemas.logs.columns import decode, iterate_columns, read_columns

@@ -36,11 +36,11 @@ from hearthlog.analyzer.doctor.records import (
     name_of,
     parse_strictly,
 )
-from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.raw_messages import gather_heads, iterate_records
 from hearthlog.schemas.mcap.records import (
     ATTACHMENT,
     HEAD,
+    LAST_TIME,
     MESSAGE_HEAD,
     UINT32,
     UINT64,

@@ -28,12 +28,11 @@ from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.merged_reading import iterate_messages
 from hearthlog.schemas.logs.metadata import ROSBAG2_METADATA, TopicCount, rosbag2_metadata
 from hearthlog.schemas.logs.writer import ENCODING, CountedWriter
-from hearthlog.schemas.mcap.chunk_index import RecordLocation
 from hearthlog.schemas.mcap.chunk_writer import Block, message_blocks
 from hearthlog.schemas.mcap.chunks import read_in_batches, repeated_chunks
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.mcap.records import HEAD, LIMIT, UINT32
+from hearthlog.schemas.mcap.records import HEAD, LIMIT, UINT32, RecordLocation
 from hearthlog.schemas.messages.message_types import PACKAGE
 from hearthlog.schemas.new_files import new_file
 from hearthlog.schemas.salvage.intact_records import (

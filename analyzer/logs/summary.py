@@ -24,10 +24,9 @@ from hearthlog.schemas.logs.contents import (
 )
 from hearthlog.schemas.logs.files import is_layer
 from hearthlog.schemas.logs.metadata import read_provenance, version_text
-from hearthlog.schemas.mcap.chunk_index import RecordLocation
 from hearthlog.schemas.mcap.chunks import read_in_batches
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import HEAD
+from hearthlog.schemas.mcap.records import HEAD, RecordLocation
 
 Span = tuple[int, int]
 

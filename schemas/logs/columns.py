@@ -18,9 +18,9 @@ from hearthlog.schemas.files import map_logs
 from hearthlog.schemas.frames import millisecond_text
 from hearthlog.schemas.logs.files import topic_counts
 from hearthlog.schemas.logs.merged_reading import iterate_pieces
-from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.chunks import OnDamage, TopicChoice
 from hearthlog.schemas.mcap.raw_messages import RawMessages, bounds
+from hearthlog.schemas.mcap.records import LAST_TIME
 from hearthlog.schemas.messages.cdr_codec import (
     Fields,
     UndecodableText,

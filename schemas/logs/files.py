@@ -30,7 +30,6 @@ from hearthlog.schemas.files import (
     store_errors,
 )
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.logfile import ACTIVE_SUFFIX, LogFile, open_log
 from hearthlog.schemas.mcap.raw_messages import iterate_records
 from hearthlog.schemas.mcap.records import (
@@ -38,6 +37,7 @@ from hearthlog.schemas.mcap.records import (
     FOOTER,
     FOOTER_SIZE,
     HEAD,
+    LAST_TIME,
     LIMIT,
     OTHER_SUFFIXES,
     SUMMARY_OFFSET,

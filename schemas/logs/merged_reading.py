@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.files import map_logs, prefetch
 from hearthlog.schemas.logs.files import stated_span, time_span
-from hearthlog.schemas.mcap.chunk_index import not_empty
 from hearthlog.schemas.mcap.chunks import (
     OnDamage,
     TopicChoice,
@@ -23,7 +22,7 @@ from hearthlog.schemas.mcap.chunks import (
 )
 from hearthlog.schemas.mcap.logfile import LogFile
 from hearthlog.schemas.mcap.raw_messages import RawMessages
-from hearthlog.schemas.mcap.records import LIMIT
+from hearthlog.schemas.mcap.records import LIMIT, not_empty
 
 _BATCH = 5 << 20  # bytes per batch, compressed plus decompressed
 _READERS = 2  # threads: more would wait for each other's Python code

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from hearthlog.schemas.arrays import Bytes, Int64, gather
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.frames import millisecond_text
-from hearthlog.schemas.mcap.chunk_index import CHUNKS, LAST_TIME, LATE, by_start, not_empty
 from hearthlog.schemas.mcap.compressed_chunk import (
     ContentStream,
     Part,
@@ -35,16 +34,21 @@ from hearthlog.schemas.mcap.raw_messages import (
     iterate_records,
 )
 from hearthlog.schemas.mcap.records import (
+    CHUNKS,
     HEAD,
     INDEX_ENTRIES,
+    LAST_TIME,
+    LATE,
     LIMIT,
     MESSAGE,
     MESSAGE_FIXED,
     MESSAGE_HEAD,
     MESSAGE_INDEX_HEAD,
     ChunkHead,
+    by_start,
     chunk_head,
     decompress_into,
+    not_empty,
 )
 
 _LARGE = f"messages of more than {LIMIT >> 20} MiB are left out: larger than hearthlog reads"

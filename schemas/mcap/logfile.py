@@ -20,35 +20,33 @@ from numpy.typing import NDArray
 
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.files import LocalFile, StoredFile, open_file
-from hearthlog.schemas.mcap.chunk_index import (
-    CHUNKS,
-    LAST_TIME,
-    LATE,
-    ChunkRow,
-    RecordLocation,
-    by_start,
-    not_empty,
-    read_chunk_index,
-    read_chunk_row,
-    read_records,
-    walk_records,
-)
 from hearthlog.schemas.mcap.compressed_chunk import ContentStream
 from hearthlog.schemas.mcap.raw_messages import CHUNK_HEAD_LIMIT, find_chunk_heads
 from hearthlog.schemas.mcap.records import (
+    CHUNKS,
     FOOTER,
     FOOTER_SIZE,
     HEAD,
     INDEX_ENTRIES,
+    LAST_TIME,
+    LATE,
     LIMIT,
     MAGIC,
     MESSAGE_INDEX_HEAD,
     TOO_LARGE,
     UINT16,
+    ChunkRow,
+    RecordLocation,
     begun_chunk_head,
+    by_start,
+    not_empty,
     not_mcap,
     parse_escaped,
+    read_chunk_index,
+    read_chunk_row,
     read_footer,
+    read_records,
+    walk_records,
 )
 
 _NO_INDEX = "its index is damaged, and messages may be missing; `hearthlog recover` says which"

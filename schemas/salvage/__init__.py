@@ -17,9 +17,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from hearthlog.schemas.files import LocalFile
-from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.raw_messages import CHUNK_HEAD_LIMIT, find_chunk_heads
-from hearthlog.schemas.mcap.records import LIMIT, MAGIC, MESSAGE, Definition, Definitions
+from hearthlog.schemas.mcap.records import LAST_TIME, LIMIT, MAGIC, MESSAGE, Definition, Definitions
 from hearthlog.schemas.salvage.damage import Damage, DamageList, loss_in
 from hearthlog.schemas.salvage.index import MessageIndexes, read_index
 from hearthlog.schemas.salvage.intact_records import (

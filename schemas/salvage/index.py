@@ -15,7 +15,6 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from hearthlog.schemas.logs.metadata import ROSBAG2_METADATA
-from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.compressed_chunk import LATEST, StoredChunk
 from hearthlog.schemas.mcap.records import (
     FOOTER,
@@ -23,6 +22,7 @@ from hearthlog.schemas.mcap.records import (
     HEAD,
     INDEX_ENTRIES,
     INDEX_ENTRY,
+    LAST_TIME,
     MAGIC,
     MESSAGE_INDEX_HEAD,
     UINT32,

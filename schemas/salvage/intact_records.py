@@ -14,13 +14,13 @@ from mcap.opcode import Opcode
 from mcap.records import McapRecord
 
 from hearthlog.schemas.arrays import Int64
-from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.compressed_chunk import StoredChunk, compress_chunk
 from hearthlog.schemas.mcap.raw_messages import gather_heads, index_messages, iterate_records
 from hearthlog.schemas.mcap.records import (
     ATTACHMENT,
     HEAD,
     INDEX_ENTRIES,
+    LAST_TIME,
     LIMIT,
     MESSAGE,
     MESSAGE_FIXED,

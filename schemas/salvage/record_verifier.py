@@ -16,7 +16,6 @@ from mcap.records import McapRecord
 from numpy.typing import NDArray
 
 from hearthlog.schemas.files import LocalFile
-from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.compressed_chunk import (
     ContentStream,
     StoredChunk,
@@ -30,6 +29,7 @@ from hearthlog.schemas.mcap.records import (
     HEAD,
     INDEX_ENTRIES,
     INDEX_ENTRY,
+    LAST_TIME,
     LIMIT,
     MAGIC,
     MESSAGE,

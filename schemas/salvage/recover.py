@@ -29,11 +29,10 @@ from hearthlog.schemas.logs.metadata import (
     rosbag2_metadata,
 )
 from hearthlog.schemas.logs.writer import ENCODING, PROFILE, CountedWriter
-from hearthlog.schemas.mcap.chunk_index import LAST_TIME
 from hearthlog.schemas.mcap.chunks import in_parts, read_in_batches
 from hearthlog.schemas.mcap.compressed_chunk import most_content
 from hearthlog.schemas.mcap.logfile import LogFile
-from hearthlog.schemas.mcap.records import HEAD, LIMIT, MAGIC, Definition, not_mcap
+from hearthlog.schemas.mcap.records import HEAD, LAST_TIME, LIMIT, MAGIC, Definition, not_mcap
 from hearthlog.schemas.messages.message_types import EMBEDDING, LOG_DAMAGED, encode_gap
 from hearthlog.schemas.messages.topics import LIVE, is_scenario, parse_topic
 from hearthlog.schemas.new_files import (
