@@ -27,8 +27,7 @@ from hearthlog.analyzer.bridge.alerts.delivery import (
 from hearthlog.analyzer.bridge.alerts.output import AlertsOutput
 from hearthlog.analyzer.bridge.alerts.rules import Notification
 from hearthlog.analyzer.bridge.home_state import HomeState
-from hearthlog.analyzer.bridge.secret_files import page_token
-from hearthlog.analyzer.bridge.settings import DeliverySettings, RecorderAddress
+from hearthlog.analyzer.bridge.settings import DeliverySettings, RecorderAddress, page_token
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.http import free_port
 

@@ -16,12 +16,6 @@ from typing import Any
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.bridge.home_state import HomeState, follow_home
 from hearthlog.analyzer.bridge.output import RECENT, Output, OutputUpdate, Totals
-from hearthlog.analyzer.bridge.secret_files import (
-    figures_token,
-    page_secrets,
-    read_token,
-    secret_path,
-)
 from hearthlog.analyzer.bridge.settings import (
     NO_RECIPIENT,
     BridgeSettings,
@@ -29,6 +23,10 @@ from hearthlog.analyzer.bridge.settings import (
     PageSettings,
     PingSettings,
     RecorderAddress,
+    figures_token,
+    page_secrets,
+    read_token,
+    secret_path,
 )
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report
 from hearthlog.analyzer.errors import missing, remedy

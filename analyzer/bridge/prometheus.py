@@ -17,8 +17,7 @@ from prometheus_client.registry import Collector
 
 from hearthlog.analyzer.activity.segments import is_of_scenario, source_parts
 from hearthlog.analyzer.bridge.output import OutputUpdate, Total, Totals
-from hearthlog.analyzer.bridge.secret_files import figures_token
-from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress
+from hearthlog.analyzer.bridge.settings import PrometheusSettings, RecorderAddress, figures_token
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report
 from hearthlog.analyzer.http import HOST, HttpHandler, HttpServer, is_numeric_host
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY

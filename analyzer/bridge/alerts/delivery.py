@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from hearthlog.analyzer.bridge.alerts.rules import Notification
-from hearthlog.analyzer.bridge.secret_files import secret_path
+from hearthlog.analyzer.bridge.settings import secret_path
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report, StateEntry
 from hearthlog.analyzer.errors import remedy
 from hearthlog.analyzer.logs.local_time import local_time

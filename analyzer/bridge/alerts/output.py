@@ -37,8 +37,12 @@ from hearthlog.analyzer.bridge.alerts.rules import (
     live_history,
 )
 from hearthlog.analyzer.bridge.output import OutputUpdate
-from hearthlog.analyzer.bridge.secret_files import secret_path
-from hearthlog.analyzer.bridge.settings import NO_RECIPIENT, DeliverySettings, RecorderAddress
+from hearthlog.analyzer.bridge.settings import (
+    NO_RECIPIENT,
+    DeliverySettings,
+    RecorderAddress,
+    secret_path,
+)
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState, Report, StateEntry
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.schemas.errors import LogError

@@ -15,8 +15,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from hearthlog.analyzer.bridge.secret_files import secret_path
-from hearthlog.analyzer.bridge.settings import MqttSettings
+from hearthlog.analyzer.bridge.settings import MqttSettings, secret_path
 from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.schemas.files import read_limited
 

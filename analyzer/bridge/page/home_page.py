@@ -41,8 +41,13 @@ from hearthlog.analyzer.bridge.page.sounds import (
     uncounted_ids,
 )
 from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scenario_lines
-from hearthlog.analyzer.bridge.secret_files import cookie_key, keep_address, page_token
-from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
+from hearthlog.analyzer.bridge.settings import (
+    PageSettings,
+    RecorderAddress,
+    cookie_key,
+    keep_address,
+    page_token,
+)
 from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.analyzer.logs.hidden_classes import read_hidden_classes, write_hidden_classes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
