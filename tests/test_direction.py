@@ -23,7 +23,7 @@ from hearthlog.analyzer.doctor.frame_sequence import FrameSequence
 from hearthlog.analyzer.logs.selection import select
 from hearthlog.analyzer.logs.sound_vectors import as_vectors, mean_bearings
 from hearthlog.analyzer.review.lanes import DIRECTION, timeline_plots
-from hearthlog.analyzer.review.live_timeline import LiveTimeline
+from hearthlog.analyzer.review.live import LiveTimeline
 from hearthlog.analyzer.review.timeline import Plot
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.classifiers.evidence import BLOCK_FRAMES

@@ -15,7 +15,7 @@ from livehome import LiveHome
 from waiting import wait_for
 
 from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
-from hearthlog.analyzer.review.current_sounds import CurrentSound, lasting
+from hearthlog.analyzer.review.live import CurrentSound, lasting
 
 FRAME = 50_000_000
 BEGIN = 1_772_348_400 * 10**9

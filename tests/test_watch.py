@@ -26,7 +26,6 @@ from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
-from hearthlog.analyzer.review.current_sounds import AWAY_SECONDS, CurrentSound, CurrentSounds
 from hearthlog.analyzer.review.lanes import (
     FEATURES,
     FLOOR,
@@ -38,7 +37,13 @@ from hearthlog.analyzer.review.lanes import (
     RECORDER,
     StateLane,
 )
-from hearthlog.analyzer.review.live_timeline import LiveTimeline, last_time
+from hearthlog.analyzer.review.live import (
+    AWAY_SECONDS,
+    CurrentSound,
+    CurrentSounds,
+    LiveTimeline,
+    last_time,
+)
 from hearthlog.analyzer.review.timeline import LogLines, Plot
 from hearthlog.analyzer.review.viewer.canvas import Canvas
 from hearthlog.analyzer.review.viewer.drawing import plot_entity

@@ -33,7 +33,7 @@ from hearthlog.tools.cli.terminal import (
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.foxglove.server import Admission
-    from hearthlog.analyzer.review.current_sounds import CurrentSound, CurrentSounds
+    from hearthlog.analyzer.review.live import CurrentSound, CurrentSounds
     from hearthlog.analyzer.review.viewer.recording import LiveServer
     from hearthlog.analyzer.review.viewer.viewer import Viewer
 
@@ -202,7 +202,7 @@ def watch(
             return
     stop = stopped_by(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-    from hearthlog.analyzer.review.live_timeline import last_time
+    from hearthlog.analyzer.review.live import last_time
     from hearthlog.schemas.logs.files import check_allowed
 
     check_allowed(logs)
@@ -354,8 +354,7 @@ def _follow(
 ) -> bool:
     """Draw new data until stopped; return whether something could not be read."""
     from hearthlog.analyzer.logs.layers import zone_of
-    from hearthlog.analyzer.review.current_sounds import CurrentSounds
-    from hearthlog.analyzer.review.live_timeline import LiveTimeline
+    from hearthlog.analyzer.review.live import CurrentSounds, LiveTimeline
     from hearthlog.schemas.logs.follow import follow_messages
 
     damaged = ReportOnce()
@@ -390,7 +389,7 @@ def print_sounds(logs: Path, newest: int | None, timezone: str | None, stop: Eve
     """Print the current sounds until stopped; return whether something could not be read."""
     from hearthlog.analyzer.logs.layers import zone_of
     from hearthlog.analyzer.logs.local_time import home_zone
-    from hearthlog.analyzer.review.current_sounds import CurrentSounds
+    from hearthlog.analyzer.review.live import CurrentSounds
     from hearthlog.schemas.logs.follow import follow_messages
 
     home_zone(timezone)
@@ -450,13 +449,13 @@ class _SoundLines:
         self._states = states
 
     def _name(self, sound: "CurrentSound") -> str:
-        from hearthlog.analyzer.review.current_sounds import microphone_words
+        from hearthlog.analyzer.review.live import microphone_words
 
         return microphone_words(sound.microphone)
 
     def _line(self, sound: "CurrentSound", zone: tzinfo, width: int) -> str:
         from hearthlog.analyzer.logs.local_time import local_time
-        from hearthlog.analyzer.review.current_sounds import lasting, silent_since
+        from hearthlog.analyzer.review.live import lasting, silent_since
 
         is_listening = sound.is_listening()
         moment = local_time(sound.time if is_listening else time.time_ns(), zone)

@@ -15,13 +15,6 @@ import rerun.blueprint as rrb
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.http import free_port
-from hearthlog.analyzer.review.current_sounds import (
-    CurrentSound,
-    CurrentSounds,
-    lasting,
-    microphone_words,
-    silent_since,
-)
 from hearthlog.analyzer.review.lanes import (
     DIRECTION,
     FEATURES,
@@ -34,7 +27,14 @@ from hearthlog.analyzer.review.lanes import (
     StateLane,
     sure_state,
 )
-from hearthlog.analyzer.review.live_timeline import Update
+from hearthlog.analyzer.review.live import (
+    CurrentSound,
+    CurrentSounds,
+    Update,
+    lasting,
+    microphone_words,
+    silent_since,
+)
 from hearthlog.analyzer.review.timeline import LogLines, Plot, Timeline, home_clock
 from hearthlog.analyzer.review.timeline_reader import read_frames
 from hearthlog.analyzer.review.viewer.canvas import Canvas
