@@ -96,7 +96,7 @@ from pathlib import Path
 for name in {of_extras}:
     sys.modules[name] = None
 from hearthlog.tools.cli.main import main
-import hearthlog.analyzer.promotion.promotion_check, hearthlog.analyzer.review.review_list
+import hearthlog.analyzer.promotion, hearthlog.analyzer.review.review_list
 import hearthlog.analyzer.review.timeline_reader, hearthlog.recorder.recording
 from hearthlog.schemas.messages.message_types import typestore
 typestore()

@@ -19,6 +19,12 @@ from hearthlog.analyzer.evaluation import compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, intersection
 from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.promotion import (
+    Verdict,
+    clearly_better,
+    find_champion,
+    regressions,
+)
 from hearthlog.analyzer.promotion.comparison import (
     HomeComparison,
     NamedSounds,
@@ -36,12 +42,6 @@ from hearthlog.analyzer.promotion.paired_labels import (
     TwoModels,
     changes_of_frames,
     changes_of_labellings,
-)
-from hearthlog.analyzer.promotion.promotion_check import (
-    Verdict,
-    clearly_better,
-    find_champion,
-    regressions,
 )
 from hearthlog.analyzer.promotion.recent_time import (
     LogSpan,

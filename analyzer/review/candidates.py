@@ -28,8 +28,8 @@ from hearthlog.analyzer.logs.spans import (
     rows_at,
 )
 from hearthlog.analyzer.marks.marks import RANDOM, read_review
+from hearthlog.analyzer.promotion import find_champion, other_features
 from hearthlog.analyzer.promotion.paired_labels import ChangedTime, find_changed_time
-from hearthlog.analyzer.promotion.promotion_check import find_champion, other_features
 from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.analyzer.review.ranking import spread
 from hearthlog.analyzer.review.review_list import CHANGE, HINT, ReviewSpan

@@ -332,7 +332,7 @@ def rollback(folder: _Folder = None) -> None:
 
 def _check_harmless(folder: Path, name: str, home: list[Path], *, anyway: bool) -> None:
     """Raise ModelError if a model was judged harmful; judge a model without a verdict first."""
-    from hearthlog.analyzer.promotion.promotion_check import judge, judged_against
+    from hearthlog.analyzer.promotion import judge, judged_against
     from hearthlog.models.registry import first_starter, is_starter, load, override_judgement
     from hearthlog.models.starter import BY_FEATURES, with_network
     from hearthlog.schemas.errors import ModelError

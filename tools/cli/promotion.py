@@ -11,9 +11,9 @@ from hearthlog.schemas.errors import printable
 from hearthlog.tools.cli.terminal import print_notice, print_table
 
 if TYPE_CHECKING:
+    from hearthlog.analyzer.promotion import Verdict
     from hearthlog.analyzer.promotion.comparison import HomeComparison, PairedAccuracy
     from hearthlog.analyzer.promotion.paired_labels import LabelChanges
-    from hearthlog.analyzer.promotion.promotion_check import Verdict
     from hearthlog.models.registry import Judgement
 
 

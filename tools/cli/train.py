@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections import Counter
 
     from hearthlog.analyzer.collections.manifest_writer import ManifestSummary
-    from hearthlog.analyzer.promotion.promotion_check import Verdict
+    from hearthlog.analyzer.promotion import Verdict
     from hearthlog.analyzer.training.dataset import Dataset
     from hearthlog.analyzer.training.manifest import Scenario, SkippedClip
     from hearthlog.analyzer.training.method import Method
@@ -182,7 +182,7 @@ def _print_json(
 
 
 def _judged(model: "Model", output: Path, home: list[Path]) -> "Verdict | None":
-    from hearthlog.analyzer.promotion.promotion_check import judge
+    from hearthlog.analyzer.promotion import judge
     from hearthlog.schemas.errors import ModelError
 
     try:

@@ -28,8 +28,8 @@ from hearthlog.analyzer.logs.spans import (
     single_span,
 )
 from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.promotion import Verdict, judge
 from hearthlog.analyzer.promotion.paired_labels import TwoModels, joined_frames
-from hearthlog.analyzer.promotion.promotion_check import Verdict, judge
 from hearthlog.analyzer.promotion.recent_time import (
     RecentLog,
     choose,
