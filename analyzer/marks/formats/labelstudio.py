@@ -8,6 +8,7 @@ from typing import Any
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import Coverage
+from hearthlog.analyzer.marks import Mark
 from hearthlog.analyzer.marks.formats.labels import (
     UNREADABLE,
     Choice,
@@ -18,7 +19,6 @@ from hearthlog.analyzer.marks.formats.labels import (
     place_text,
     scan,
 )
-from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.frames import seconds_text, time_text
 
 _TYPE = "labels"
