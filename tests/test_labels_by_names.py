@@ -25,7 +25,7 @@ from hearthlog.models.embedding import WINDOW_FRAMES, Embeddings, read_projectio
 from hearthlog.models.embedding.networks import YAMNET
 from hearthlog.models.embedding.sound_names import audioset_names, named_sounds
 from hearthlog.models.features.installed import DEFAULT
-from hearthlog.models.labels.names_labeller import NamesLabeller
+from hearthlog.models.labels.labeller import NamesLabeller
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.registry import load, promote
 from hearthlog.models.starter import GENERAL, starter_file

@@ -18,8 +18,7 @@ from hearthlog.models.classifiers.classifier import Classifier
 from hearthlog.models.classifiers.model import Model
 from hearthlog.models.features.floor import Floors, FloorTracker
 from hearthlog.models.labels import Segment, StateRun
-from hearthlog.models.labels.labeller import FrameLabels
-from hearthlog.models.labels.names_labeller import labeller_of
+from hearthlog.models.labels.labeller import FrameLabels, labeller_of
 from hearthlog.recorder.events import Gap
 from hearthlog.schemas.arrays import Float32, Indices, Int64
 from hearthlog.schemas.errors import LogError

@@ -11,8 +11,7 @@ from hearthlog.models.embedding.networks import Embedder
 from hearthlog.models.features import SILENCE_POWER, FeatureSet, mean_and_std
 from hearthlog.models.features.floor import Floors, is_quiet
 from hearthlog.models.labels import Segment
-from hearthlog.models.labels.labeller import FrameLabels, segment_columns
-from hearthlog.models.labels.names_labeller import labeller_of
+from hearthlog.models.labels.labeller import FrameLabels, labeller_of, segment_columns
 from hearthlog.recorder.stream import EncodedMessage, column_messages, segment_line
 from hearthlog.schemas.arrays import Bool, Float32, Indices, Int64
 from hearthlog.schemas.messages import message_types
