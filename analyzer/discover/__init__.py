@@ -1,4 +1,4 @@
-"""Recurring sounds and voices of a home: their clusters, with kinds, files, names, occurrences."""
+"""Recurring sounds and voices of a home: their clusters, files, occurrences and summaries."""
 
 import fcntl
 import hashlib
@@ -34,6 +34,12 @@ from hearthlog.schemas.files import read_limited
 from hearthlog.schemas.frames import NANOSECONDS, read_time, time_text
 from hearthlog.schemas.logs.files import log_readers
 from hearthlog.schemas.new_files import open_lock, replaced_file
+
+if TYPE_CHECKING:  # the page of the home reads summaries, and needs nothing that makes them
+    from hearthlog.analyzer.discover.groups import Groups
+    from hearthlog.analyzer.discover.sounds import HomeSounds
+    from hearthlog.analyzer.discover.speech import HomeSpeech
+    from hearthlog.analyzer.discover.voices import HomeVoices
 
 NO_CLUSTER = -1
 MOST_CLUSTERS = 1_000  # per file
@@ -234,12 +240,6 @@ def read_each(
             read(entry)
         progress(number / len(entries))
 
-
-if TYPE_CHECKING:  # the page of the home reads summaries, and needs nothing that makes them
-    from hearthlog.analyzer.discover.groups import Groups
-    from hearthlog.analyzer.discover.sounds import HomeSounds
-    from hearthlog.analyzer.discover.speech import HomeSpeech
-    from hearthlog.analyzer.discover.voices import HomeVoices
 
 SUMMARY: Final = "groups.safetensors.json"  # in a folder of logs, next to the groups file
 MOST_LABELS, MOST_MICROPHONES = 8, 64  # per group
