@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
@@ -23,16 +23,6 @@ _BUILD = "colcon build --base-paths tools/ros && source install/setup.bash"
 
 class NodeError(Exception):
     """Something that the user of a node can mend; the message is one line that says how."""
-
-
-class RunningNode(Protocol):
-    """A node that can be run."""
-
-    def look(self) -> bool:
-        """Do what there is to do; return whether to go on."""
-
-    def close(self) -> None:
-        """Publish what is left, and end what was begun."""
 
 
 def message_class(name: str) -> Any:
@@ -122,6 +112,9 @@ def wait_for_subscribers(publishers: Iterable[Any]) -> None:
 
 def run(make_node: Callable[[], Any]) -> None:
     """Run a node until it is enough, Ctrl-C comes, or a request to end.
+
+    Its method `look` does what there is to do, and returns whether to go on; `close` publishes what
+    is left, and ends what was begun.
 
     The handlers of rclpy are not used: they end the context while others publish.
     """
