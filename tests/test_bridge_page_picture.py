@@ -218,3 +218,25 @@ def test_sounds_beside_a_television_are_behind_one_tap(phone, show):
     phone.of(f"{button}.click()")
     assert phone.of(beside) == 0
     assert phone.of("seen") == []
+
+
+def test_a_screen_reader_has_counts_in_words_and_no_sign_of_an_empty_status(phone, show):
+    show(390)
+    names = phone.of(
+        "[...document.querySelectorAll('td button[aria-label]')].map((e) => e.ariaLabel)"
+    )
+    coughing = [name for name in names if name.startswith("Coughing, ")]
+    assert [name.rpartition(": ")[2] for name in coughing] == [
+        "1",
+        "2, perhaps 19 more",
+        "perhaps 2",
+    ]
+    lanes = phone.of("[...document.querySelectorAll('.lane')].map((e) => e.ariaLabel)")
+    (lane,) = (name for name in lanes if name.startswith("Coughing"))
+    assert "3 times, perhaps 21 more since yesterday evening" in lane
+    fold = phone.of("document.querySelector('#look button.fold').ariaLabel")
+    assert "perhaps" in fold
+    assert not set("()?+") & set("".join(names) + lane + fold)
+    assert phone.of("document.querySelectorAll('[role=status]').length") == 0
+    heads = phone.of("[...document.querySelectorAll('tbody th')].map((e) => e.textContent)")
+    assert "Talking, 60\u00a0beside a television" in heads

@@ -246,7 +246,7 @@ def _lane(
     last = (of_last_days if home.is_past and of_last_days else [None, *sounds.counted])[-1]
     at = "" if last is None else home.when(last.end)
     name = words.class_words(label)
-    often = words.text("count.not known") if count is None else words.times(count)
+    often = words.text("count.not known") if count is None else _perhaps(of_day, home)
     key = "lane of a day" if home.is_past else "lane and last" if count else "lane"
     description = words.text(key, **{"class": name, "times": often, "last": at})
     if uncounted_today:
@@ -270,6 +270,16 @@ def _lane(
         "last": at,
         "times": [_times(each, name, sounds.given, home) for each in (of_day, *of_parts)],
     }
+
+
+def _perhaps(events: Sequence[SoundEvent], home: HomeDay) -> str:
+    """Return how often a sound was, in words: `twice, perhaps 3 more times`."""
+    words, unsure = home.words, sum(map(home.is_unsure, events))
+    sure = len(events) - unsure
+    if not unsure:
+        return words.times(sure)
+    more = words.more_times(unsure, sure) if sure else words.times(unsure)
+    return ", ".join([words.times(sure)] * bool(sure) + [words.text("perhaps", what=more)])
 
 
 def _times(events: Sequence[SoundEvent], name: str, given: Collection[str], home: HomeDay) -> Any:

@@ -19,6 +19,13 @@ export function counted(value, unsure) {
   return unsure === value ? `${value}?` : `${value - unsure}\u2009(+${unsure}?)`;
 }
 
+// A count for a screen reader, which would read 2 (+3?) sign by sign: 2, perhaps 3 more.
+export function spoken(value, unsure) {
+  if (!unsure) return counted(value);
+  return unsure === value ? say("spoken.unsure", { count: value })
+    : say("spoken.partly", { sure: value - unsure, count: unsure });
+}
+
 const BREAKS = texts["page.breaks"].split(" ").map((word) => [word.replaceAll("|", ""), word.replaceAll("|", "\u00ad")]);
 
 // A name whose long words may be broken: a browser may have no dictionary of the language.

@@ -1,5 +1,5 @@
 // A day as one picture, its counts, and the times behind a lane or a count.
-import { breakable, colour, count, counted, draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
+import { breakable, colour, count, counted, draw, inside, keep, make, place, say, send, set, spoken, swatch, write } from "./elements.js";
 import { showEntries } from "./sounds.js";
 
 const LANE = 36, NAME = 15, GAP = 3, HOURS = 20, NARROWEST = 4; // pixels
@@ -157,14 +157,16 @@ function showRow(row, it, where, { columns, now }) {
   const isPast = now === null;
   if (!row.name.firstChild) {
     row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour),
-      make("span", {}, breakable(it.words), row.about = make("span", { class: "about" }))));
+      make("span", {}, breakable(it.words), row.comma = make("span", { class: "hidden" }), row.about = make("span", { class: "about" }))));
   }
-  write(row.about, it.uncounted && !it.count ? count("uncounted", it.uncounted) : "");
+  const note = it.uncounted && !it.count ? count("uncounted", it.uncounted) : "";
+  write(row.comma, note && ", "); // for a screen reader, which reads on
+  write(row.about, note);
   it.counts.forEach((value, index) => {
     row.cells[index].className = value ? "" : "none";
     write(row.counts[index], value === null ? say("not known") : counted(value, it.unsure[index + 1]));
     const name = [it.words, where, columns[index]].filter(Boolean).join(", ");
-    set(row.counts[index], "aria-label", `${name}: ${row.counts[index].textContent}`);
+    set(row.counts[index], "aria-label", `${name}: ${value === null ? say("not known") : spoken(value, it.unsure[index + 1])}`);
   });
   row.last.className = it.last ? "" : "none";
   write(row.last, it.last || say(isPast ? "none in span" : "not lately"));

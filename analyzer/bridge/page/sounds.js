@@ -1,5 +1,5 @@
 // Lists of sounds: what they were, what they really were, and their kept sound.
-import { ask, breakable, count, counted, inside, keep, make, place, say, send, swatch, write } from "./elements.js";
+import { ask, breakable, count, counted, inside, keep, make, place, say, send, spoken, swatch, write } from "./elements.js";
 
 const REST = 8000; // milliseconds without a touch, after which a list may change
 const SEPARATOR = "\u00a0· "; // ends a line, and begins none
@@ -132,9 +132,10 @@ function folded(look) {
     if (same.length <= SINGLE + 1 || number < SINGLE) entries.push({ ...entry, isFolded: false });
     else if (number === SINGLE) {
       const earlier = same.slice(SINGLE);
-      const often = count("earlier", sum(earlier.map(({ ids }) => ids.length)), sum(earlier.map(({ unsure }) => unsure)));
+      const numbers = [sum(earlier.map(({ ids }) => ids.length)), sum(earlier.map(({ unsure }) => unsure))];
+      const often = count("earlier", ...numbers), inWords = say("spoken.earlier", { count: spoken(...numbers) });
       const about = earlier.map((each) => [timeOf(each), each.room].filter(Boolean).join(" ")).join(", ");
-      entries.push({ id: `fold ${key}`, key, colour: entry.colour, words: entry.words, often, about },
+      entries.push({ id: `fold ${key}`, key, colour: entry.colour, words: entry.words, often, inWords, about },
         ...earlier.map((each) => ({ ...each, isFolded: !unfolded.has(key) })));
     }
   }
@@ -177,12 +178,12 @@ function timeOf({ time, unsure, ids }) {
   return unsure === ids.length ? `${time}?` : `${time} (${unsure}?)`;
 }
 
-function showFold(item, { key, often, about, words }) {
+function showFold(item, { key, often, inWords = often, about, words }) {
   const isOpen = unfolded.has(key);
   write(item.often, `${SEPARATOR}${often}`);
   write(item.about, about);
   item.button.setAttribute("aria-expanded", String(isOpen));
-  item.button.setAttribute("aria-label", `${say(isOpen ? "fold" : "unfold")}: ${words}, ${often}`);
+  item.button.setAttribute("aria-label", `${say(isOpen ? "fold" : "unfold")}: ${words}, ${inWords}`);
   write(item.button, say(isOpen ? "fold" : "unfold"));
 }
 
@@ -191,7 +192,7 @@ function begin(question) {
   const item = {
     what: make("p", { class: "what" }),
     about: make("p", { class: "about" }),
-    said: make("p", { class: "said", role: "status" }),
+    said: make("p", { class: "said", "aria-live": "polite" }),
     summary: make("summary", {}, say("that was")),
     isReviewable: false,
   };
