@@ -404,6 +404,7 @@ def test_a_ring_that_is_not_sure_is_listed_as_not_counted_until_somebody_confirm
     shown = ShownBouts(home.moment.now, UTC, home.words, lambda _: "", True)
     about = shown.describe(bout)
     assert (about["sure"], about["look"]) == ("not sure, so not counted", False)
+    assert about["words"] == "Perhaps telephone ringing"
     confirmed = shown._replace(correction=lambda _: "You said: Telephone ringing")
     assert confirmed.describe(bout)["sure"] == ""
 

@@ -174,10 +174,14 @@ def test_the_hours_of_a_week_lie_below_those_of_its_days(phone, show):
 def test_a_past_day_says_why_a_class_with_a_count_of_0_has_a_mark(phone, show):
     show(1366)
     phone.of("document.getElementById('day-before').click()")
+    phone.until(
+        "document.getElementById('day-sentence').dataset.date"
+        " === document.getElementById('dates').options[1].value"
+    )
     phone.shows("#rooms", "1 beside a television")
     row = "[...document.querySelectorAll('tbody tr')].find((e) => e.innerText.startsWith('Shout'))"
     cells = phone.of(f"[...{row}.cells].map((e) => e.innerText.replaceAll('\\u00a0', ' '))")
-    assert cells == ["Shouting\n1 beside a television", "0", "0", "\N{EN DASH}"]
+    assert cells == ["Shouting\n,\n1 beside a television", "0", "0", "\N{EN DASH}"]
     lane = (
         "[...document.querySelectorAll('.lane')]"
         ".find((e) => e.querySelector('.name').textContent === 'Shouting')"

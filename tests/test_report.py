@@ -764,7 +764,7 @@ def test_the_first_sentence_of_a_headline_is_a_part_and_not_cut_at_a_full_stop(t
     data, _ = read_report_data(find_home_logs([tmp_path / "logs"]), Period(DAY, 1, UTC))
     assert day_headline(data.days[0]) == ("Sunday was quiet.", "1 bout of coughing by day (12:05).")
     page = page_of(tmp_path / "logs", tmp_path)
-    assert '<p class="headline">Sunday was quiet. <span class="second">1 bout' in page
+    assert '<p class="headline">Sunday was quiet. <br><span class="second">1 bout' in page
 
 
 @pytest.mark.parametrize(
@@ -912,7 +912,7 @@ class Outline(HTMLParser):
         self.stack, self.fetched, self.scripts, self.headings = [], [], 0, []
 
     def handle_starttag(self, tag, attrs):
-        if tag not in {"meta", "img"}:
+        if tag not in {"meta", "img", "br"}:
             self.stack.append(tag)
         self.scripts += tag == "script"
         wanted = [value for name, value in attrs if name in {"src", "href"}]

@@ -122,7 +122,9 @@ def _night(classes: Sequence[str]) -> Iterator[ReportFigure]:
         if name in classes:
             yield _at_night(name, several_in_words(name), in_words(name))
     yield ReportFigure(
-        "Times with half a minute of sound", "Times with sound", lambda day: day.night_stretches
+        "Times with half a minute of sound",
+        "Half minutes of sound",
+        lambda day: day.night_stretches,
     )
     yield ReportFigure("Time with sound", "Time with sound", lambda day: day.night_sound)
 

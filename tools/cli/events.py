@@ -280,7 +280,9 @@ def _print(
         else ()
     )
     lengths = _right("length", [_length(event.seconds) for event in found])
-    shares = _right("sure", [f"{100 * event.confidence:.0f} %" for event in found])
+    shares = _right(
+        "sure", [f"{100 * event.confidence:.0f} %{'?' * event.is_unsure}" for event in found]
+    )
     head = (
         f"when ({clock})" if clock else "when", "sound", next(lengths), next(shares),
         *(["where"] if several else []), "",

@@ -267,7 +267,7 @@ def _lane(
         "unsure": [sum(map(home.is_unsure, own)) for own in (of_day, *of_parts)],
         "uncounted": len(uncounted_today),
         "uncounted_times": _few_clocks(uncounted_today, home),
-        "last": at,
+        "last": f"{at}?" if last is not None and home.is_unsure(last) else at,
         "times": [_times(each, name, sounds.given, home) for each in (of_day, *of_parts)],
     }
 

@@ -159,7 +159,7 @@ function showRow(row, it, where, { columns, now }) {
     row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour),
       make("span", {}, breakable(it.words), row.comma = make("span", { class: "hidden" }), row.about = make("span", { class: "about" }))));
   }
-  const note = it.uncounted && !it.count ? count("uncounted", it.uncounted) : "";
+  const note = it.uncounted ? count("uncounted", it.uncounted) : "";
   write(row.comma, note && ", "); // for a screen reader, which reads on
   write(row.about, note);
   it.counts.forEach((value, index) => {

@@ -305,7 +305,10 @@ class ShownBouts(NamedTuple):
     def _heading(self, bout: Bout) -> str:
         if not bout.doubts:
             label = bout.first.label
-            return self.words.class_words(self.common_names.get(label, label))
+            words = self.words.class_words(self.common_names.get(label, label))
+            perhaps_only = self._are_too_doubtful(bout.events)
+            inside = self.words.inside(words)
+            return self.words.text("doubt.perhaps", classes=inside) if perhaps_only else words
         names = [self.words.class_words(name) for name in perhaps(bout.doubts, self.hidden)]
         if not names:
             return self.words.text("doubt.loud")
@@ -328,12 +331,18 @@ class ShownBouts(NamedTuple):
     def _sureness_of(self, events: Sequence[SoundEvent]) -> str:
         """Return how many of some events are not sure; whether the likeliest is if none are."""
         unsure = self._unsure_of(events)
-        if all(is_too_doubtful(e.label, e.confidence) and not self.correction(e) for e in events):
+        if self._are_too_doubtful(events):
             return self.words.text("not sure.not counted")
         if 0 < unsure < len(events):
             return self.words.count("not sure.some", unsure)
         word = self.sureness.word(max(event.confidence for event in events))
         return self.words.text(word) if word == SURE or unsure else ""
+
+    def _are_too_doubtful(self, events: Sequence[SoundEvent]) -> bool:
+        return all(
+            is_too_doubtful(each.label, each.confidence) and not self.correction(each)
+            for each in events
+        )
 
     def _unsure_of(self, events: Sequence[SoundEvent]) -> int:
         return sum(self.sureness.is_unsure(e.confidence) and not self.correction(e) for e in events)
