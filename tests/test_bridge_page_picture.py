@@ -244,3 +244,14 @@ def test_a_screen_reader_has_counts_in_words_and_no_sign_of_an_empty_status(phon
     assert phone.of("document.querySelectorAll('[role=status]').length") == 0
     heads = phone.of("[...document.querySelectorAll('tbody th')].map((e) => e.textContent)")
     assert "Talking, 60\u00a0beside a television" in heads
+
+
+def test_an_evening_of_television_leaves_the_sounds_of_the_day_in_the_list(phone, tmp_path):
+    bursts = [(at("18:00") + 300 * n, 170, ("speech", "music")[n % 2], 0.9) for n in range(46)]
+    busy = [(at(f"{hour:02}:00"), 5, "objects_activity", 0.9) for hour in range(9, 15)]
+    write_day(tmp_path, DAY, [*busy, *bursts], hours=range(22))
+    now = midnight(DAY) + round(at("21:59") * NANOSECONDS)
+    with served_page(tmp_path, UTC, now) as page:
+        phone.open(SimpleNamespace(url=page.address), 390, 844, "light")
+        phone.shows("#events .fold .what", "20 sounds, not counted")
+        assert phone.text("#all-events").replace("\u00a0", " ") == "Show all 8"

@@ -265,14 +265,15 @@ class HomePage:
         }
 
     def _latest(self) -> list[Bout]:
-        """Return the newest bouts that need review, and the newest others."""
-        left = {True: _MOST_TO_REVIEW, False: _MOST_OTHERS}
+        """Return the newest bouts that need review, those beside a television, and the others."""
+        left = {"review": _MOST_TO_REVIEW, "uncounted": _MOST_OTHERS, "others": _MOST_OTHERS}
         found = []
         for bout in self._bouts.values():
             uncounted = sum(event.id in self._uncounted for event in bout.events)
-            look = needs_review(bout, uncounted)
-            if left[look]:
-                left[look] -= 1
+            kind = "uncounted" if uncounted == len(bout.events) else "others"
+            kind = "review" if needs_review(bout, uncounted) else kind
+            if left[kind]:
+                left[kind] -= 1
                 found.append(bout)
         return found
 
