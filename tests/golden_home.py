@@ -36,7 +36,7 @@ from hearthlog.analyzer.bridge.bridge import Bridge, ProblemReporter, open_outpu
 from hearthlog.analyzer.bridge.settings import BridgeSettings, RecorderAddress, load_bridge_settings
 from hearthlog.analyzer.bridge.state import BridgeState, state_folder
 from hearthlog.analyzer.http import free_port
-from hearthlog.analyzer.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.recorder.config import load_settings
 from hearthlog.recorder.pause_schedule import time_zone
 from hearthlog.recorder.recording import record

@@ -18,7 +18,7 @@ from log_fixtures import Result
 from logreader import LogReader
 from rosbags import rosbag1, rosbag2
 
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.review.live import LiveTimeline
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.modelfile import load_model

@@ -17,7 +17,7 @@ from hearthlog.analyzer.bridge.page.home_page import HomePage
 from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.local_time import today
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.schemas.logs.files import find_logs
 
 JSON = {"Content-Type": "application/json"}

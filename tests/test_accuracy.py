@@ -35,7 +35,7 @@ from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion.recent_time import reference
 from hearthlog.analyzer.report.report import Period, make_report
 from hearthlog.analyzer.review.lanes import class_precision

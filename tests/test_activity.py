@@ -34,7 +34,7 @@ from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, today
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, single_span
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, write_marks
 from hearthlog.analyzer.promotion.paired_labels import reference_sounds
 from hearthlog.analyzer.promotion.recent_time import recent_logs, spans_of
 from hearthlog.analyzer.relabel.layer import layer_topics

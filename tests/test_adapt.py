@@ -13,7 +13,7 @@ from log_fixtures import run
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.model_scores import segment_probabilities
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.training.adaptation import adapt_model, is_moved, learned_over
 from hearthlog.analyzer.training.dataset import Recording, clip_recordings, cut_recordings
 from hearthlog.analyzer.training.home_recordings import (

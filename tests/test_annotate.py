@@ -21,7 +21,8 @@ from logreader import LogReader
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import ROUNDING, find_coverage
-from hearthlog.analyzer.marks import (
+from hearthlog.analyzer.marks.formats import FORMATS
+from hearthlog.analyzer.marks.marks import (
     LATEST,
     QUEUE,
     RANDOM,
@@ -32,7 +33,6 @@ from hearthlog.analyzer.marks import (
     read_reviewed,
     write_marks,
 )
-from hearthlog.analyzer.marks.formats import FORMATS
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs, review_path
@@ -336,7 +336,7 @@ def test_a_layer_from_before_marks_said_who_made_them_is_read(log, zero):
 def test_of_two_processes_that_mark_at_once_nothing_is_lost(log, zero):
     code = (
         "import sys; from pathlib import Path\n"
-        "from hearthlog.analyzer.marks import Mark, write_marks\n"
+        "from hearthlog.analyzer.marks.marks import Mark, write_marks\n"
         "log, first = Path(sys.argv[1]), int(sys.argv[2])\n"
         "for start in range(first, first + 12 * 10**8, 10**8):\n"
         "    write_marks(log, [Mark('mic', start, start + 10**7, 'cry')])"

@@ -35,7 +35,7 @@ from hearthlog.analyzer.bridge.settings import BridgeSettings, PageSettings, Rec
 from hearthlog.analyzer.bridge.state import BridgeError, BridgeState
 from hearthlog.analyzer.http import HttpServer, free_port
 from hearthlog.analyzer.logs.local_time import today
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import ON_TELEVISION
 from hearthlog.recorder.pause_schedule import is_paused, pause, paused_until
 from hearthlog.schemas.errors import LogError

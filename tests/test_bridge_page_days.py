@@ -39,7 +39,7 @@ from hearthlog.analyzer.bridge.settings import PageSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import local_time, today
-from hearthlog.analyzer.marks import Mark
+from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.models.classes import CLASSES, RUNNING_WATER, colour_on_paper
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns

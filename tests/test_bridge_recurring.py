@@ -36,7 +36,7 @@ from hearthlog.analyzer.discover import (
     summary_path,
 )
 from hearthlog.analyzer.discover.groups import GROUPS
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.files import find_logs
 

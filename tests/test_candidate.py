@@ -18,7 +18,7 @@ from model_folders import keep_models
 from test_model_changes import block, count, labels_by, output, recording, wait_for
 
 from hearthlog.analyzer.logs.layers import find_coverage
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion.comparison import compare_on_trial, gather_evidence
 from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.models.features.installed import DEFAULT

@@ -41,7 +41,7 @@ from hearthlog.analyzer.logs.catalog import (
 )
 from hearthlog.analyzer.logs.catalog_writer import write_catalog
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.workers import InlineWorkers, open_workers
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import MicrophoneSettings, Settings

@@ -13,7 +13,7 @@ from model_folders import keep_models
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation.model_scores import compare_models, evaluate_model
-from hearthlog.analyzer.marks import Mark, MarkedSpan, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import Mark, MarkedSpan, read_marks, write_marks
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.dataset import clip_recordings, cut_recordings
 from hearthlog.analyzer.training.home_recordings import home_recordings

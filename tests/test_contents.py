@@ -19,7 +19,7 @@ from rewriting import Log
 from hearthlog.analyzer.doctor.examination import examine
 from hearthlog.analyzer.logs import summary as summarising
 from hearthlog.analyzer.logs.summary import summarise
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.config import MicrophoneSettings, Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

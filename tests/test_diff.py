@@ -19,7 +19,7 @@ from hearthlog.analyzer.evaluation import Events, compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.selection import array_names
 from hearthlog.analyzer.logs.spans import NONE
-from hearthlog.analyzer.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.review.ranking import make_queue
 from hearthlog.analyzer.review.review_list import (
     REASONS,

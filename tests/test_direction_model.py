@@ -20,7 +20,7 @@ from rewriting import Log
 from safetensors.numpy import load, save
 
 from hearthlog.analyzer.logs.recorder_info import read_recorder_infos
-from hearthlog.analyzer.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.relabel.player import ReplayOptions
 from hearthlog.analyzer.relabel.recorded import Features, read_recorded
 from hearthlog.analyzer.relabel.relabel import relabel

@@ -35,7 +35,7 @@ from hearthlog.analyzer.discover.groups import (
 from hearthlog.analyzer.discover.sounds import discover, group_spans, read_sounds
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.marks import Mark, ReviewedSpan, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, write_marks
 from hearthlog.analyzer.recorder_status import examine_live
 from hearthlog.analyzer.review.lanes import timeline_lanes
 from hearthlog.analyzer.review.timeline import LabelledSpans

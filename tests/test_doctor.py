@@ -40,7 +40,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
 from hearthlog.analyzer.doctor.examination import examine
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.features.floor import BLOCK_FRAMES
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.recorder.config import Settings

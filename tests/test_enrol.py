@@ -14,8 +14,8 @@ from log_fixtures import run
 from stores import put
 
 from hearthlog.analyzer.logs.layers import find_coverage
-from hearthlog.analyzer.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.marks.enrol import enrol_file
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.analyzer.training.home_recordings import home_recordings
 from hearthlog.analyzer.training.home_training_set import read_home_training_set
 from hearthlog.models.features.installed import DEFAULT

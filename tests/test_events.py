@@ -22,7 +22,7 @@ from hearthlog.analyzer.activity.daily_metrics import day_of, metrics_of_home
 from hearthlog.analyzer.activity.home_data import read_home
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.session import listen
 from hearthlog.analyzer.review.timeline import SoundClip
 from hearthlog.models.classes import SILENCE

@@ -18,7 +18,7 @@ from foreign_label_files import FILES
 from log_fixtures import run
 
 from hearthlog.analyzer.logs.layers import find_coverage
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record
 from hearthlog.recorder.sources.audio_files import FileSource

@@ -38,7 +38,7 @@ from readers import (
 )
 
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.review.lanes import FEATURES
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.models.modelfile import load_model

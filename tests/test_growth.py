@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from hearthlog import __version__
 from hearthlog.analyzer.logs.selection import select
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.logs.columns import iterate_columns, join, read_columns
 from hearthlog.schemas.logs.files import find_logs, is_layer

@@ -12,7 +12,7 @@ import pytest
 from log_fixtures import run
 
 from hearthlog.analyzer.errors import DataError
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.dataset import CONFIRMED
 from hearthlog.analyzer.training.home_recordings import (

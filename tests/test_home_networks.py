@@ -23,7 +23,7 @@ from hearthlog.analyzer.discover.sounds import (
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.spans import JudgeableSpans, span_sounds
 from hearthlog.analyzer.training.home_recordings import read_reviewed_sound, training_recordings
 from hearthlog.analyzer.training.home_training_set import read_home_training_set

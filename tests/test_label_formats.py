@@ -16,10 +16,10 @@ from pyannote.database.util import load_rttm
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import ROUNDING, Coverage, find_coverage
-from hearthlog.analyzer.marks import LATEST, Mark, new_marks, read_marks
 from hearthlog.analyzer.marks.formats import FORMATS
 from hearthlog.analyzer.marks.formats.labels import Choice
 from hearthlog.analyzer.marks.label_files import ImportOptions, import_labels, write_labels
+from hearthlog.analyzer.marks.marks import LATEST, Mark, new_marks, read_marks
 from hearthlog.schemas.frames import NANOSECONDS, seconds_text
 from hearthlog.schemas.logs.files import find_logs
 

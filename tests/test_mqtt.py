@@ -23,7 +23,7 @@ from hearthlog.analyzer.bridge.mqtt.publisher import MqttPublisher
 from hearthlog.analyzer.bridge.settings import MqttSettings, RecorderAddress
 from hearthlog.analyzer.bridge.state import BridgeState
 from hearthlog.analyzer.logs.hidden_classes import NEVER_TELL_FILE, write_hidden_classes
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.recorder.log.folder_lock import FolderLock
 from hearthlog.recorder.pause_schedule import paused_until
 from hearthlog.schemas.frames import NANOSECONDS

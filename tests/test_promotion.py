@@ -18,7 +18,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.evaluation import compare_labellings
 from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling, find_labellings
 from hearthlog.analyzer.logs.spans import Spans, intersection
-from hearthlog.analyzer.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import PERSON, QUEUE, RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion import (
     Verdict,
     clearly_better,

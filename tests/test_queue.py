@@ -21,7 +21,7 @@ from hearthlog.analyzer.logs.clips import kept_time
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.layers import find_coverage
 from hearthlog.analyzer.logs.spans import NONE, cut, intersection_rows, joined, single_span
-from hearthlog.analyzer.marks import QUEUE, RANDOM, Mark, read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, read_marks, read_reviewed
 from hearthlog.analyzer.review import review_list as requested
 from hearthlog.analyzer.review.candidates import (
     MINUTE,

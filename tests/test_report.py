@@ -36,7 +36,7 @@ from hearthlog.analyzer.logs.hidden_classes import write_hidden_classes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span, home_zone, local_time
 from hearthlog.analyzer.logs.spans import Spans, cut, difference, intersection, joined, lengths
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.relabel.layer import layer_topics
 from hearthlog.analyzer.report.headline import day_headline
 from hearthlog.analyzer.report.report import Period, make_report, read_report_data

@@ -18,7 +18,7 @@ from log_fixtures import small_disk
 from logs import read
 
 from hearthlog.analyzer.doctor.examination import examine
-from hearthlog.analyzer.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.disk_keeper import DiskKeeper, keep_disk
 from hearthlog.recorder.events import Frames

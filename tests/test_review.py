@@ -32,7 +32,7 @@ from hearthlog.analyzer.http import free_port
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined
-from hearthlog.analyzer.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, read_marks, read_reviewed, write_marks
 from hearthlog.analyzer.review.lanes import timeline_lanes
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_list import ReviewSpan as Listed

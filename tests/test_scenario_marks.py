@@ -17,7 +17,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.catalog import read_catalog
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import LabelledFile, Labellings, find_labellings
-from hearthlog.analyzer.marks import (
+from hearthlog.analyzer.marks.marks import (
     PERSON,
     RANDOM,
     Mark,

@@ -14,7 +14,7 @@ from hearthlog.analyzer.activity.checked_minutes import read_reviewed_labels
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.recorder_info import model_of
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion import find_champion
 from hearthlog.analyzer.promotion.comparison import gather_evidence
 from hearthlog.analyzer.promotion.recent_time import recent_logs

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 
 from hearthlog.analyzer.logs.recorder_info import Status
 from hearthlog.analyzer.logs.summary import summarise
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.features.installed import DEFAULT
 from hearthlog.models.modelfile import load_model
 from hearthlog.recorder.config import MicrophoneSettings, Settings

@@ -17,7 +17,7 @@ from logreader import LogReader
 from logs import read
 
 from hearthlog.analyzer.doctor.examination import examine
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.recorder.disk_keeper import keep_disk
 from hearthlog.recorder.retention import KeepingRules, Limits, ThinningDays
 from hearthlog.schemas.errors import LogError

@@ -27,7 +27,7 @@ from viewers import rerun_home, shown, viewer
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review import timeline_reader as reading
 from hearthlog.analyzer.review.lanes import (
     FEATURES,

@@ -13,7 +13,7 @@ from log_fixtures import run
 from logs import features, read
 
 from hearthlog.analyzer.logs import recorder_info
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.lanes import FEATURES, timeline_plots
 from hearthlog.analyzer.review.timeline_reader import read_timeline
 from hearthlog.analyzer.training.home_recordings import home_recordings

@@ -27,7 +27,7 @@ from viewers import (
 )
 
 from hearthlog.analyzer.logs.local_time import day_span
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.review.lanes import PROBABILITIES, SELECTED_COLOUR
 from hearthlog.analyzer.review.timeline import Key
 from hearthlog.analyzer.review.timeline_reader import read_timeline

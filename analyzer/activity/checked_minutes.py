@@ -28,7 +28,7 @@ from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings, overlaid, unified
 from hearthlog.analyzer.logs.recorder_info import model_of
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, difference, lengths, overlay, rows_at
-from hearthlog.analyzer.marks import (
+from hearthlog.analyzer.marks.marks import (
     CHOICES,
     RANDOM,
     Mark,

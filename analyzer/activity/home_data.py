@@ -23,8 +23,8 @@ from hearthlog.analyzer.logs.labelling import (
 from hearthlog.analyzer.logs.recorder_info import Trouble, gaps_of, troubles_of
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
 from hearthlog.analyzer.logs.spans import NONE, SEGMENT_DELAY, Spans, cut, joined
-from hearthlog.analyzer.marks import Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.analyzer.marks.label_files import find_class_names
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import CLASS_NAME, OF_EVERY_SCENARIO, OTHER, class_name
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS

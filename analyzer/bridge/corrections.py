@@ -13,7 +13,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE
-from hearthlog.analyzer.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.models.classes import SILENCE, TELEVISION, UNKNOWN, class_name
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.frames import NANOSECONDS

@@ -35,7 +35,7 @@ from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs
 from hearthlog.analyzer.logs.selection import checked_array_names
 from hearthlog.analyzer.logs.sound_vectors import mean_embeddings
 from hearthlog.analyzer.logs.spans import concatenated_ranges
-from hearthlog.analyzer.marks import (
+from hearthlog.analyzer.marks.marks import (
     Mark,
     MarkedSpan,
     ReviewedSpan,

@@ -21,8 +21,8 @@ from hearthlog.analyzer.logs.labelling import SEGMENT_FIELDS, Labelling, all_cla
 from hearthlog.analyzer.logs.layers import find_coverage, with_layers
 from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
 from hearthlog.analyzer.logs.spans import Spans, intersection, intersection_rows, joined
-from hearthlog.analyzer.marks import read_marks
 from hearthlog.analyzer.marks.label_files import read_lines
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.training.scores import Scores, score
 from hearthlog.models.classes import SILENCE, ordered
 from hearthlog.schemas.arrays import Bool, Int64

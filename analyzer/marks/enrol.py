@@ -17,7 +17,7 @@ from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.export.merge import merge_logs
 from hearthlog.analyzer.logs.layers import find_coverage, latest_records
 from hearthlog.analyzer.logs.selection import array_names, select
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.models.classes import CLASS_NAME, SILENCE, class_name
 from hearthlog.models.features import SILENCE_POWER
 from hearthlog.recorder.config import MicrophoneSettings, load_settings

@@ -11,7 +11,6 @@ from typing import NamedTuple, cast
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import ROUNDING, Coverage
 from hearthlog.analyzer.logs.text_files import read_text
-from hearthlog.analyzer.marks import Mark
 from hearthlog.analyzer.marks.formats import AUDACITY, RAVEN, LabelFormat, find_format
 from hearthlog.analyzer.marks.formats.labels import (
     OTHER,
@@ -26,6 +25,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     place_text,
 )
 from hearthlog.analyzer.marks.formats.tables import is_table
+from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.models.classes import CLASS_NAME, find_class
 from hearthlog.schemas.files import read_toml
 from hearthlog.schemas.frames import FRAME_NANOSECONDS

@@ -22,7 +22,7 @@ from hearthlog.analyzer.logs.spans import (
     joined,
     single_span,
 )
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_marks, read_reviewed
 from hearthlog.models.classes import SILENCE, UNDECIDED, class_name
 from hearthlog.models.classifiers.model import Model
 from hearthlog.schemas.errors import LogError

@@ -27,7 +27,7 @@ from hearthlog.analyzer.logs.spans import (
     overlay,
     rows_at,
 )
-from hearthlog.analyzer.marks import RANDOM, read_review
+from hearthlog.analyzer.marks.marks import RANDOM, read_review
 from hearthlog.analyzer.promotion import find_champion, other_features
 from hearthlog.analyzer.promotion.paired_labels import ChangedTime, find_changed_time
 from hearthlog.analyzer.promotion.recent_time import recent_logs

@@ -21,7 +21,7 @@ from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, microphone_s
 from hearthlog.analyzer.logs.selection import checked_array_names
 from hearthlog.analyzer.logs.sound_vectors import as_vectors, degrees_of
 from hearthlog.analyzer.logs.spans import EVENT_PAUSE, joined, overlay, rows_at
-from hearthlog.analyzer.marks import RANDOM
+from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.timeline import (
     LabelledSpans,
     LabellingTimeline,

@@ -9,7 +9,7 @@ import numpy as np
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import Coverage
-from hearthlog.analyzer.marks import (
+from hearthlog.analyzer.marks.marks import (
     RANDOM,
     Mark,
     MarkedSpan,

@@ -17,8 +17,8 @@ from hearthlog.analyzer.logs.labelling import Labelling, NamedLabelling
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.spans import NEVER, Spans, cut, intersection_rows, single_span, union
 from hearthlog.analyzer.logs.text_files import csv_records, read_text
-from hearthlog.analyzer.marks import QUEUE, RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.marks.formats import find_format
+from hearthlog.analyzer.marks.marks import QUEUE, RANDOM, Mark, ReviewedSpan
 from hearthlog.analyzer.review.ranking import USEFUL, ReviewQueue
 from hearthlog.models.classes import CLASS_NAME
 from hearthlog.schemas.errors import LogError

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labellings, NamedLabelling
 from hearthlog.analyzer.logs.spans import NONE, Spans, cut, union
-from hearthlog.analyzer.marks import QUEUE, RANDOM
+from hearthlog.analyzer.marks.marks import QUEUE, RANDOM
 from hearthlog.analyzer.promotion.paired_labels import A_DAY, class_words, time_words
 from hearthlog.analyzer.review.candidates import (
     MINUTE,

@@ -12,7 +12,7 @@ from typing import Protocol
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.clips import play_sound, wav_bytes
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.marks import PERSON, RANDOM, Mark
+from hearthlog.analyzer.marks.marks import PERSON, RANDOM, Mark
 from hearthlog.analyzer.review.marking import Marking
 from hearthlog.analyzer.review.review_queue import ReviewItem
 from hearthlog.analyzer.review.timeline import Key, LabelledSpans, Question, SoundClip, sound_of

@@ -23,7 +23,7 @@ from hearthlog.analyzer.logs.local_time import home_zone
 from hearthlog.analyzer.logs.recorder_info import MicrophoneHealth, lasting
 from hearthlog.analyzer.logs.selection import decode_types
 from hearthlog.analyzer.logs.spans import difference, joined, single_span
-from hearthlog.analyzer.marks import Reviewed, read_review
+from hearthlog.analyzer.marks.marks import Reviewed, read_review
 from hearthlog.analyzer.review.lanes import (
     FEATURES,
     FIELDS,

@@ -19,7 +19,7 @@ from hearthlog.analyzer.logs.sound_vectors import (
     directions_of,
     embeddings_of,
 )
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, read_review
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, read_review
 from hearthlog.analyzer.training.clips import AS_IT_IS, ClipEmbeddings, spread
 from hearthlog.analyzer.training.dataset import Recording
 from hearthlog.analyzer.training.direction_samples import sighting_of

@@ -4,7 +4,7 @@ import pytest
 
 pytest.importorskip("hearthlog.tools.lab.bench", reason="the wheel leaves the benchmarks out")
 
-from hearthlog.analyzer.marks import read_marks
+from hearthlog.analyzer.marks.marks import read_marks
 from hearthlog.analyzer.promotion.recent_time import recent_logs
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import NANOSECONDS

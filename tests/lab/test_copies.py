@@ -12,7 +12,7 @@ import soundfile
 from log_fixtures import run
 from mcap.reader import make_reader
 
-from hearthlog.analyzer.marks import Mark, read_marks, write_marks
+from hearthlog.analyzer.marks.marks import Mark, read_marks, write_marks
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.recorder.recording import record

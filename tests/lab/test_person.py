@@ -7,7 +7,7 @@ import pytest
 
 from hearthlog.analyzer.logs.labelling import find_labellings
 from hearthlog.analyzer.logs.spans import intersection_rows, overlay, single_span
-from hearthlog.analyzer.marks import read_marks, read_reviewed
+from hearthlog.analyzer.marks.marks import read_marks, read_reviewed
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings
 from hearthlog.schemas.frames import NANOSECONDS

@@ -35,10 +35,10 @@ from hearthlog.tools.cli.terminal import (
 
 if TYPE_CHECKING:
     from hearthlog.analyzer.logs.layers import Coverage
-    from hearthlog.analyzer.marks import Mark, ReviewedSpan
     from hearthlog.analyzer.marks.enrol import Enrolled
     from hearthlog.analyzer.marks.formats.labels import SkippedLabels
     from hearthlog.analyzer.marks.label_files import Folded
+    from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 
 
 _SCENARIO = "Scenario of the marks, by name; without it the marks are of the sounds of the home."
@@ -94,16 +94,16 @@ def import_labels(
     label count as reviewed. Exit status 3: some labels were left out.
     """
     from hearthlog.analyzer.logs.layers import find_coverage
-    from hearthlog.analyzer.marks import (
+    from hearthlog.analyzer.marks.formats.labels import Choice
+    from hearthlog.analyzer.marks.label_files import ImportOptions, read_class_map
+    from hearthlog.analyzer.marks.label_files import import_labels as read_labels
+    from hearthlog.analyzer.marks.marks import (
         RANDOM,
         new_marks,
         read_marks,
         read_reviewed,
         write_marks,
     )
-    from hearthlog.analyzer.marks.formats.labels import Choice
-    from hearthlog.analyzer.marks.label_files import ImportOptions, read_class_map
-    from hearthlog.analyzer.marks.label_files import import_labels as read_labels
     from hearthlog.analyzer.review.review_list import (
         check_scenario,
         outside_requests,
@@ -183,8 +183,8 @@ def export_labels(
 ) -> None:
     """Write the marks of review layers to a label file."""
     from hearthlog.analyzer.logs.layers import find_coverage
-    from hearthlog.analyzer.marks import read_marks
     from hearthlog.analyzer.marks.label_files import write_labels
+    from hearthlog.analyzer.marks.marks import read_marks
 
     _check_use(output, scenario)
     check_new(output)

@@ -308,7 +308,7 @@ def chosen_method(name: str | None, **parameters: float | None) -> "Method":
 
 def reviewer_name(option: str | None) -> str:
     """Return the reviewer's name; empty without an option and a login name."""
-    from hearthlog.analyzer.marks import PERSON_NAME
+    from hearthlog.analyzer.marks.marks import PERSON_NAME
 
     if option is not None:
         name = option.strip()

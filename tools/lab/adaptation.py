@@ -16,7 +16,7 @@ import typer
 
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.layers import find_coverage
-from hearthlog.analyzer.marks import Mark, ReviewedSpan
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.promotion.recent_time import RecentLog, recent_logs
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.home_training_set import read_home_training_set

@@ -26,7 +26,7 @@ import typer
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.labelling import Labelling
-from hearthlog.analyzer.marks import Mark, write_marks
+from hearthlog.analyzer.marks.marks import Mark, write_marks
 from hearthlog.analyzer.training.adaptation import adapt_model
 from hearthlog.analyzer.training.clips import clip_frames
 from hearthlog.analyzer.training.home_training_set import read_home_training_set

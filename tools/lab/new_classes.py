@@ -20,7 +20,7 @@ import typer
 
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.layers import find_coverage
-from hearthlog.analyzer.marks import Mark, ReviewedSpan
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan
 from hearthlog.analyzer.promotion import judge
 from hearthlog.analyzer.promotion.recent_time import RecentLog, recent_logs
 from hearthlog.analyzer.training.adaptation import adapt_model

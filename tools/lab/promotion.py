@@ -27,7 +27,7 @@ from hearthlog.analyzer.logs.spans import (
     rows_at,
     single_span,
 )
-from hearthlog.analyzer.marks import RANDOM, Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import RANDOM, Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.promotion import Verdict, judge
 from hearthlog.analyzer.promotion.paired_labels import TwoModels, joined_frames
 from hearthlog.analyzer.promotion.recent_time import (

@@ -18,7 +18,7 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
-from hearthlog.analyzer.marks import RANDOM
+from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.models.modelfile import load_model
 from hearthlog.models.starter import GENERAL, starter_file
 from hearthlog.recorder.config import Settings

@@ -27,7 +27,7 @@ from hearthlog.analyzer.logs.local_time import (
 )
 from hearthlog.analyzer.logs.selection import array_names, select
 from hearthlog.analyzer.logs.spans import SEGMENT_DELAY
-from hearthlog.analyzer.marks import Mark, read_marks
+from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.schemas.errors import HearthlogError
 from hearthlog.schemas.logs.columns import read_columns
 from hearthlog.schemas.logs.files import review_path

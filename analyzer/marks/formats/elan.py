@@ -19,7 +19,6 @@ from defusedxml.sax import parse
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import Coverage
-from hearthlog.analyzer.marks import Mark
 from hearthlog.analyzer.marks.formats.labels import (
     WRONG_TIME,
     Choice,
@@ -29,6 +28,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     made_text,
     scan,
 )
+from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.errors import listed
 from hearthlog.schemas.frames import seconds_text, time_text
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import Coverage
-from hearthlog.analyzer.marks import LATEST, PERSON_NAME, Mark
+from hearthlog.analyzer.marks.marks import LATEST, PERSON_NAME, Mark
 from hearthlog.schemas.errors import shortened
 from hearthlog.schemas.frames import NANOSECONDS, read_time, time_text
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import Coverage
-from hearthlog.analyzer.marks import Mark
 from hearthlog.analyzer.marks.formats.labels import (
     UNREADABLE,
     Choice,
@@ -19,6 +18,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     place_text,
     scan,
 )
+from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.frames import seconds_text, time_text
 
 _TYPE = "labels"

@@ -10,7 +10,6 @@ from pathlib import Path
 from hearthlog.analyzer.errors import DataError
 from hearthlog.analyzer.logs.layers import Coverage
 from hearthlog.analyzer.logs.text_files import csv_rows, disarmed, numbered_lines, without_disarming
-from hearthlog.analyzer.marks import Mark
 from hearthlog.analyzer.marks.formats.labels import (
     UNREADABLE,
     Choice,
@@ -24,6 +23,7 @@ from hearthlog.analyzer.marks.formats.labels import (
     scan,
     with_point,
 )
+from hearthlog.analyzer.marks.marks import Mark
 from hearthlog.schemas.errors import listed
 from hearthlog.schemas.frames import seconds_text, time_text
 

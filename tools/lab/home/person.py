@@ -10,7 +10,7 @@ import numpy as np
 from hearthlog.analyzer.logs.labelling import Labelling, find_labellings
 from hearthlog.analyzer.logs.layers import Coverage, find_coverage
 from hearthlog.analyzer.logs.spans import intersection_rows, overlay, single_span
-from hearthlog.analyzer.marks import Mark, ReviewedSpan, write_marks
+from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, write_marks
 from hearthlog.analyzer.review.ranking import USEFUL
 from hearthlog.analyzer.review.review_queue import ReviewItem, queue_spans, review_items
 from hearthlog.models.classes import OTHER_NEGATIVE, UNKNOWN, class_name

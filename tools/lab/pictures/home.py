@@ -8,7 +8,7 @@ from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
 from hearthlog.analyzer.logs.local_time import local_time
-from hearthlog.analyzer.marks import RANDOM
+from hearthlog.analyzer.marks.marks import RANDOM
 from hearthlog.analyzer.review.ranking import USEFUL
 from hearthlog.models.registry import DEFAULT_FOLDER
 from hearthlog.models.starter import GENERAL, starter_file

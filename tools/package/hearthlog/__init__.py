@@ -84,7 +84,6 @@ def __dir__() -> list[str]:
 
 _MOVED = {  # modules that documents of earlier versions name, mostly for extensions
     "hearthlog.analyzer.evaluation.event_scores": "hearthlog.analyzer.evaluation",
-    "hearthlog.analyzer.marks.marks": "hearthlog.analyzer.marks",
     "hearthlog.analyzer.training.landmark_method": "hearthlog.analyzer.training.window_methods",
     "hearthlog.analyzer.training.learned_inputs": "hearthlog.analyzer.training.window_methods",
     "hearthlog.analyzer.training.svm_method": "hearthlog.analyzer.training.window_methods",

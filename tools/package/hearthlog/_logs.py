@@ -33,7 +33,7 @@ from hearthlog.analyzer.logs.selection import (
     select,
 )
 from hearthlog.analyzer.logs.sound_vectors import Bearings, as_vectors, mean_bearings
-from hearthlog.analyzer.marks import Mark, read_marks
+from hearthlog.analyzer.marks.marks import Mark, read_marks
 from hearthlog.schemas.errors import HearthlogWarning, LogError
 from hearthlog.schemas.logs import follow as growing
 from hearthlog.schemas.logs.columns import Columns, decode, join, read_columns
