@@ -256,10 +256,12 @@ class Window:
         """Drag the mouse from one x to another.
 
         A button that is pressed in the frame of the move after it counts as pressed where that move
-        ends. A state may come out of a frame that began before the button; a picture does not.
+        ends. A state may come out of a frame that began before the button; a picture does not. What
+        lies under the mouse, such as the end of a selection, is known a frame after the move.
         """
         middle = (start + end) // 2
         self.mouse(f"mousemove {start} {y}")
+        self.picture()
         self.picture()
         self.mouse("mousedown 1")
         self.picture()
