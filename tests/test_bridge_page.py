@@ -922,7 +922,7 @@ def test_a_screen_reader_is_told_what_everything_is(phone, lived):
     )
     assert "Crying, Living room, Since 07:00: 0" in cells
     buttons = [name for role, name in tree if role == "DisclosureTriangle"]
-    assert len({*buttons}) == len(buttons) == len(LIVED) + 1
+    assert len({*buttons}) == len(buttons) == len(LIVED) + 2
     assert ("meter", "Loudness, Living room") in tree
 
 
