@@ -146,13 +146,13 @@ function folded(look) {
 function withTelevisionFolded(others) {
   const key = TELEVISION, uncounted = others.filter((entry) => entry.is_uncounted);
   if (uncounted.length <= SINGLE) return others;
-  const [oldest, newest] = [uncounted, uncounted].map(([...all], end) =>
-    all.sort((a, b) => (end ? b.span[1] - a.span[1] : a.span[0] - b.span[0]))[0].span_words[end]);
+  const oldest = uncounted.reduce((first, each) => (each.span[0] < first.span[0] ? each : first));
+  const newest = uncounted.reduce((last, each) => (each.span[1] > last.span[1] ? each : last));
   const often = new Map();
   for (const { words, ids } of uncounted) often.set(words, (often.get(words) ?? 0) + ids.length);
   const classesOften = [...often].sort((a, b) => b[1] - a[1]).map(([words, number]) => `${words} ${counted(number)}`).join(", ");
   const fold = { id: `fold ${key}`, key, colour: GREY, words: say("beside television"),
-    often: count("not counted", sum(often.values())), about: `${say("span", { first: oldest, last: newest })}${SEPARATOR}${classesOften}` };
+    often: count("not counted", sum(often.values())), about: `${say("span", { first: oldest.span_words[0], last: newest.span_words[1] })}${SEPARATOR}${classesOften}` };
   return others.flatMap((entry) => {
     if (!entry.is_uncounted) return [entry];
     return [...(entry === uncounted[0] ? [fold] : []), ...(unfolded.has(key) ? [entry] : [])];
