@@ -220,10 +220,11 @@ def test_sound_that_was_not_kept_cannot_be_played_and_is_said_so(home, hearthlog
 def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path, hearthlog):
     coughs = [(at("08:00"), 5, "coughing", 0.95), (at("09:00"), 5, "coughing", 0.4)]
     rings = [(at("10:00"), 5, "phone_ring", 0.95), (at("11:00"), 5, "phone_ring", 0.69)]
-    shout = at("12:00"), 2, "yelling", 0.5
-    write_day(tmp_path, DAY, [*coughs, *rings, shout], classes=GENERAL)
+    others = [(at("12:00"), 2, "yelling", 0.5), (at("13:00"), 5, "unknown", 0.9)]
+    write_day(tmp_path, DAY, [*coughs, *rings, *others], classes=[*GENERAL, "unknown"])
     found = hearthlog("events", tmp_path, "--day", DAY, "--label", "coughing")
     assert found.stdout.splitlines()[-1] == "Coughing on Monday, 2026-03-02: 1, and perhaps 1 more"
+    assert [line.rstrip()[-5:] for line in found.stdout.splitlines()[1:3]] == [" 95 %", "40 %?"]
     found = hearthlog("events", tmp_path, "--day", DAY, "--json")
     counts = json.loads(found.stdout)["counts"]
     assert counts["coughing"] == {"counted": 2, "television": 0, "unsure": 1}
