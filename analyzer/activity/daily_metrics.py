@@ -253,8 +253,38 @@ class DayMetrics:
     zone: tzinfo
     span: Spans  # a single span, like the night
     night: Spans
-    coverage: Spans  # covered spans of the day
-    logged: Spans  # the part of the day from the first log to the last one; may have no length
+    logs: tuple[int, int]  # from when to when the home has logs, in nanoseconds of UTC
+
+    @property
+    def with_night(self) -> "DayMetrics":
+        """The day together with the evening before it: from 22:00 to midnight."""
+        return replace(self, span=single_span(int(self.night.starts[0]), int(self.span.ends[0])))
+
+    @property
+    def waking(self) -> Spans:
+        """The time from 07:00 to 22:00."""
+        return single_span(*awake_span(self.day, self.zone))
+
+    @property
+    def evening(self) -> Spans:
+        """The time from 22:00 to midnight, which belongs to the next night, too."""
+        return single_span(awake_span(self.day, self.zone)[1], int(self.span.ends[0]))
+
+    @property
+    def coverage(self) -> Spans:
+        """Covered spans of the day."""
+        return intersection(self.home.coverage, self.span)
+
+    @property
+    def logged(self) -> Spans:
+        """The part of the day from the first log to the last one; may have no length.
+
+        All of it if less than a minute lacks.
+        """
+        (start,), (end,) = self.span
+        first, last = (min(max(time, start), end) for time in self.logs)
+        first = start if first - start < MINUTE else first
+        return single_span(first, end if end - last < MINUTE else last)
 
     @property
     def before_logs(self) -> int:
@@ -337,14 +367,15 @@ class DayMetrics:
         """Return the event starts that `night_count` counts for a class, in nanoseconds of UTC."""
         return self.counted_events(name, self.night)
 
-    def count(self, name: str) -> Count | None:
-        """Return the number of events of a class on this day; None if unknown."""
-        return _if_covered(self.count_in(name, self.span), self.share_of(name))
+    def count(self, name: str, span: Spans | None = None) -> Count | None:
+        """Return the number of events of a class on this day, or in a part; None if unknown."""
+        span = self.span if span is None else span
+        share = _share(self.home.listened.get(name, NONE), span)
+        return _if_covered(self.count_in(name, span), share)
 
     def night_count(self, name: str) -> Count | None:
         """Return the number of events of a class in the night; None if unknown."""
-        share = _share(self.home.listened.get(name, NONE), self.night)
-        return _if_covered(self.count_in(name, self.night), share)
+        return self.count(name, self.night)
 
     def uncounted_events(self, name: str) -> int:
         """Return the number of events of a class not counted because of a television."""
@@ -394,8 +425,8 @@ class DayMetrics:
     @property
     def quiet(self) -> Duration | None:
         """Length of `longest_quiet`; None if less than half of its search window is covered."""
-        waking = single_span(*awake_span(self.day, self.zone))
-        return _length(self.longest_quiet) if self._share_of(waking) >= _HALF else None
+        is_covered = self._share_of(self.waking) >= _HALF
+        return _length(self.longest_quiet) if is_covered else None
 
     @property
     def active(self) -> Int64:
@@ -440,17 +471,13 @@ def day_of(
 ) -> DayMetrics:
     """Return the figures of a local day; its night is from 22:00 on the day before to 07:00.
 
-    `logged` is from when to when the home has logs, in nanoseconds of UTC; by default all day, and
-    so if less than a minute lacks.
+    `logged` is from when to when the home has logs, in nanoseconds of UTC; by default all the time.
     """
     start, end = day_span(day, zone)
     span, night = single_span(start, end), single_span(*night_span(day, zone))
     near = home.between(min(int(night.starts[0]), start), max(int(night.ends[0]), end))
-    coverage = intersection(near.coverage, span)
-    first, last = (start, end) if logged is None else (min(max(t, start), end) for t in logged)
-    first, last = start if first - start < MINUTE else first, end if end - last < MINUTE else last
-    logs = single_span(first, last)
-    return DayMetrics(day, near, zone, span, night, coverage, logs)
+    always = int(night.starts[0]), end
+    return DayMetrics(day, near, zone, span, night, always if logged is None else logged)
 
 
 def _share(covered: Spans, span: Spans) -> float:

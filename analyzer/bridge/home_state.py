@@ -232,9 +232,8 @@ class LiveMicrophone:
             given = corrections.labels(events)
             counted = {event.id for event in self.counted(events)}
             for event in events:
-                if event.id not in given and is_too_doubtful(event.label, event.confidence):
-                    continue
-                name = given.get(event.id, label)
+                is_doubtful = is_too_doubtful(event.label, event.confidence)
+                name = given.get(event.id, UNKNOWN if is_doubtful else label)
                 own = found.get(names.get(name, name))
                 if own is not None:
                     own.events.append(event)

@@ -9,7 +9,7 @@ import numpy as np
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.values import Count, Duration, rounded
-from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
+from hearthlog.analyzer.logs.local_time import EVENING
 from hearthlog.analyzer.logs.spans import (
     Spans,
     difference,
@@ -17,7 +17,6 @@ from hearthlog.analyzer.logs.spans import (
     intersection_rows,
     joined,
     lengths,
-    single_span,
 )
 from hearthlog.analyzer.report.report_data import TELEVISION_PAUSE, day_television
 from hearthlog.analyzer.report.wording import (
@@ -250,8 +249,8 @@ def unlogged(days: Sequence[DayMetrics], *, with_day: bool = False) -> str:
 
 def _is_covered(day: DayMetrics) -> bool:
     """Whether three quarters of the day, and of its waking hours, were recorded."""
-    waking = single_span(*(at_hour(day.day, hour, day.zone) for hour in (MORNING, EVENING)))
-    return min(day.share, intersection(day.coverage, waking).length / waking.length) >= MOST
+    waking = intersection(day.coverage, day.waking).length / day.waking.length
+    return min(day.share, waking) >= MOST
 
 
 def _lively(day: DayMetrics) -> Bool:
@@ -279,11 +278,10 @@ def _sounds(day: DayMetrics) -> Iterator[str]:
 
     Those of the night that ends on the day, of 07:00 to 22:00, and of the evening after that.
     """
-    morning, evening = (at_hour(day.day, hour, day.zone) for hour in (MORNING, EVENING))
     times_of_day = (
         (day.night, "in the night"),
-        (single_span(morning, evening), "by day"),
-        (single_span(evening, int(day.span.ends[0])), f"after {EVENING}:00"),
+        (day.waking, "by day"),
+        (day.evening, f"after {EVENING}:00"),
     )
     for name in WORRYING:
         parts: list[str] = []

@@ -1,7 +1,7 @@
 """HTML page of a report."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -10,16 +10,20 @@ import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
 from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
+from hearthlog.analyzer.logs.spans import intersection
 from hearthlog.analyzer.report.headline import day_headline, unlogged, week_headline
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
     ASSESSED_ITEMS,
+    DAY_PARTS,
     FigureSection,
     ReportData,
     ReportFigure,
+    day_sections,
     event_figure,
     minutes_figure,
-    sections,
+    part_figure,
+    week_sections,
 )
 from hearthlog.analyzer.report.summary_text import (
     longest_quiet_text,
@@ -40,9 +44,9 @@ from hearthlog.analyzer.report.timeline import (
 )
 from hearthlog.analyzer.report.wording import (
     clock_text,
+    clock_with_day,
     dates_in_words,
     day_in_words,
-    several_in_words,
     short_day,
     times_in_words,
 )
@@ -50,6 +54,7 @@ from hearthlog.models.classes import (
     COUGHING,
     FLUSHING_WATER,
     ON_TELEVISION,
+    OTHER,
     SHOWER,
     SILENCE,
     UNKNOWN,
@@ -69,6 +74,7 @@ class Cell(NamedTuple):
     colour: tuple[int, int, int] | None = None
     unbroken: bool = False  # whether line breaks are forbidden
     note: str = ""  # in small letters below the text
+    kind: str = ""  # CSS class
 
 
 class PageTable(NamedTuple):
@@ -106,7 +112,8 @@ _NOTHING, _TO = "\u2013", "\u2013"  # dashes
 _PARTLY = 0.95
 _HOME, _MICROPHONE = "home", "mic"  # names that nobody gave
 _FEW = 5  # events of which every time is written
-_FEW_WORRYING = 9
+_FEW_WORRYING = 12
+_MOST_TIMES = {**dict.fromkeys(WORRYING, _FEW_WORRYING), FLUSHING_WATER: 16, SHOWER: 16}
 _BESIDE = "beside a television"
 _SPACE = "\N{NO-BREAK SPACE}"
 
@@ -122,17 +129,22 @@ class PageSection(NamedTuple):
 def day_page(data: ReportData) -> str:
     """Return the page of a day."""
     day = data.days[0]
-    timeline = timeline_of(day)
-    title = day_in_words(day.day)
-    bars = hour_bars(day, data.earlier if data.comparable else [])
+    shown = data.with_nights
+    whole = shown.days[0]
+    timeline = timeline_of(whole)
+    title, table = day_in_words(day.day), _sounds(shown, whole)
+    bars = hour_bars(whole, shown.earlier if data.comparable else [])
     return _page(
         data,
+        shown,
         PagePicture(f"The sounds of {title}", _description(timeline), [("", timeline)], bars),
         title=title,
         headline=day_headline(day),
         summary=list(summarize_day(data, day)),
-        overview=[("What was heard", _sounds(data, day))],
-        parts=[_part(data, section, day) for section in sections(data.classes)],
+        overview=[("What was heard", table)],
+        evening=DAY_PARTS[-1].title in table.heads,
+        partly=_partly_heard(whole),
+        parts=[_part(data, section, day) for section in day_sections()],
     )
 
 
@@ -145,6 +157,7 @@ def week_page(data: ReportData) -> str:
     described = " ".join(f"{name}: {_description(each)}" for name, each in days)
     return _page(
         data,
+        data,
         PagePicture(f"The sounds of {spoken}", described, days),
         title=f"Week {first.isocalendar().week}, {spoken}",
         headline=week_headline(data.days),
@@ -156,8 +169,11 @@ def week_page(data: ReportData) -> str:
                 _week(data, list(map(minutes_figure, names)), has_share=False),
             ),
         ],
+        evening=False,
+        partly=[],
         parts=[
-            PageSection(section, _week(data, section.figures)) for section in sections(data.classes)
+            PageSection(section, _week(data, section.figures))
+            for section in week_sections(data.classes)
         ],
     )
 
@@ -179,11 +195,12 @@ def _description(timeline: DayTimeline) -> str:
     return text + (f" Not recorded: {', '.join(gaps)}." if gaps else "")
 
 
-def _page(data: ReportData, picture: PagePicture, **parts: Any) -> str:
+def _page(data: ReportData, shown: ReportData, picture: PagePicture, **parts: Any) -> str:
+    """Fill the page; `shown` has the days of the picture and of the first tables."""
     days = [day for day in (*data.before, *data.days) if day.coverage.length]
     names = [name for name in data.classes if name not in {SILENCE, UNKNOWN}]
-    absent = [name for name in names if _has_count(data, name) and not _occurs(data, name)]
-    uncertain = [name for name in names if not _has_count(data, name)]
+    absent = [name for name in names if _has_count(shown, name) and not _occurs(shown, name)]
+    uncertain = [name for name in names if not _has_count(shown, name)]
     everywhere = [name for name in names if name not in ON_TELEVISION]
     return fill_page(
         data=data,
@@ -199,7 +216,7 @@ def _page(data: ReportData, picture: PagePicture, **parts: Any) -> str:
         confused=_listed(data.confused),
         everywhere=_listed(everywhere),
         dash=_NOTHING,
-        unsure=any(_is_unsure(data, name) for name in names),
+        unsure=any(_is_unsure(shown, name) for name in names),
         scenarios=[(plain(name), _scenario(data, name)) for name in data.scenarios],
         days_before=BASELINE_DAYS,
         interrai=_interrai(data, days),
@@ -246,29 +263,39 @@ def _scenario_text(minutes: float, day: DayMetrics) -> str:
 
 
 def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
-    """Return how often, when and how long each class was heard."""
-    heads = ["Sound", "How often", "When", "How long"]
+    """Return how often each class was heard in each recorded part of the day, when and how long."""
+    parts = [p for p in DAY_PARTS if intersection(day.home.coverage, p.span(day)).length]
+    heads = ["Sound", *(part.title for part in parts), "When", "How long"]
     rows = []
     for name in data.classes:
-        figure, lasting = event_figure(name), minutes_figure(name)
-        value, uncounted = figure.value(day), day.uncounted_events(name)
-        if name == SILENCE:
-            cells = [Cell(""), Cell(""), _cell(data, lasting, day)]
-        elif _occurs(data, name) and (value is not None or uncounted):
-            cells = [
-                _with_apart(_cell(data, figure, day), _apart(figure, [day])),
-                Cell(_times(day, name)),
-                _with_apart(_cell(data, lasting, day), _apart(lasting, [day])),
-            ]
-        else:
+        lasting, uncounted = minutes_figure(name), day.uncounted_events(name)
+        if name == SILENCE or not _occurs(data, name):
             continue
+        if day.count(name) is None and not uncounted:
+            continue
+        length, apart = _cell(data, lasting, day), _apart(lasting, [day])
+        cells = [
+            *(_count_cell(data, part_figure(name, part), day) for part in parts),
+            Cell(_times(day, name)),
+            length._replace(note=", ".join(note for note in (apart, length.note) if note)),
+        ]
         right = [Cell(data.accuracy_text(name))] * data.checked
-        rows.append([Cell(in_words(name), colour=colour_on_paper(name)), *cells, *right])
+        beside = f"{uncounted} {_BESIDE}" if uncounted else ""
+        head = Cell(in_words(name), colour=colour_on_paper(name), note=beside)
+        rows.append([head, *cells, *right])
     return PageTable([*heads, *["Right here"] * data.checked], rows, "sounds stack")
 
 
-def _with_apart(cell: Cell, apart: str) -> Cell:
-    return cell._replace(note=", ".join(note for note in (apart, cell.note) if note))
+def _partly_heard(day: DayMetrics) -> list[str]:
+    """Return sentences on the classes that could be heard for less of a day than others."""
+    names: dict[str, list[str]] = {}
+    for name in day.home.classes:
+        if name not in {SILENCE, UNKNOWN, OTHER} and day.share_of(name) < _PARTLY * day.share:
+            names.setdefault(percent(day.share_of(name)), []).append(name)
+    return [
+        f"{_listed(own).capitalize()} could be heard for {share} of the time only."
+        for share, own in names.items()
+    ]
 
 
 def _apart(figure: ReportFigure, days: Sequence[DayMetrics]) -> str:
@@ -282,10 +309,10 @@ def _apart(figure: ReportFigure, days: Sequence[DayMetrics]) -> str:
 def _times(day: DayMetrics, name: str) -> str:
     """Return the times of a few events of a class, else the first and the last."""
     starts = day.counted_events(name, day.span)
-    if len(starts) <= (_FEW_WORRYING if name in WORRYING else _FEW):
-        return times_in_words(starts, day.zone, unsure=day.unsure_events(name))
+    if len(starts) <= _MOST_TIMES.get(name, _FEW):
+        return times_in_words(starts, day.zone, first=day.day, unsure=day.unsure_events(name))
     return "\N{NO-BREAK SPACE}to ".join(
-        clock_text(int(edge), day.zone) for edge in (starts.min(), starts.max())
+        clock_with_day(int(edge), day.zone, day.day) for edge in (starts.min(), starts.max())
     )
 
 
@@ -319,6 +346,11 @@ def _cell(data: ReportData, figure: ReportFigure, day: DayMetrics) -> Cell:
     return Cell(text, data.change(figure, day), unbroken=True, note=note)
 
 
+def _count_cell(data: ReportData, figure: ReportFigure, day: DayMetrics) -> Cell:
+    cell = _cell(data, figure, day)
+    return cell._replace(kind="count zero" if cell.text == "0" else "count")
+
+
 def _text(value: Value | None) -> str:
     return _NOTHING if value is None else value.text
 
@@ -326,33 +358,17 @@ def _text(value: Value | None) -> str:
 def _part(data: ReportData, section: FigureSection, day: DayMetrics) -> PageSection:
     shown = [figure for figure in section.figures if figure.value(day) is not None]
     rows = [[Cell(figure.title), _cell(data, figure, day)] for figure in shown]
-    remarks = [*_remarks(section, day)]
+    remarks = [_coughing(day) if section.title == "Night" else longest_quiet_text(day)]
     if len(shown) < len(section.figures):
         more = "more" if shown else "anything"
         remarks.append(f"Too little was recorded to tell {more}.")
     return PageSection(section, PageTable(["", "This day"], rows, "figures"), remarks)
 
 
-def _remarks(section: FigureSection, day: DayMetrics) -> Iterator[str]:
-    share = _share(section.figures, day)
-    if share < _PARTLY * day.share:
-        yield f"These sounds could be heard for {percent(share)} of the day only."
-    if section.title == "Bathroom":
-        for name in (FLUSHING_WATER, SHOWER):
-            starts = day.events(name)
-            if len(starts):
-                at = times_in_words(starts, day.zone)
-                yield f"{several_in_words(name)} at {at}."
-    elif section.title == "Night":
-        yield _coughing(day)
-    else:
-        yield longest_quiet_text(day)
-
-
 def _coughing(day: DayMetrics) -> str:
-    """Return when coughing was labelled in the night, hour by hour if it was often."""
-    starts = day.night_events(COUGHING)
-    if not len(starts):
+    """Return when coughing was labelled in the night, unless the table of sounds has each time."""
+    whole, starts = day.with_night, day.night_events(COUGHING)
+    if len(whole.counted_events(COUGHING, whole.span)) <= _FEW_WORRYING or not len(starts):
         return ""
     if len(starts) <= _FEW:
         unsure = day.unsure_events(COUGHING)

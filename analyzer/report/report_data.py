@@ -1,7 +1,7 @@
 """Content of a report: days and their baseline, sections of figures, and interRAI items."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, tzinfo
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from hearthlog.analyzer.activity.values import (
     compared,
     usual_range,
 )
+from hearthlog.analyzer.logs.local_time import EVENING, MORNING
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import Spans, intersection, joined
 from hearthlog.analyzer.report.wording import several_in_words
@@ -74,11 +75,20 @@ def day_television(day: DayMetrics, pause: int = 0) -> Spans:
     return intersection(joined(starts, starts + MINUTE, pause), day.span)
 
 
-def sections(classes: Sequence[str]) -> list[FigureSection]:
-    """Return the tables for the classes of a home's model."""
+def day_sections() -> list[FigureSection]:
+    """Return the tables of a day below that of its sounds, which has those of its night."""
+    return [
+        FigureSection("Night", _NIGHT, _NIGHT_NOTE),
+        FigureSection("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
+    ]
+
+
+def week_sections(classes: Sequence[str]) -> list[FigureSection]:
+    """Return the tables of a week for the classes of a home's model."""
+    coughing = [_at_night(n, several_in_words(n), in_words(n)) for n in _IN_NIGHT if n in classes]
     found = [
         FigureSection("Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE),
-        FigureSection("Night", list(_night(classes)), _NIGHT_NOTE),
+        FigureSection("Night", [*coughing, *_NIGHT], _NIGHT_NOTE),
         FigureSection("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
     ]
     return [section for section in found if section.figures]
@@ -88,6 +98,25 @@ def minutes_figure(name: str) -> ReportFigure:
     """Return the figure of a class's duration, without that beside a television."""
     title = in_words(name)
     return ReportFigure(title, title, lambda day: day.minutes(name), name, lasts=True)
+
+
+class DayPart(NamedTuple):
+    """A part of a day with the night before it; no two have a time in common."""
+
+    title: str
+    span: Callable[[DayMetrics], Spans]
+
+
+DAY_PARTS = (
+    DayPart(f"Night {EVENING:02}\N{EN DASH}{MORNING:02}", lambda day: day.night),
+    DayPart(f"Day {MORNING:02}\N{EN DASH}{EVENING:02}", lambda day: day.waking),
+    DayPart(f"After {EVENING}:00", lambda day: day.evening),
+)
+
+
+def part_figure(name: str, part: DayPart) -> ReportFigure:
+    """Return the figure of a class's event count in a part of a day."""
+    return ReportFigure(name, part.title, lambda day: day.count(name, part.span(day)), name)
 
 
 def event_figure(name: str, title: str = "") -> ReportFigure:
@@ -117,18 +146,15 @@ def _bathroom(classes: Sequence[str]) -> Iterator[ReportFigure]:
             yield from _day_and_night(name)
 
 
-def _night(classes: Sequence[str]) -> Iterator[ReportFigure]:
-    for name in (COUGHING, CRYING):
-        if name in classes:
-            yield _at_night(name, several_in_words(name), in_words(name))
-    yield ReportFigure(
+_IN_NIGHT = COUGHING, CRYING
+_NIGHT = (
+    ReportFigure(
         "Times with half a minute of sound",
         "Half minutes of sound",
         lambda day: day.night_stretches,
-    )
-    yield ReportFigure("Time with sound", "Time with sound", lambda day: day.night_sound)
-
-
+    ),
+    ReportFigure("Time with sound", "Time with sound", lambda day: day.night_sound),
+)
 _ACTIVITY = (
     ReportFigure("Time with sound", "Time with sound", lambda day: day.sound),
     ReportFigure("Sound from", "Sound from", lambda day: day.first, sums=False),
@@ -196,6 +222,12 @@ class ReportData:
     def classes(self) -> list[str]:
         """Classes that can occur."""
         return self.days[0].home.classes
+
+    @property
+    def with_nights(self) -> "ReportData":
+        """The same data with each day and baseline day from 22:00 of the evening before."""
+        days, earlier = ([day.with_night for day in each] for each in (self.days, self.earlier))
+        return replace(self, days=days, earlier=earlier)
 
     @property
     def unknown(self) -> list[str]:

@@ -28,7 +28,7 @@ from hearthlog.analyzer.bridge.page.past_days import PastDays
 from hearthlog.analyzer.bridge.page.sounds import ShownBouts, bouts, events_between
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.logs.home_logs import find_home_logs
-from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour
+from hearthlog.analyzer.logs.local_time import MORNING, at_hour, local_time
 from hearthlog.analyzer.logs.spans import (
     NONE,
     Spans,
@@ -44,9 +44,10 @@ from hearthlog.analyzer.report.page import day_page
 from hearthlog.analyzer.report.report import Period, read_report_data
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_ITEMS,
+    DAY_PARTS,
     ReportData,
+    day_sections,
     minutes_figure,
-    sections,
 )
 from hearthlog.analyzer.report.wording import several_in_words
 from hearthlog.models.classes import (
@@ -83,6 +84,7 @@ from hearthlog.tools.lab.true_day import NEAR, TrueDay, TrueSound, read_sounds, 
 _COMPANY = 15 * MINUTE  # a television is known by the ten minutes around
 _SURE = 0.9
 _NO_SOUNDS = {SILENCE, UNKNOWN}
+_IS_BY_SOUND = is_modest(ENGLISH.text("page.by sound"))  # of each sentence of the page
 _SHORTEST = MINUTE // 60  # of a sound that breaks a quiet stretch
 _CLOCK = re.compile(r"\b([0-2]\d:[0-5]\d)\b")
 _RUN = re.compile(r"\b([0-2]\d:[0-5]\d) to ([0-2]\d:[0-5]\d)\b")
@@ -166,9 +168,7 @@ def _statements_of(
     for kind, text in page.paragraphs:
         yield from _paragraph(kind, text, day, truth)
     figures = {
-        (part.title, figure.title): figure
-        for part in sections(day.home.classes)
-        for figure in part.figures
+        (part.title, figure.title): figure for part in day_sections() for figure in part.figures
     }
     for title, heads, cells in page.rows:
         if title == "What was heard":
@@ -238,7 +238,7 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
             right=not wrong.any(),
             modest=modest,
         )
-        yield from _televisions(television, truth, modest=modest)
+        yield from _televisions(REPORT, _RUN.findall(television), truth, modest=modest)
     elif match := re.search(r"sound in (\d+) of|for (\w+) hours", first):
         stated = read_number(match[1] or match[2])
         yield judge_count(REPORT, first, (stated, stated), int(lively.sum()), modest=modest)
@@ -250,27 +250,24 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
         yield from _counts_in(REPORT, sentence, truth)
 
 
-def _televisions(text: str, truth: TrueDay, *, modest: bool) -> Iterator[Statement]:
+def _televisions(
+    surface: str, runs: Sequence[tuple[str, str]], truth: TrueDay, *, modest: bool
+) -> Iterator[Statement]:
     """Check the times of a television."""
-    for run_ in _RUN.findall(text):
+    for run_ in runs:
         start, end = (time_at(truth.metrics, each) for each in run_)
         end += 24 * HOUR * (end < start)
         wide = joined(truth.television.starts - _COMPANY, truth.television.ends + _COMPANY)
         inside = cut(wide, start, end).length / max(end - start, 1)
         right = inside >= 1 - TOLERANCE
-        statement = f"{' to '.join(run_)}: {text}"
-        yield judge(REPORT, statement, f"{inside:.0%} of it", right=right, modest=modest)
+        statement = f"something like a television from {' to '.join(run_)}"
+        yield judge(surface, statement, f"{inside:.0%} of it", right=right, modest=modest)
 
 
 def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statement]:
     """Check counts of classes in a sentence: of night, day and evening, or of the whole day."""
     day = truth.metrics
-    evening = at_hour(day.day, EVENING, day.zone)
-    parts = {
-        "night": day.night,
-        "by day": single_span(int(day.night.ends[0]), evening),
-        "22:00": single_span(evening, int(day.span.ends[0])),
-    }
+    parts = {"night": day.night, "by day": day.waking, "22:00": day.evening}
     modest = is_modest(re.sub(r"\(\d+ labelled\)", "", sentence))
     name = None
     for part in sentence.split("; "):
@@ -314,7 +311,7 @@ def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
     elif "It was quiet." in text:
         yield judge(REPORT, text, f"{_sound(true):.1f} min", right=_sound(true) <= 2, modest=modest)
     elif "television" in text and _RUN.search(text):
-        yield from _televisions(text, truth, modest=modest)
+        yield from _televisions(REPORT, _RUN.findall(text), truth, modest=modest)
     elif text.startswith("In the night"):
         yield from _counts_in(REPORT, text, truth)
         if (stated := read_minutes(text)) is not None and true.night_sound is not None:
@@ -384,28 +381,30 @@ def _night_coughs(text: str, truth: TrueDay) -> Iterator[Statement]:
 def _sound_counts(
     heads: Sequence[str], cells: Sequence[str], day: DayMetrics, truth: TrueDay
 ) -> Iterator[Statement]:
-    """Check a row of the table of sounds: how often, when and how long."""
+    """Check a row of the table of sounds: how often in each part of the day, when, how long."""
     name = next(
         (n for n in [*_sounds_of(day), SILENCE] if in_words(n) == cells[0].partition(" | ")[0]),
         None,
     )
     if name is None:
         return
-    often, when, lasting = cells[1:4]
-    where = f"{cells[0]}: "
-    if (stated := read_count(often.partition(" | ")[0])) is not None:
-        modest = is_modest(heads[1] + cells[0] + re.sub(r"\(\d+ labelled\)", "", often))
-        yield judge_count(REPORT, where + often, stated, _count(truth, name), modest=modest)
+    by_head, whole = dict(zip(heads, cells, strict=True)), truth.metrics.with_night
+    for part in (each for each in DAY_PARTS if each.title in by_head):
+        often = by_head[part.title]
+        if (stated := read_count(often.partition(" | ")[0])) is not None:
+            where = f"{cells[0]}, {part.title}: {often}"
+            modest = is_modest(re.sub(r"\(\d+ labelled\)", "", where))
+            true = whole.count_in(name, part.span(whole)).labelled
+            yield judge_count(REPORT, where, stated, true, modest=modest)
+    when, lasting = by_head["When"], by_head["How long"]
     if clocks := _CLOCK.findall(when):
-        yield judge_times(
-            REPORT, where + when, name, clocks, truth, modest=is_modest(heads[2] + when)
-        )
+        where = f"{cells[0]}: {when}"
+        yield judge_times(REPORT, where, name, clocks, truth, modest=is_modest(where))
     if (minutes := read_minutes(lasting.partition(" | ")[0])) is not None:
-        value = minutes_figure(name).value(truth.metrics)
+        value = minutes_figure(name).value(whole)
         true = 0 if value is None else value.middle
-        yield judge_length(
-            REPORT, where + lasting, minutes, true, modest=is_modest(heads[3] + lasting)
-        )
+        where = f"{cells[0]}: {lasting}"
+        yield judge_length(REPORT, where, minutes, true, modest=is_modest(where))
 
 
 def _figure(
@@ -450,13 +449,13 @@ def page_statements(
     sentence = picture["sentence"]
     for part in re.split(r"(?<=\.) (?=By day)", sentence):
         span = night if "In the night" in part else day if "By day" in part else both
-        yield from _page_sentence(part, home, truth, span, modest=is_modest(sentence))
+        yield from _page_sentence(part, home, truth, span, modest=_IS_BY_SOUND)
     morning = home._replace(
         moment=home.moment._replace(now=at_hour(truth.metrics.day, MORNING, home.zone) + HOUR),
         is_past=False,
     )
     sentence, last_night = picture_of(morning)["sentence"], truth.everywhere.night
-    yield from _page_sentence(sentence, home, truth, last_night, modest=is_modest(sentence))
+    yield from _page_sentence(sentence, home, truth, last_night, modest=_IS_BY_SOUND)
     for lane in (each for each in picture["rooms"][0]["lanes"] if each["label"] != UNKNOWN):
         name, modest = lane["label"], is_modest(lane["told"])
         for count, span, what in zip(lane["counts"], (night, day), picture["columns"], strict=True):
@@ -483,11 +482,17 @@ def _page_sentence(
     day = truth.everywhere
     if "television" in text:
         day = truth.metrics
+        _, _, television = text.partition("television")
+        edge = re.search(r"(since|until) (\d\d:\d\d)", television)
+        first, last = (f"{local_time(int(each[0]), home.zone):%H:%M}" for each in span)
+        runs = _RUN.findall(television) if edge is None else [(edge[2], last)]
+        runs = [(first, edge[2])] if edge is not None and edge[1] == "until" else runs
+        yield from _televisions(PAGE, runs, truth, modest=modest)
     minutes = day.home.minutes.between(span)
     microphone = home.microphones[0]
     shown = dict.fromkeys(microphone.common_names.get(label, label) for label in microphone.names)
     names = [n for n in shown if n not in _NO_SOUNDS and _mentions(text, n)]
-    if match := re.search(r"[Nn]o ([^.:(]*)\.$", text):
+    if match := re.search(r"[Nn]o ([^.:;(]*)[.;]", text):
         for name in (n for n in names if _mentions(match[1], n)):
             true = minutes.count(name, None).labelled
             yield judge_count(PAGE, f"{text} [{in_words(name)}]", (0, 0), true, modest=modest)

@@ -328,14 +328,13 @@ def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
 
 _QUIET_SHARE = 0.01  # most of a quiet night with any sound
 _QUIET_EVENTS = 5  # most events of important classes in a quiet night
-_PARTLY = ("night.partly", "day.partly", "day.past partly")
 _NOON = 12
 _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 4  # of a class
 _TELEVISION_PAUSE = 20 * MINUTE  # shorter pauses of a television are left out, as in the report
 _MOST_TELEVISION = 2  # times of a television
-_LONGEST = 72  # characters of a sentence about several classes: four lines of a phone
-_LONGEST_OF_ONE = 96  # about one of several
+_LONGEST = 52  # characters of a sentence about several classes: three lines of a phone
+_LONGEST_OF_ONE = 76  # about one of several
 
 
 SoundsOfRooms = dict[str, dict[str, Sequence[SoundEvent]]]  # by class and microphone
@@ -358,7 +357,7 @@ def day_sentence(home: HomeDay) -> str:
         when = words.text("night.partly")
     elif all(_is_quiet(each, rooms.get(each.name, {}), start, end) for each in home.microphones):
         when, television = words.text("night.quiet" if is_over else "night.quiet so far"), ""
-        found = {name: own for name, own in found.items() if name in IMPORTANT}
+        found = _important(found)
     else:
         when = words.text("night.last" if is_over else "night.this")
     return _sentence([DayPart(when, found, television)], home)
@@ -368,28 +367,38 @@ def _sentence_of_day(home: HomeDay) -> str:
     moment, words, span = home.moment, home.words, home.span()
     morning = at_hour(home.date, MORNING, home.zone)
     start = span.start if home.is_past else morning
-    found = _events_of(home, start, span.end)
     since = "" if home.is_past else words.text("since", time=clock(start, home.zone))
-    parts = [DayPart(since, found)]
+    day = DayPart(since, _events_of(home, start, span.end), _television(home, start, moment.now))
+    parts = [day]
     if home.is_past:
         both = (("day.past night", start, morning), ("day.past day", morning, span.end))
-        parts = [DayPart(words.text(key), _events_of(home, *times)) for key, *times in both]
-    parts = [part for part in parts if {*part.found} & {*IMPORTANT}]
+        parts = [
+            DayPart(
+                words.text(key), _important(_events_of(home, *times)), _television(home, *times)
+            )
+            for key, *times in both
+        ]
+    parts = [part for part in parts if _important(part.found) or part.television]
     shares = [m.listened_share(start, moment.now) for m in home.microphones]
     if min(shares, default=0) < MOST:
         partly = words.text("day.past partly" if home.is_past else "day.partly")
         is_split = home.is_past and bool(parts)
-        heads = [DayPart(partly, {}), *parts] if is_split else [DayPart(partly, found)]
-        return _sentence(heads, home)
-    if parts:
+        return _sentence(
+            [DayPart(partly, {}), *parts] if is_split else [day._replace(when=partly)], home
+        )
+    if any(_important(part.found) for part in parts):
         return _sentence(parts, home)
     detectable = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
     names = [words.inside(words.class_words(name)) for name in ordered(detectable)]
     if not names:
-        return _sentence([DayPart(since, found)], home) if found else ""
+        return _sentence([day], home) if day.found or day.television else ""
     key = "day.past none" if home.is_past else "day.none"
     none = words.text(key, when=since, classes=words.listed(names, "or"))
-    return words.text("by its sound", sentence=none) + "."
+    return "; ".join(filter(None, (none, day.television))) + "."
+
+
+def _important(found: SoundsOfRooms) -> SoundsOfRooms:
+    return {name: own for name, own in found.items() if name in IMPORTANT}
 
 
 def _events_of(home: HomeDay, start: int, end: int) -> SoundsOfRooms:
@@ -497,14 +506,8 @@ def _room_for(parts: Sequence[DayPart]) -> int:
 
 
 def _sentence_of(parts: Sequence[DayPart], home: HomeDay, most: int | None) -> str:
-    words = home.words
     sentences = [_part_in_words(part, home, most) for part in parts]
-    text = ". ".join(each[:1].upper() + each[1:] for each in sentences if each)
-    if not any(part.found or part.television for part in parts) and parts[0].when in map(
-        words.text, _PARTLY
-    ):
-        return f"{text}."
-    return words.text("by its sound", sentence=text) + "."
+    return ". ".join(each[:1].upper() + each[1:] for each in sentences if each) + "."
 
 
 def _part_in_words(part: DayPart, home: HomeDay, most: int | None) -> str:

@@ -98,6 +98,7 @@ function showSentence({ date, sentence }) {
   const element = place("day-sentence");
   element.style.minHeight = element.dataset.date === date ? `${element.offsetHeight}px` : "";
   element.dataset.date = date;
+  element.classList.toggle("long", sentence.length > 80);
   write(element, sentence);
 }
 
