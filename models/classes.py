@@ -75,7 +75,7 @@ CLASSES = (
                "", ("tv", "from_the_television")),
     SoundClass(OTHER_NEGATIVE,   (195, 202, 199),  10.0, "Other negative"),
     SoundClass(OTHER,            (101, 111, 208),  10.0, "Other sounds"),
-    SoundClass(UNKNOWN,          (255, 255, 255),  10.0, "Not sure"),
+    SoundClass(UNKNOWN,          (255, 255, 255),  10.0, "Not recognised"),
     SoundClass(SILENCE,          (112, 120, 130),   2.5, "Quiet"),
 )
 # fmt: on

@@ -394,7 +394,7 @@ def test_the_page_says_of_a_night_what_its_table_counts(tmp_path):
     lines = list(Accuracy(find_home_logs([tmp_path / "home"])).lines())
     assert lines[2].startswith(
         "coughing, crying, shouting, telephone ringing, laughing, household sounds, talking, music,"
-        " other negative, other sounds and not sure are left out of 5"
+        " other negative, other sounds and not recognised are left out of 5"
     )
     assert "coughing right" not in lines[0]
 
@@ -413,8 +413,8 @@ def test_neither_quiet_nor_what_a_model_does_not_know_is_said_to_be_right_or_wro
         check(logs, at(f"{hour:02}:00"), [(5, 7, "speech")])
     make_report(find_home_logs([tmp_path / "home"]), Period(DAY, 1, UTC), tmp_path / "day.html")
     text = (tmp_path / "day.html").read_text()
-    assert re.findall(r">(Not sure|Quiet)</th>.*<td[^>]*>([^<]*)</td></tr>", text) == [
-        ("Not sure", "")
+    assert re.findall(r">(Not recognised|Quiet)</th>.*<td[^>]*>([^<]*)</td></tr>", text) == [
+        ("Not recognised", "")
     ]
     lines = list(Accuracy(find_home_logs([tmp_path / "home"])).lines())
     assert (

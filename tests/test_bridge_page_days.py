@@ -765,7 +765,7 @@ def test_the_night_and_the_day_have_the_counts_that_the_report_of_the_day_has(tm
             report[re.search(r"</span>([^<]*)<", row)[1]] = counts
     assert report == page
     assert page["Coughing"] == ["2", "1 (+1?)"]
-    assert page["Not sure"] == ["0", "1?"], "a ring that may be something else"
+    assert page["Not recognised"] == ["0", "1?"], "a ring that may be something else"
     assert page["Talking"] == ["0", "0"]
 
 

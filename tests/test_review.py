@@ -482,7 +482,7 @@ def test_the_keys_are_three_lines_by_what_they_are_for(home):
     answers, sounds, marks, _ = sitting.output[-4:]
     assert answers == "answers: c confirm the labels, Enter confirm the rest, q quit"
     assert sounds.startswith("sounds: 1 quiet, ")
-    assert sounds.endswith("t television, u not sure")
+    assert sounds.endswith("t television, u not recognised")
     assert marks.startswith("spans and marks: m move the mark, d delete the marks, z undo, Space ")
 
 
@@ -848,7 +848,7 @@ def test_a_reviewer_reads_the_names_that_the_lanes_have_and_one_key_means_not_su
     assert [one.colour for one in named] == [
         colour(name) for name in ("silence", "yelling", "phone_ring", "unknown")
     ]
-    assert classes == ["quiet", "shouting", "telephone ringing", "not sure"]
+    assert classes == ["quiet", "shouting", "telephone ringing", "not recognised"]
     sitting.run("3")
     ((*span, question),) = filter(None, sitting.screen.requested)
     assert (tuple(span), question.text) == (item[:2], "Shouting?")
@@ -1174,7 +1174,7 @@ def test_the_page_shows_the_line_before_and_the_last_one_whole_above_the_buttons
                 requested = review.wait_for(f"{following} of ")
                 patiently(page.text, lambda text, wanted=requested: text == wanted)
                 (done, is_complete), (last, also) = page.evaluate(lines)
-                assert done.startswith("marked as not sure: ")
+                assert done.startswith("marked as not recognised: ")
                 assert (last, is_complete, also) == (requested, True, True)
                 assert min(page.evaluate(tops)) >= 0
 

@@ -307,12 +307,12 @@ def test_the_mean_of_f1_says_of_which_class_it_is_not(capsys):
     rows = re.findall(
         r"^(\w[\w ]*?)  .* (\d\.\d+)$", capsys.readouterr().out.partition("\n\n")[0], re.MULTILINE
     )
-    known = [float(f1) for name, f1 in rows if name != "Not sure"]
+    known = [float(f1) for name, f1 in rows if name != "Not recognised"]
     assert len(known) == len(general.classes) - 1
     printed = f"macro F1 without unknown: {np.mean(known):.3f}"
     assert printed in model_card(general)
     print_figures(general)
-    assert f"macro F1 {np.mean(known):.3f} without 'Not sure', " in capsys.readouterr().out
+    assert f"macro F1 {np.mean(known):.3f} without 'Not recognised', " in capsys.readouterr().out
 
 
 def test_metrics_agree_with_each_other_and_with_the_data():

@@ -387,7 +387,9 @@ def _sentence_of_day(home: HomeDay) -> str:
             [DayPart(partly, {}), *parts] if is_split else [day._replace(when=partly)], home
         )
     if any(_important(part.found) for part in parts):
-        return _sentence(parts, home)
+        short = words.text("television") if len(parts) > 1 else ""  # two parts are long enough
+        named = [p._replace(television=short) if short and p.television else p for p in parts]
+        return _sentence(named, home)
     detectable = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
     names = [words.inside(words.class_words(name)) for name in ordered(detectable)]
     if not names:
