@@ -949,6 +949,20 @@ def test_one_says_by_keyboard_what_a_sound_was(phone, lived):
     assert [mark.label for mark in lived.marks()] == ["door_bell"]
 
 
+def test_cancel_closes_a_form_and_keeps_nothing(phone, lived):
+    phone.open(lived)
+    answers = '[...document.querySelectorAll("#events .said")].map((e) => e.innerText)'
+    before, marks = phone.of(answers), lived.marks()
+    phone.of('document.querySelector("#events summary").click()')
+    phone.until('document.querySelector("#events fieldset")')
+    phone.of('document.querySelector("#events input[type=radio]").click()')
+    phone.of('document.querySelector("#events .save .quiet").click()')
+    phone.until('!document.querySelector("#events details").open')
+    assert phone.of("document.activeElement.tagName") == "SUMMARY"
+    assert phone.of(answers) == before
+    assert lived.marks() == marks
+
+
 def test_a_form_that_somebody_fills_in_stays_when_sounds_come(phone, lived):
     phone.open(lived)
     phone.of('document.querySelectorAll("#events summary")[1].click()')

@@ -205,7 +205,7 @@ def _hours(seconds: float) -> str:
 def _minutes(minutes: float) -> str:
     if minutes < 1:
         return f"{60 * minutes:.0f} s" if not minutes or round(60 * minutes) else "under 1 s"
-    return f"{minutes:.1f} min" if minutes < _HOUR else Duration.show(minutes)
+    return f"{minutes:.0f} min" if round(minutes) < _HOUR else Duration.show(minutes)
 
 
 def day_lines(day: date, totals: Mapping[str, EventTotal]) -> Iterator[str]:

@@ -93,9 +93,9 @@ function form(item, { legend, choices, save }) {
   something.append(own);
   own.addEventListener("input", () => { something.firstElementChild.checked = true; });
   const problem = make("p", { class: "problem", role: "alert" });
-  const button = make("button", {}, say("save"));
+  const button = make("button", {}, say("save")), cancel = make("button", { type: "button", class: "quiet" }, say("cancel"));
   const question = make("form", {}, make("fieldset", {}, make("legend", {}, legend),
-    ...choices.map(([label, words]) => choice("label", label, words)), something), problem, make("div", { class: "save" }, button));
+    ...choices.map(([label, words]) => choice("label", label, words)), something), problem, make("div", { class: "save" }, button, cancel));
   question.addEventListener("submit", async (submitted) => {
     submitted.preventDefault();
     const label = new FormData(question).get("label") || own.value.trim();
@@ -107,9 +107,13 @@ function form(item, { legend, choices, save }) {
     if (answer.error) { write(problem, answer.error); return; }
     showAnswer(item, answer.said);
     item.isAnswered = true;
+    close();
+  });
+  cancel.addEventListener("click", close);
+  function close() {
     item.details.open = false;
     item.summary.focus();
-  });
+  }
   return question;
 }
 
