@@ -65,12 +65,14 @@ def write_day(  # noqa: PLR0913
     others: Mapping[str, Iterable[Event]] = MappingProxyType({}),
     doubts: Iterable[Doubt] = (),
     all_frames: bool = False,
+    steady: Iterable[tuple[float, float, float]] | None = None,
 ) -> list[Path]:
     """Write the logs of a day: events, and silence where there is no gap, both in UTC.
 
     The recorder may have other microphones, with events of their own and no gap. Only of `doubts`
     there are frames, those of the quiet around each of them too; they are events as well. With
-    `all_frames` there are those of the whole day instead.
+    `all_frames` there are those of the whole day instead. With `steady`, even if empty, there are
+    statistics, louder by some dB in its spans: second of the day, seconds, dB.
     """
     doubts = list(doubts)
     events = [*events, *((second, seconds, *about[:2]) for second, seconds, *about in doubts)]
@@ -91,6 +93,7 @@ def write_day(  # noqa: PLR0913
             [output for output in health if hour * HOUR <= output[0] < (hour + step) * HOUR],
             [each for each in doubts if hour * HOUR <= each[0] < (hour + step) * HOUR],
             all_frames,
+            None if steady is None else (hour, hour + step, list(steady)),
             {"version": "0", "node": node} | ({"timezone": timezone} if timezone else {}),
         )
         for hour in hours[::step]
@@ -195,8 +198,22 @@ def _tiled(events: list[Event], gaps: list[tuple[float, float, str]], hours: lis
         yield a, b - a, label, confidence
 
 
+def _statistics_of(microphone, begin, first, last, steady) -> TopicBatch:
+    """Return the statistics of some hours: of a quiet that is louder in some spans."""
+    seconds = np.arange(first * HOUR, last * HOUR)
+    level = np.full(len(seconds), -60.0)
+    for start, length, louder in steady:
+        level[(seconds >= start) & (seconds < start + length)] += louder
+    mean = np.zeros((len(seconds), len(FEATURE_NAMES)), np.float32)
+    mean[:, FEATURE_NAMES.index("energy")] = 10 ** (level / 10)
+    stamps = begin + seconds * NANOSECONDS
+    head = {"header.stamp": stamps, "header.frame_id": microphone, "frame": seconds * 20}
+    fields = head | {"mean": mean, "std": np.zeros_like(mean)}
+    return TopicBatch(f"/{microphone}/statistics", stamps, fields)
+
+
 def _write_hour(  # noqa: PLR0913, PLR0917
-    path, microphone, classes, begin, rooms, gaps, health, doubts, all_frames, about
+    path, microphone, classes, begin, rooms, gaps, health, doubts, all_frames, steady, about
 ) -> Path:
     topics = [each for name in rooms for each in topics_of(name, FEATURE_NAMES, classes)]
     writer = LogWriter(path, [*{each.name: each for each in topics}.values()], about)
@@ -220,6 +237,8 @@ def _write_hour(  # noqa: PLR0913, PLR0917
     for second, *row in rooms[microphone] if all_frames else ():
         first = begin + round(second * NANOSECONDS)
         batches += frames_of(microphone, classes, first, *row, {}, 0.0, around=0)
+    if steady is not None:
+        batches.append(_statistics_of(microphone, begin, *steady))
     if batches:
         writer.write_columns(batches)
     for start, seconds, reason in gaps:

@@ -790,6 +790,37 @@ def test_a_shower_that_the_model_does_not_know_counts_as_quiet(tmp_path, classes
     assert f"steady sound, such as {steady}, counts as quiet" in text
 
 
+@pytest.mark.parametrize(
+    ("steady", "words"),
+    [
+        ([(at("07:17"), 420, 14)], "but for steady sound from 07:17 to 07:24"),
+        ([(at("07:17"), 420, 5)], ""),
+        ([(at("07:17"), 120, 14)], ""),
+        ([(at("08:00"), 10 * HOUR, 14)], ""),  # a street by day is no sound of its own
+        (
+            [(at("03:00"), 360, 14), (at("11:30"), 360, 14)],
+            "but for steady sound from 03:00 to 03:06 and 11:30 to 11:36",
+        ),
+        (
+            [(at(f"{hour:02}:00"), 180, 14) for hour in (3, 9, 11)],
+            "but for steady sound at three times",
+        ),
+    ],
+)
+def test_a_quiet_day_names_steady_sound_that_no_label_names(tmp_path, steady, words):
+    write_day(tmp_path / "logs", DAY, [(at("07:19"), 3, "coughing", 0.9)], steady=steady)
+    text = text_of(page_of(tmp_path / "logs", tmp_path))
+    assert f"Sunday was quiet {words}".strip() + "." in text
+    assert ("such as water, a fan or a machine, was louder" in text) == bool(words)
+
+
+def test_no_shower_that_the_model_knows_is_called_steady_sound(tmp_path):
+    shower = [(at("07:17"), 420, "shower", 0.9)]
+    about = {"classes": BATHROOM, "steady": [(at("07:17"), 420, 14)]}
+    write_day(tmp_path / "logs", DAY, shower, **about)
+    assert "no label names" not in text_of(page_of(tmp_path / "logs", tmp_path))
+
+
 def test_a_week_of_one_recorded_day_has_the_sentence_of_that_day(tmp_path):
     write_day(tmp_path / "logs", DAY, [(at("19:20"), 600, "objects_activity", 0.9)])
     week = {"first": DAY - timedelta(days=6), "days": 7}

@@ -178,6 +178,7 @@ class HomeMetrics:
     minutes: HomeMinutes
     rates: dict[str, CheckedRates]  # by class, from the checked minutes
     unsure: dict[str, Int64]  # by class: those starts that are not sure, and not reviewed
+    steady: Spans = NONE  # loud, but labelled quiet; read for the report of a day only
 
     def between(self, start: int, end: int) -> "HomeMetrics":
         """Return the metrics of a span in nanoseconds of UTC; events belong where they begin."""
@@ -191,6 +192,7 @@ class HomeMetrics:
             self.minutes.between(single_span(start, end)),
             self.rates,
             self.unsure,
+            cut(self.steady, start, end),
         )
 
     def events_in(self, name: str, span: Spans) -> Int64:

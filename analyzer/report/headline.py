@@ -159,9 +159,9 @@ def _day(day: DayMetrics) -> str:
         partly = f" ({int(hours)} of {hours_of_day} hours recorded)"
     if not is_quiet(day):
         return f"{name} had sound in {lively.sum()} of {hours_of_day} hours{partly}"
-    if not lively.any():
-        return f"{name} was quiet{partly}"
-    return f"{name} was quiet but for {_exceptions(day, lively)}{partly}"
+    exceptions = _exceptions(day, lively) if lively.any() else ""
+    but = ", and ".join(text for text in (exceptions, _steady(day)) if text)
+    return f"{name} was quiet{' but for ' * bool(but)}{but}{partly}"
 
 
 def _exceptions(day: DayMetrics, lively: Bool) -> str:
@@ -176,6 +176,17 @@ def _exceptions(day: DayMetrics, lively: Bool) -> str:
     if television:
         runs.append(f"something like a television from {listed(television, 'and')}")
     return listed(runs, "and")
+
+
+def _steady(day: DayMetrics) -> str:
+    """Return when there was steady sound that no label names; empty if it was short."""
+    spans = intersection(day.home.steady, day.span)
+    if spans.length < LIVELY_MINUTES * MINUTE:
+        return ""
+    times = _times(day, spans)
+    if len(times) > _ONE_MORE:
+        return f"steady sound at {number_in_words(len(times))} times"
+    return f"steady sound from {listed(times, 'and')}"
 
 
 def states_missing_time(day: DayMetrics) -> bool:

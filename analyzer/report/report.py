@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, timedelta, tzinfo
 from pathlib import Path
 from typing import NamedTuple
@@ -31,20 +31,29 @@ from hearthlog.analyzer.activity.home_data import (
     read_home,
     read_scenario_minutes,
 )
+from hearthlog.analyzer.activity.steady_sound import read_steady_sound
 from hearthlog.analyzer.activity.values import BASELINE_DAYS
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, check_day, network_changes
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.layers import latest_records
 from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import EVENT_PAUSE, Spans, intersection, joined, rows_at
+from hearthlog.analyzer.logs.spans import (
+    EVENT_PAUSE,
+    NONE,
+    Spans,
+    intersection,
+    joined,
+    rows_at,
+    union,
+)
 from hearthlog.analyzer.report.page import day_page, week_page
 from hearthlog.analyzer.report.report_data import ASSESSED_DAYS as ASSESSED
 from hearthlog.analyzer.report.report_data import ReportData
-from hearthlog.models.classes import WORRYING, class_name
+from hearthlog.models.classes import SILENCE, WORRYING, class_name
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.logs.files import RELABEL_LAYER
-from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling
+from hearthlog.schemas.messages.topics import LIVE, labelling_topic, relabelling, topic
 from hearthlog.schemas.new_files import check_new, new_file
 
 WEEK = 7
@@ -125,6 +134,8 @@ def read_report_data(
     checked = read_checked_minutes(logs, labelling, since, close[1], home.losses)
     checks = checked.of_model(model)
     metrics = metrics_of_home(home, checks)
+    if count == 1:
+        metrics = replace(metrics, steady=_steady_sound(logs, home, close))
     routines = Routines(Profiles(home_sound(home, metrics), zone, night_after=False))
     past = [day_of(metrics, day, zone) for day in earlier]
     logged = _logged(logs, metrics.coverage)
@@ -152,6 +163,16 @@ def read_report_data(
         hidden=home.hidden,
     )
     return data, home.losses
+
+
+def _steady_sound(logs: HomeLogs, home: HomeData, close: tuple[int, int]) -> Spans:
+    """Return when any microphone of a home recorded steady sound on a day."""
+    found = [NONE]
+    for (node, microphone), labels in home.segments.items():
+        paths = [entry.path for entry in logs.between(*close) if entry.node == node]
+        quiet = labels.spans(labels.labels == SILENCE)
+        found.append(read_steady_sound(paths, topic(microphone, "statistics"), quiet, *close))
+    return union(*found)
 
 
 def _logged(logs: HomeLogs, coverage: Spans) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import difference, joined, lengths
+from hearthlog.analyzer.logs.spans import Spans, difference, intersection, joined, lengths
 from hearthlog.analyzer.report.headline import amount, states_missing_time, unlogged
 from hearthlog.analyzer.report.report_data import TELEVISION_PAUSE, ReportData, day_television
 from hearthlog.analyzer.report.wording import (
@@ -55,6 +55,7 @@ def summarize_day(data: ReportData, day: DayMetrics) -> Iterator[str]:
         yield _changes(data, day)
     if day.night_hours:
         yield _night(day)
+    yield _steady(day)
     yield _still(day)
 
 
@@ -199,7 +200,12 @@ def _loudest(day: DayMetrics) -> str:
 
 def _television(day: DayMetrics) -> str:
     """Return when something like a television sounded."""
-    spans = day_television(day, TELEVISION_PAUSE)
+    when = _longest(day_television(day, TELEVISION_PAUSE), day)
+    return f"Something like a television, a radio or company sounded {when}." if when else ""
+
+
+def _longest(spans: Spans, day: DayMetrics) -> str:
+    """Return the longest of some spans in words: `at other times and from 07:17 to 07:24`."""
     if not len(spans.starts):
         return ""
     longest = np.sort(np.argsort(spans.starts - spans.ends, kind="stable")[:_TIMES])
@@ -209,8 +215,15 @@ def _television(day: DayMetrics) -> str:
         for row in longest.tolist()
     ]
     more = "at other times and " if len(spans.starts) > _TIMES else ""
-    when = more + f"from {listed(times, 'and')}"
-    return f"Something like a television, a radio or company sounded {when}."
+    return f"{more}from {listed(times, 'and')}"
+
+
+def _steady(day: DayMetrics) -> str:
+    """Return when there was steady sound that is labelled quiet."""
+    spans = intersection(day.home.steady, day.span)
+    times = _longest(spans, day)
+    what = "Steady sound that no label names, such as water, a fan or a machine"
+    return f"{what}, was louder than the quiet around it {times}." if times else ""
 
 
 def _still(day: DayMetrics) -> str:

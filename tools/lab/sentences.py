@@ -220,12 +220,13 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
         first = ""
     hours, modest = day.sound_by_hour, is_modest(first)
     lively = hours >= LIVELY_MINUTES
-    but, _, television = first.partition("something like a television")
+    others, _, steady = first.partition("steady sound")
+    but, _, television = others.partition("something like a television")
     if _RUN.search(first):
         has_sound, may_have = np.zeros(len(hours), bool), np.zeros(len(hours), bool)
         for start, end in _RUN.findall(but):
             has_sound[int(start[:2]) : int(end[:2])] = True
-        for start, end in _RUN.findall(television):  # to the minute
+        for start, end in _RUN.findall(television + steady):  # to the minute
             may_have[int(start[:2]) : int(end[:2]) + 1] = True
         slack = 1 + TOLERANCE
         wrong = (has_sound & (hours * slack < LIVELY_MINUTES)) | (
@@ -239,6 +240,7 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
             modest=modest,
         )
         yield from _televisions(REPORT, _RUN.findall(television), truth, modest=modest)
+        yield from _steady_sounds(_RUN.findall(steady), truth, modest=modest)
     elif match := re.search(r"sound in (\d+) of|for (\w+) hours", first):
         stated = read_number(match[1] or match[2])
         yield judge_count(REPORT, first, (stated, stated), int(lively.sum()), modest=modest)
@@ -248,6 +250,18 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
         )
     for sentence in rest:
         yield from _counts_in(REPORT, sentence, truth)
+
+
+def _steady_sounds(
+    runs: Sequence[tuple[str, str]], truth: TrueDay, *, modest: bool
+) -> Iterator[Statement]:
+    """Check that there was sound where a steady one is stated."""
+    for run_ in runs:
+        start, end = (time_at(truth.metrics, each) for each in run_)
+        inside = cut(truth.metrics.home.sound, start, end).length / max(end - start, 1)
+        right = inside >= 1 - TOLERANCE
+        statement = f"steady sound from {' to '.join(run_)}"
+        yield judge(REPORT, statement, f"{inside:.0%} of it", right=right, modest=modest)
 
 
 def _televisions(
