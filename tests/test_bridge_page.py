@@ -949,6 +949,15 @@ def test_one_says_by_keyboard_what_a_sound_was(phone, lived):
     assert [mark.label for mark in lived.marks()] == ["door_bell"]
 
 
+def test_a_form_has_what_people_ask_about_though_no_model_knows_it(phone, lived):
+    phone.open(lived)
+    phone.of('document.querySelector("#events summary").click()')
+    phone.until('document.querySelector("#events fieldset")')
+    texts = phone.of('[...document.querySelectorAll("#events label")].map((e) => e.innerText)')
+    assert {"Coughing", "Crying", "Toilet flush", "Shower", "Water tap"} <= {*texts}
+    assert len({*texts}) == len(texts)
+
+
 def test_cancel_closes_a_form_and_keeps_nothing(phone, lived):
     phone.open(lived)
     answers = '[...document.querySelectorAll("#events .said")].map((e) => e.innerText)'

@@ -20,6 +20,7 @@ from viewers import patiently
 
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import Sureness
+from hearthlog.analyzer.activity.daily_metrics import read_day_totals
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
 from hearthlog.analyzer.bridge.corrections import EventCorrections, user_error
 from hearthlog.analyzer.bridge.home_state import HomeState
@@ -767,6 +768,11 @@ def test_the_night_and_the_day_have_the_counts_that_the_report_of_the_day_has(tm
     assert page["Coughing"] == ["2", "1 (+1?)"]
     assert page["Not recognised"] == ["0", "1?"], "a ring that may be something else"
     assert page["Talking"] == ["0", "0"]
+    week = tmp_path / "week.html"
+    make_report(find_home_logs([logs]), Period(monday, 7, UTC), week)
+    assert '>Coughing</th><td data-head="Mon 2">3 (+1?)</td>' in week.read_text()
+    total = read_day_totals(find_home_logs([logs]), monday, UTC)["coughing"]
+    assert (total.counted, total.unsure) == (4, 1), "as info has it"
 
 
 @pytest.mark.parametrize("text", ["2001-01-01", "", "../../etc/passwd", "9999-12-31", "%00", "x"])

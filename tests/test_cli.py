@@ -88,7 +88,9 @@ def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(
     counts = figures["day"]["counts"]
     sure = {name: own["counted"] - own["unsure"] for name, own in counts.items()}
     parts = [f"{in_words(name).lower()} {sure[name] or 'none'}" for name in ordered(counts)]
-    assert rest[len(rows) + 1].startswith("Labelled on Sunday, 2026-03-01: ")
+    assert rest[len(rows) + 1].startswith(
+        "Labelled in the 24 hours to 22:00 of Sunday, 2026-03-01: "
+    )
     assert all(part in rest[len(rows) + 1] for part in parts)
     assert len(re.findall(r"minutes|frame", "".join(rest))) == 0, "one set of amounts"
     assert figures["streams"][0]["starter"] is False

@@ -355,7 +355,9 @@ def test_a_sum_of_days_of_which_most_are_not_known_is_not_0(tmp_path):
         write_day(tmp_path / "logs", DAY - timedelta(days=ago), hours=hours)
     page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
     rows = rows_of(page)
-    assert rows["Recorded"][:7] == ["100 %"] * 3 + ["4 %"] * 4
+    assert rows["Recorded"][:7] == ["92 %", "100 %", "100 %", "12 %", "4 %", "4 %", "4 %"], (
+        "each with the evening before"
+    )
     assert {cells[-1] for cells in rows.values()} & {"0", "0 min"} == set()
 
 
@@ -853,7 +855,7 @@ def test_times_of_up_to_five_sounds_are_written_and_of_more_the_first_and_the_la
     rows = rows_of(page_of(tmp_path / "logs", tmp_path))
     assert rows["Coughing"] == ["0", "2", "0", "11:00 twice", "under 1 min"]
     assert rows["Telephone ringing"] == ["0", "3", "0", "09:58, 10:08, 15:26", "under 1 min"]
-    assert rows["Talking"] == ["0", "6", "0", "08:00 to 08:50", "under 1 min"]
+    assert rows["Talking"] == ["0", "6", "0", "first 08:00, last 08:50", "under 1 min"]
     assert list(rows)[1:4] == ["Coughing", "Telephone ringing", "Talking"], (
         "what matters comes first"
     )
@@ -1005,7 +1007,9 @@ def test_a_page_needs_nothing_but_itself(flat_page):
 def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
     text = text_of(flat_page)
     assert "Sunday, 1 March 2026" in text
-    assert re.search(r"Coughing 40 more often usually \d+ \(\d+ to \d+\) 0 .* 01:00 to 04:15", text)
+    assert re.search(
+        r"Coughing 40 more often usually \d+ \(\d+ to \d+\) 0 .* first 01:00, last 04:15", text
+    )
     assert "How unusual the day was cannot be said yet: that takes 14 mostly recorded days" in text
     assert "Not recorded: 50 min (3 %)" in text
     assert " Recorded: " not in text, "it is missing once"

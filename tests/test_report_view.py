@@ -186,7 +186,7 @@ def test_a_phone_has_a_block_for_each_class_without_the_days_that_were_not_recor
     browser, tmp_path
 ):
     write_day(tmp_path / "logs", DAY, [*_TELEVISION, *_DOUBTFUL])
-    write_day(tmp_path / "logs", DAY - timedelta(days=2))
+    write_day(tmp_path / "logs", DAY - timedelta(days=2), hours=range(22))
     set_size(browser, *PHONE, mobile=True)
     browser.open(report_of(tmp_path / "logs", tmp_path, 7, DAY - timedelta(days=6)))
     found = boxes(browser, "table.wide td")

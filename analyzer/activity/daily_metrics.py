@@ -263,6 +263,11 @@ class DayMetrics:
         return replace(self, span=single_span(int(self.night.starts[0]), int(self.span.ends[0])))
 
     @property
+    def to_evening(self) -> "DayMetrics":
+        """The 24 hours to 22:00: no two days have a time in common, and each night is in one."""
+        return replace(self, span=single_span(int(self.night.starts[0]), int(self.waking.ends[0])))
+
+    @property
     def waking(self) -> Spans:
         """The time from 07:00 to 22:00."""
         return single_span(*awake_span(self.day, self.zone))
@@ -539,11 +544,11 @@ def event_totals(metrics: HomeMetrics, start: int, end: int) -> dict[str, EventT
 
 
 def read_day_totals(logs: HomeLogs, day: date, zone: tzinfo) -> dict[str, EventTotal]:
-    """Read the logs of a local day, and count its events as a report does.
+    """Read the logs of the 24 hours to 22:00 of a day, and count their events as a report does.
 
     Raise `DataError` without labels, `LogError` if segments are invalid.
     """
-    start, end = day_span(day, zone)
+    start, end = night_span(day, zone)[0], awake_span(day, zone)[1]
     data = read_home(logs, LIVE, start - _BEFORE, (start, end))
     return event_totals(metrics_of_home(data), start, end)
 

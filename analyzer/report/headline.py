@@ -67,12 +67,16 @@ def day_headline(day: DayMetrics) -> Headline:
     return Headline(f"{_day(day)}.", " ".join(rest))
 
 
-def week_headline(days: Sequence[DayMetrics]) -> Headline:
-    """Return the headline of a week: its quiet days; coughing, crying and shouting."""
+def week_headline(days: Sequence[DayMetrics], counted: Sequence[DayMetrics]) -> Headline:
+    """Return the headline of a week: its quiet days; coughing, crying and shouting.
+
+    Sounds are those of the `counted` days, which may begin in the evening before.
+    """
     recorded = [day for day in days if day.coverage.length]
     complete_days = [day for day in recorded if _is_covered(day)]
     others = [day for day in days if day not in complete_days]
-    sounds = (_sentence(text) for text in _sounds_of_week(recorded, len(days)))
+    heard = [day for day in counted if day.coverage.length]
+    sounds = (_sentence(text) for text in _sounds_of_week(heard, len(days)))
     first = f"{_quiet_days(complete_days, len(others))}{_too_little(complete_days, others)}."
     return Headline(first, " ".join(sounds))
 

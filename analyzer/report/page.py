@@ -129,7 +129,7 @@ class PageSection(NamedTuple):
 def day_page(data: ReportData) -> str:
     """Return the page of a day."""
     day = data.days[0]
-    shown = data.with_nights
+    shown = data.from_evening
     whole = shown.days[0]
     timeline = timeline_of(whole)
     title, table = day_in_words(day.day), _sounds(shown, whole)
@@ -151,22 +151,22 @@ def day_page(data: ReportData) -> str:
 def week_page(data: ReportData) -> str:
     """Return the page of a week."""
     first, last = data.days[0].day, data.days[-1].day
-    spoken = dates_in_words(first, last)
-    names = [name for name in data.classes if name != SILENCE and _occurs(data, name)]
-    days = week_timelines(data.days)
+    shown, spoken = data.from_evening, dates_in_words(first, last)
+    names = [name for name in data.classes if name != SILENCE and _occurs(shown, name)]
+    days = week_timelines(shown.days)
     described = " ".join(f"{name}: {_description(each)}" for name, each in days)
     return _page(
         data,
-        data,
+        shown,
         PagePicture(f"The sounds of {spoken}", described, days),
         title=f"Week {first.isocalendar().week}, {spoken}",
-        headline=week_headline(data.days),
+        headline=week_headline(data.days, shown.days),
         summary=list(summarize_week(data)),
         overview=[
-            ("How often it was heard", _week(data, list(map(event_figure, names)))),
+            ("How often it was heard", _week(shown, list(map(event_figure, names)))),
             (
                 "How long it was heard",
-                _week(data, list(map(minutes_figure, names)), has_share=False),
+                _week(shown, list(map(minutes_figure, names)), has_share=False),
             ),
         ],
         evening=False,
@@ -311,9 +311,10 @@ def _times(day: DayMetrics, name: str) -> str:
     starts = day.counted_events(name, day.span)
     if len(starts) <= _MOST_TIMES.get(name, _FEW):
         return times_in_words(starts, day.zone, first=day.day, unsure=day.unsure_events(name))
-    return "\N{NO-BREAK SPACE}to ".join(
+    first, last = (
         clock_with_day(int(edge), day.zone, day.day) for edge in (starts.min(), starts.max())
     )
+    return f"first {first}, last {last}"
 
 
 def _occurs(data: ReportData, name: str) -> bool:

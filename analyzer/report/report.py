@@ -109,7 +109,7 @@ def make_report(  # noqa: PLR0913
         html, *png = [files.enter_context(new_file(path)) for path in paths]
         html.write_text(text, "utf-8")
         if draw is not None:
-            draw(png[0], data.days, data.earlier)
+            draw(png[0], data.from_evening.days, data.from_evening.earlier)
     return WrittenReport(page, None if draw is None else picture, losses)
 
 

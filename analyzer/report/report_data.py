@@ -224,9 +224,19 @@ class ReportData:
         return self.days[0].home.classes
 
     @property
-    def with_nights(self) -> "ReportData":
-        """The same data with each day and baseline day from 22:00 of the evening before."""
-        days, earlier = ([day.with_night for day in each] for each in (self.days, self.earlier))
+    def from_evening(self) -> "ReportData":
+        """The same data with days from the evening before: one to midnight, seven to 22:00.
+
+        So each night is in one piece, and no sound is in two days of a week. A day of a week
+        without logs stays as it is: two hours of the evening before make no day.
+        """
+        if len(self.days) == 1:
+            days, earlier = ([day.with_night for day in each] for each in (self.days, self.earlier))
+        else:
+            days, earlier = (
+                [day.to_evening if day.logged.length else day for day in each]
+                for each in (self.days, self.earlier)
+            )
         return replace(self, days=days, earlier=earlier)
 
     @property

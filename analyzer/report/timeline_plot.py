@@ -31,8 +31,6 @@ _UNCOUNTED = (210 / 255, 94 / 255, 1 / 255, _PALE)
 
 def save_timelines(path: Path, days: Sequence[DayMetrics], earlier: Sequence[DayMetrics]) -> None:
     """Draw a day, with the minutes with sound of each hour, or the days of a week."""
-    if len(days) == 1:  # as the page draws it
-        days, earlier = ([day.with_night for day in each] for each in (days, earlier))
     rows = week_timelines(days) if len(days) > 1 else [("", timeline_of(days[0]))]
     timelines = [timeline for _, timeline in rows]
     lane_height = 0.3 if len(days) == 1 else 0.11

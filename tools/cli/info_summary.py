@@ -20,7 +20,7 @@ from hearthlog.analyzer.activity.event_counts import FEWEST
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.logs.local_time import EVENING, local_time
 from hearthlog.analyzer.logs.summary import LogSummary
 from hearthlog.models.classes import ON_TELEVISION, SILENCE, UNKNOWN, class_name, in_words, ordered
 from hearthlog.models.starter import GENERAL
@@ -209,7 +209,7 @@ def _minutes(minutes: float) -> str:
 
 
 def day_lines(day: date, totals: Mapping[str, EventTotal]) -> Iterator[str]:
-    """Yield how often each sound occurred on a day, and what is left out beside a television."""
+    """Yield how often each sound occurred to 22:00 of a day, and what is left out."""
     parts, apart = [], []
     for name, (counted, television, unsure) in totals.items():
         if name == UNKNOWN:
@@ -220,7 +220,7 @@ def day_lines(day: date, totals: Mapping[str, EventTotal]) -> Iterator[str]:
         apart += [f"{word} {television}"] * bool(television)
     note = "; of those with ? the model is not sure" * any(one.unsure for one in totals.values())
     counts = listed(parts, "and")
-    yield f"Labelled on {day:%A, %Y-%m-%d}: {counts}{note}"
+    yield f"Labelled in the 24 hours to {EVENING}:00 of {day:%A, %Y-%m-%d}: {counts}{note}"
     if apart:
         yield f"and beside a television, not counted: {listed(apart, 'and')}"
 

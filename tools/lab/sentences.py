@@ -565,6 +565,7 @@ def info_statements(
     summary = summarise(logs)
     truth = true_day(sounds, day)
     true = truth.everywhere
+    day = day.to_evening
     totals = event_totals(day.home, int(day.span.starts[0]), int(day.span.ends[0]))
     line = " ".join(day_lines(day.day, totals))
     for name, total in totals.items():

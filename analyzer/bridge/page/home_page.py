@@ -52,7 +52,7 @@ from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.analyzer.logs.hidden_classes import read_hidden_classes, write_hidden_classes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time
-from hearthlog.models.classes import SILENCE, ordered
+from hearthlog.models.classes import SILENCE, WATER, WORRYING, class_name, ordered
 from hearthlog.recorder import pause_schedule
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError
@@ -247,7 +247,9 @@ class HomePage:
 
     def _last_bouts(self, update: OutputUpdate, words: Translation) -> Any:
         microphones = update.state.microphones.values()
-        names = ordered(label for each in microphones for label in [*each.classes, *each.labels()])
+        own = {label for each in microphones for label in [*each.classes, *each.labels()]}
+        taught = {*WORRYING, *WATER} - set(map(class_name, own)) - update.state.hidden_classes
+        names = ordered(own | taught)  # a model learns a class by answers, too
         shown = self._shown(
             words, update.today.now, update.state.corrections, is_alone=len(microphones) == 1
         )

@@ -169,7 +169,7 @@ function showRow(row, it, where, { columns, now }) {
     set(row.counts[index], "aria-label", `${name}: ${value === null ? say("not known") : spoken(value, it.unsure[index + 1])}`);
   });
   row.last.className = it.last ? "" : "none";
-  write(row.last, it.last || say(isPast ? "none in span" : "not lately"));
+  write(row.last, it.last || say(isPast || it.uncounted ? "none in span" : "not lately"));
 }
 
 function beginRoom(name, isAlone) {
