@@ -204,7 +204,7 @@ def test_two_microphones_are_counted_apart_by_the_bridge_and_joined_by_the_repor
 
 def test_the_contents_of_logs_name_the_counts_of_the_report(logs, capfd):
     found = json.loads(run(capfd, "info", logs, "--json").stdout)["day"]
-    _, day = day_metrics(logs)
+    day = day_metrics(logs)[1].to_evening
     assert found["date"] == DAY.isoformat()
     assert found["counts"] == {
         name: {

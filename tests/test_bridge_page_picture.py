@@ -255,3 +255,13 @@ def test_an_evening_of_television_leaves_the_sounds_of_the_day_in_the_list(phone
         phone.open(SimpleNamespace(url=page.address), 390, 844, "light")
         phone.shows("#events .fold .what", "20 sounds, not counted")
         assert phone.text("#all-events").replace("\u00a0", " ") == "Show all 8"
+
+
+def test_a_telephone_that_may_have_rung_is_not_among_what_there_was_not_once(phone, tmp_path):
+    sounds = [(at("10:00"), 4, "phone_ring", 0.6), (at("11:00"), 4, "coughing", 0.9)]
+    write_day(tmp_path, DAY - timedelta(days=1), [(at("12:00"), 4, "crying", 0.9)])
+    write_day(tmp_path, DAY, sounds, hours=range(14))
+    with served_page(tmp_path, UTC, midnight(DAY) + round(at("13:59") * NANOSECONDS)) as page:
+        phone.open(SimpleNamespace(url=page.address), 390, 844, "light")
+        phone.shows("button.zero", "crying")
+        assert "telephone" not in phone.text("button.zero")

@@ -21,7 +21,6 @@ _SHORTEST = 3 * MINUTE
 _PAUSE = MINUTE  # with another sound in it
 _QUIET_SHARE = 0.75  # of a quiet minute
 _TINY = 1e-12
-_FIELDS = "header.stamp", "mean"
 
 
 def read_steady_sound(
@@ -41,23 +40,23 @@ def read_steady_sound(
     parts = [part for log in logs if (part := _read(log, topic, start, end)) is not None]
     if not parts:
         return NONE
-    stamps, energy = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-    return steady_sound(stamps, energy, quiet)
+    times, energy = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+    return steady_sound(times, energy, quiet) if len(times) else NONE
 
 
-def steady_sound(stamps: Int64, energy: Float64, quiet: Spans) -> Spans:
+def steady_sound(times: Int64, energy: Float64, quiet: Spans) -> Spans:
     """Return the steady sound among quiet minutes.
 
     Parameters
     ----------
-    stamps : numpy.ndarray
+    times : numpy.ndarray
         [shape=(n,)] in nanoseconds of UTC, in order.
     energy : numpy.ndarray
         [shape=(n,)] mean square of the sound of about a second.
     quiet : Spans
         Labelled quiet.
     """
-    minutes, firsts = np.unique(stamps // MINUTE, return_index=True)
+    minutes, firsts = np.unique(times // MINUTE, return_index=True)
     edges = np.arange(minutes[0], minutes[-1] + 2) * MINUTE
     is_quiet = lengths(quiet, edges)[minutes - minutes[0]] >= _QUIET_SHARE * MINUTE
     if not is_quiet.any():
@@ -75,9 +74,9 @@ def steady_sound(stamps: Int64, energy: Float64, quiet: Spans) -> Spans:
 
 
 def _read(log: Path, topic: str, start: int, end: int) -> Sequence[Float64 | Int64] | None:
-    """Return times and mean energies of a log; None if it has none."""
+    """Return log times, which lie in the span, and mean energies; None if there are none."""
     try:
-        columns = read_columns([log], [topic], start, end, _FIELDS).get(topic)
+        columns = read_columns([log], [topic], start, end, ["mean"]).get(topic)
     except LogError:
         return None  # as without statistics
     return None if columns is None else _energies(columns)
@@ -87,4 +86,4 @@ def _energies(columns: Columns) -> Sequence[Float64 | Int64] | None:
     names, mean = array_names(columns.metadata, "mean"), columns["mean"]
     if "energy" not in names or mean.shape[1:] != (len(names),):
         return None
-    return columns["header.stamp"], mean[:, names.index("energy")].astype(np.float64)
+    return columns.log_times, mean[:, names.index("energy")].astype(np.float64)

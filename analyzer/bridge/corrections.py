@@ -238,6 +238,9 @@ class EventCorrections:
                 del self._pending[next(iter(self._pending))]
 
 
+NO_CORRECTIONS = EventCorrections(Path(), "")
+
+
 def _pause(event: SoundEvent, mark: Mark) -> int:
     """Return the pause over which a mark and an event are one event."""
     return EVENT_PAUSE if event.label == class_name(mark.label) else 0

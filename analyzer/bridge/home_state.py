@@ -21,7 +21,7 @@ from hearthlog.analyzer.activity.segments import (
     is_of_scenario,
     source_of_topic,
 )
-from hearthlog.analyzer.bridge.corrections import EventCorrections
+from hearthlog.analyzer.bridge.corrections import NO_CORRECTIONS, EventCorrections
 from hearthlog.analyzer.bridge.settings import RecorderAddress
 from hearthlog.analyzer.bridge.state import Report
 from hearthlog.analyzer.logs.hidden_classes import common_names_of, read_hidden_classes
@@ -71,14 +71,12 @@ class Health(NamedTuple):
 
 
 class ClassSounds(NamedTuple):
-    """Events of a class, those of them that count, and the ids that people gave to it."""
+    """Events of a class, those that count, the ids given by people and of too doubtful ones."""
 
     events: list[SoundEvent]
     counted: list[SoundEvent]
     given: set[str]
-
-
-NO_CORRECTIONS = EventCorrections(Path(), "")
+    doubtful: set[str]
 
 
 class LiveMicrophone:
@@ -220,11 +218,12 @@ class LiveMicrophone:
         """Return the events of each shown class since a time, as the report counts them.
 
         `ON_TELEVISION` classes do not count beside a television, but where a person confirmed them.
-        `names` are common names of classes, such as `common_names`; empty for the classes of the
-        model.
+        `names` are common names of classes; empty for the classes of the model.
         """
         shown = [names.get(label, label) for label in [*self.classes, *self.labels()]]
-        found = {name: ClassSounds([], [], set()) for name in ordered(shown) if name != SILENCE}
+        found = {
+            name: ClassSounds([], [], set(), set()) for name in ordered(shown) if name != SILENCE
+        }
         every: list[SoundEvent] = []
         for label in [*found]:
             events = self._named_events(label, since, names)
@@ -234,6 +233,8 @@ class LiveMicrophone:
             for event in events:
                 is_doubtful = is_too_doubtful(event.label, event.confidence)
                 name = given.get(event.id, UNKNOWN if is_doubtful else label)
+                if name == UNKNOWN != label:
+                    found[label].doubtful.add(event.id)
                 own = found.get(names.get(name, name))
                 if own is not None:
                     own.events.append(event)

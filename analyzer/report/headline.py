@@ -75,8 +75,8 @@ def week_headline(days: Sequence[DayMetrics], counted: Sequence[DayMetrics]) -> 
     recorded = [day for day in days if day.coverage.length]
     complete_days = [day for day in recorded if _is_covered(day)]
     others = [day for day in days if day not in complete_days]
-    heard = [day for day in counted if day.coverage.length]
-    sounds = (_sentence(text) for text in _sounds_of_week(heard, len(days)))
+    covered = [day for day in counted if day.coverage.length]
+    sounds = (_sentence(text) for text in _sounds_of_week(covered, len(days)))
     first = f"{_quiet_days(complete_days, len(others))}{_too_little(complete_days, others)}."
     return Headline(first, " ".join(sounds))
 

@@ -130,10 +130,10 @@ def day_page(data: ReportData) -> str:
     """Return the page of a day."""
     day = data.days[0]
     shown = data.from_evening
-    whole = shown.days[0]
-    timeline = timeline_of(whole)
-    title, table = day_in_words(day.day), _sounds(shown, whole)
-    bars = hour_bars(whole, shown.earlier if data.comparable else [])
+    with_night = shown.days[0]
+    timeline = timeline_of(with_night)
+    title, table = day_in_words(day.day), _sounds(shown, with_night)
+    bars = hour_bars(with_night, shown.earlier if data.comparable else [])
     return _page(
         data,
         shown,
@@ -143,7 +143,7 @@ def day_page(data: ReportData) -> str:
         summary=list(summarize_day(data, day)),
         overview=[("What was heard", table)],
         evening=DAY_PARTS[-1].title in table.heads,
-        partly=_partly_heard(whole),
+        partly=_partly_covered(with_night),
         parts=[_part(data, section, day) for section in day_sections()],
     )
 
@@ -286,7 +286,7 @@ def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
     return PageTable([*heads, *["Right here"] * data.checked], rows, "sounds stack")
 
 
-def _partly_heard(day: DayMetrics) -> list[str]:
+def _partly_covered(day: DayMetrics) -> list[str]:
     """Return sentences on the classes that could be heard for less of a day than others."""
     names: dict[str, list[str]] = {}
     for name in day.home.classes:
@@ -368,8 +368,10 @@ def _part(data: ReportData, section: FigureSection, day: DayMetrics) -> PageSect
 
 def _coughing(day: DayMetrics) -> str:
     """Return when coughing was labelled in the night, unless the table of sounds has each time."""
-    whole, starts = day.with_night, day.night_events(COUGHING)
-    if len(whole.counted_events(COUGHING, whole.span)) <= _FEW_WORRYING or not len(starts):
+    listed_day, starts = day.with_night, day.night_events(COUGHING)
+    if len(listed_day.counted_events(COUGHING, listed_day.span)) <= _FEW_WORRYING or not len(
+        starts
+    ):
         return ""
     if len(starts) <= _FEW:
         unsure = day.unsure_events(COUGHING)

@@ -402,20 +402,20 @@ def _sound_counts(
     )
     if name is None:
         return
-    by_head, whole = dict(zip(heads, cells, strict=True)), truth.metrics.with_night
+    by_head, with_night = dict(zip(heads, cells, strict=True)), truth.metrics.with_night
     for part in (each for each in DAY_PARTS if each.title in by_head):
         often = by_head[part.title]
         if (stated := read_count(often.partition(" | ")[0])) is not None:
             where = f"{cells[0]}, {part.title}: {often}"
             modest = is_modest(re.sub(r"\(\d+ labelled\)", "", where))
-            true = whole.count_in(name, part.span(whole)).labelled
+            true = with_night.count_in(name, part.span(with_night)).labelled
             yield judge_count(REPORT, where, stated, true, modest=modest)
     when, lasting = by_head["When"], by_head["How long"]
     if clocks := _CLOCK.findall(when):
         where = f"{cells[0]}: {when}"
         yield judge_times(REPORT, where, name, clocks, truth, modest=is_modest(where))
     if (minutes := read_minutes(lasting.partition(" | ")[0])) is not None:
-        value = minutes_figure(name).value(whole)
+        value = minutes_figure(name).value(with_night)
         true = 0 if value is None else value.middle
         where = f"{cells[0]}: {lasting}"
         yield judge_length(REPORT, where, minutes, true, modest=is_modest(where))

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness
 from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE
-from hearthlog.analyzer.bridge.corrections import EventCorrections
+from hearthlog.analyzer.bridge.corrections import NO_CORRECTIONS, EventCorrections
 from hearthlog.analyzer.bridge.home_state import (
     MOST,
-    NO_CORRECTIONS,
     ClassSounds,
     LiveMicrophone,
 )
@@ -254,6 +253,7 @@ def _lane(
         description = words.text("lane beside", told=description, times=times)
     return {
         "label": label,
+        "perhaps": bool(sounds.doubtful),
         "words": name,
         "colour": colour_on_paper(label),
         "important": label in IMPORTANT,

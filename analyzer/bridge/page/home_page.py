@@ -248,8 +248,8 @@ class HomePage:
     def _last_bouts(self, update: OutputUpdate, words: Translation) -> Any:
         microphones = update.state.microphones.values()
         own = {label for each in microphones for label in [*each.classes, *each.labels()]}
-        taught = {*WORRYING, *WATER} - set(map(class_name, own)) - update.state.hidden_classes
-        names = ordered(own | taught)  # a model learns a class by answers, too
+        missing = {*WORRYING, *WATER} - set(map(class_name, own)) - update.state.hidden_classes
+        names = ordered(own | missing)  # a model learns a class by answers, too
         shown = self._shown(
             words, update.today.now, update.state.corrections, is_alone=len(microphones) == 1
         )

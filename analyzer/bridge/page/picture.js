@@ -148,7 +148,7 @@ function showZero({ zero, rows, lanes }) {
   rows.forEach(({ element, counts }, index) => {
     element.hidden = isFolded && none[index] && !counts.includes(open?.button);
   });
-  const names = lanes.filter(({ label }, index) => none[index] && label !== "unknown").map(({ words }) => inside(words));
+  const names = lanes.filter(({ label, perhaps }, index) => none[index] && label !== "unknown" && !perhaps).map(({ words }) => inside(words));
   write(zero.button, say("zero", { classes: names.join(", ") }));
   zero.element.hidden = !names.length;
 }
