@@ -207,6 +207,7 @@ def test_a_phone_has_a_block_for_each_class_without_the_days_that_were_not_recor
             browser, "table.sounds tbody th, table.sounds td:not(.count ~ .count)"
         )
     }
+    assert not boxes(browser, "table.sounds td.zero"), "nothing to read"
     assert len(lefts) == 1, "below each other, but the counts of the parts of the day"
 
 

@@ -275,7 +275,7 @@ class DayMetrics:
     @property
     def evening(self) -> Spans:
         """The time from 22:00 to midnight, which belongs to the next night, too."""
-        return single_span(awake_span(self.day, self.zone)[1], int(self.span.ends[0]))
+        return single_span(int(self.waking.ends[0]), int(self.span.ends[0]))
 
     @property
     def coverage(self) -> Spans:

@@ -142,7 +142,7 @@ def day_page(data: ReportData) -> str:
         headline=day_headline(day),
         summary=list(summarize_day(data, day)),
         overview=[("What was heard", table)],
-        evening=DAY_PARTS[-1].title in table.heads,
+        evening=[*DAY_PARTS][-1] in table.heads,
         partly=_partly_covered(with_night),
         parts=[_part(data, section, day) for section in day_sections()],
     )
@@ -264,8 +264,8 @@ def _scenario_text(minutes: float, day: DayMetrics) -> str:
 
 def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
     """Return how often each class was heard in each recorded part of the day, when and how long."""
-    parts = [p for p in DAY_PARTS if intersection(day.home.coverage, p.span(day)).length]
-    heads = ["Sound", *(part.title for part in parts), "When", "How long"]
+    parts = [p for p in DAY_PARTS if intersection(day.home.coverage, DAY_PARTS[p](day)).length]
+    heads = ["Sound", *parts, "When", "How long"]
     rows = []
     for name in data.classes:
         lasting, uncounted = minutes_figure(name), day.uncounted_events(name)

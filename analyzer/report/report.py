@@ -109,7 +109,8 @@ def make_report(  # noqa: PLR0913
         html, *png = [files.enter_context(new_file(path)) for path in paths]
         html.write_text(text, "utf-8")
         if draw is not None:
-            draw(png[0], data.from_evening.days, data.from_evening.earlier)
+            shown = data.from_evening
+            draw(png[0], shown.days, shown.earlier)
     return WrittenReport(page, None if draw is None else picture, losses)
 
 

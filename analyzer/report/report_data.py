@@ -100,23 +100,17 @@ def minutes_figure(name: str) -> ReportFigure:
     return ReportFigure(title, title, lambda day: day.minutes(name), name, lasts=True)
 
 
-class DayPart(NamedTuple):
-    """A part of a day with the night before it; no two have a time in common."""
-
-    title: str
-    span: Callable[[DayMetrics], Spans]
-
-
-DAY_PARTS = (
-    DayPart(f"Night {EVENING:02}\N{EN DASH}{MORNING:02}", lambda day: day.night),
-    DayPart(f"Day {MORNING:02}\N{EN DASH}{EVENING:02}", lambda day: day.waking),
-    DayPart(f"After {EVENING}:00", lambda day: day.evening),
-)
+# Parts of a day with the night before it, by their titles; no two have a time in common.
+DAY_PARTS: Mapping[str, Callable[[DayMetrics], Spans]] = {
+    f"Night {EVENING:02}\N{EN DASH}{MORNING:02}": lambda day: day.night,
+    f"Day {MORNING:02}\N{EN DASH}{EVENING:02}": lambda day: day.waking,
+    f"After {EVENING}:00": lambda day: day.evening,
+}
 
 
-def part_figure(name: str, part: DayPart) -> ReportFigure:
-    """Return the figure of a class's event count in a part of a day."""
-    return ReportFigure(name, part.title, lambda day: day.count(name, part.span(day)), name)
+def part_figure(name: str, part: str) -> ReportFigure:
+    """Return the figure of a class's event count in one of `DAY_PARTS`."""
+    return ReportFigure(name, part, lambda day: day.count(name, DAY_PARTS[part](day)), name)
 
 
 def event_figure(name: str, title: str = "") -> ReportFigure:

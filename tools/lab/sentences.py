@@ -403,12 +403,12 @@ def _sound_counts(
     if name is None:
         return
     by_head, with_night = dict(zip(heads, cells, strict=True)), truth.metrics.with_night
-    for part in (each for each in DAY_PARTS if each.title in by_head):
-        often = by_head[part.title]
+    for part in (each for each in DAY_PARTS if each in by_head):
+        often = by_head[part]
         if (stated := read_count(often.partition(" | ")[0])) is not None:
-            where = f"{cells[0]}, {part.title}: {often}"
+            where = f"{cells[0]}, {part}: {often}"
             modest = is_modest(re.sub(r"\(\d+ labelled\)", "", where))
-            true = with_night.count_in(name, part.span(with_night)).labelled
+            true = with_night.count_in(name, DAY_PARTS[part](with_night)).labelled
             yield judge_count(REPORT, where, stated, true, modest=modest)
     when, lasting = by_head["When"], by_head["How long"]
     if clocks := _CLOCK.findall(when):

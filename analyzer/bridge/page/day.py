@@ -38,7 +38,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 
 BIN = 120 * NANOSECONDS  # as in the picture of the report
 # What people ask about: the page states which of these no model of the home can tell.
-_EXPECTED = frozenset({*IMPORTANT, SPEECH, *WATER})
+EXPECTED = frozenset({*IMPORTANT, SPEECH, *WATER})
 _HOUR = 3600 * NANOSECONDS
 _LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
 _MOST_TIMES = 40  # of a count
@@ -169,7 +169,7 @@ def _missing_classes(home: HomeDay) -> str:
         each.common_names.get(name, name) for each in home.microphones for name in each.names
     }
     hidden = frozenset[str]().union(*(each.hidden_classes for each in home.microphones))
-    missing = _EXPECTED - detectable - hidden
+    missing = EXPECTED - detectable - hidden
     notes = []
     if RUNNING_WATER in detectable and (joined_classes := missing & {*WATER}):
         missing -= {*WATER}

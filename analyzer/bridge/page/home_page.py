@@ -24,7 +24,7 @@ from hearthlog.analyzer.bridge.page import (
     room,
     translation_for,
 )
-from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
+from hearthlog.analyzer.bridge.page.day import BIN, EXPECTED, HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDay, PastDays
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
@@ -52,7 +52,7 @@ from hearthlog.analyzer.bridge.state import BridgeError, Report
 from hearthlog.analyzer.logs.hidden_classes import read_hidden_classes, write_hidden_classes
 from hearthlog.analyzer.logs.home_logs import find_home_logs
 from hearthlog.analyzer.logs.local_time import evening_before, local_time
-from hearthlog.models.classes import SILENCE, WATER, WORRYING, class_name, ordered
+from hearthlog.models.classes import SILENCE, class_name, ordered
 from hearthlog.recorder import pause_schedule
 from hearthlog.recorder.host import writes_to_journal
 from hearthlog.schemas.errors import HearthlogError
@@ -248,7 +248,7 @@ class HomePage:
     def _last_bouts(self, update: OutputUpdate, words: Translation) -> Any:
         microphones = update.state.microphones.values()
         own = {label for each in microphones for label in [*each.classes, *each.labels()]}
-        missing = {*WORRYING, *WATER} - set(map(class_name, own)) - update.state.hidden_classes
+        missing = EXPECTED - set(map(class_name, own)) - update.state.hidden_classes
         names = ordered(own | missing)  # a model learns a class by answers, too
         shown = self._shown(
             words, update.today.now, update.state.corrections, is_alone=len(microphones) == 1
