@@ -1,4 +1,4 @@
-"""Doubtful sounds: those that a model is not sure of, and that are loud or may be of a person."""
+"""Doubtful labels: loud or worrying sounds of no sure class, and steady sound labelled quiet."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
-from hearthlog.analyzer.activity.event_counts import events_and_confidences
+from hearthlog.analyzer.activity.event_counts import MINUTE, events_and_confidences
 from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.selection import array_names
-from hearthlog.analyzer.logs.spans import NONE, Spans, rows_at
+from hearthlog.analyzer.logs.spans import NONE, Spans, joined, lengths, rows_at
 from hearthlog.models.classes import (
     COUNTED_IF_SURE,
     IMPORTANT,
@@ -22,7 +22,7 @@ from hearthlog.models.classes import (
     WORRYING,
     class_name,
 )
-from hearthlog.schemas.arrays import Bool, Float64
+from hearthlog.schemas.arrays import Bool, Float64, Int64
 from hearthlog.schemas.errors import LogError
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, read_columns
@@ -37,6 +37,11 @@ _DELAY = 10 * NANOSECONDS  # longest from a frame to its label
 _QUIET = 10  # percentile of the levels around
 _SECOND = 20  # frames
 _TINY = 1e-12
+_LOUDER_DB = 8.0  # than the quiet around, steady sound: a refrigerator adds about 3, a shower 14
+_QUIET_MINUTES = 60  # before and after
+_SHORTEST = 3 * MINUTE  # steady sound
+_PAUSE = MINUTE  # with another sound in it
+_QUIET_SHARE = 0.75  # of a quiet minute
 _FIELDS = "header.stamp", "label", "probabilities", "values"
 
 
@@ -161,12 +166,8 @@ def _probabilities(labels: Columns, start: int, end: int) -> dict[str, float] | 
 
 def _level(features: Columns, start: int, end: int) -> float:
     """Return the level of the loudest second of an event above the quiet around, in dB."""
-    names, values = array_names(features.metadata, "values"), features["values"]
-    if "energy" not in names or values.shape[1:] != (len(names),):
-        return -inf
-    energy = values[:, names.index("energy")].astype(np.float64)
-    own = energy[_inside(features, start, end)]
-    if not len(own):
+    energy = _energy_of(features, "values")
+    if energy is None or not len(own := energy[_inside(features, start, end)]):
         return -inf
     frames = min(_SECOND, len(own))
     loudest = np.convolve(own, np.full(frames, 1 / frames), "valid").max()
@@ -181,3 +182,79 @@ def _inside(columns: Columns, start: int, end: int) -> Bool:
 
 def _decibels(energy: Float64 | float) -> float:
     return float(10.0 * np.log10(np.maximum(energy, _TINY)))
+
+
+def read_steady_sound(
+    logs: Iterable[Path], topic: str, quiet: Spans, start: int, end: int
+) -> Spans:
+    """Return when a microphone recorded steady sound, from the statistics of its features.
+
+    A model that does not know water, fans or machines labels their steady sound as quiet.
+
+    Parameters
+    ----------
+    topic : str
+        Of the statistics.
+    quiet : Spans
+        Labelled quiet.
+    start, end : int
+        Nanoseconds of UTC, of a day.
+    """
+    parts = [part for log in logs if (part := _read_energies(log, topic, start, end)) is not None]
+    if not parts:
+        return NONE
+    times = np.concatenate([times for times, _ in parts])
+    energy = np.concatenate([energy for _, energy in parts])
+    return steady_sound(times, energy, quiet) if len(times) else NONE
+
+
+def steady_sound(times: Int64, energy: Float64, quiet: Spans) -> Spans:
+    """Return the steady sound among quiet minutes.
+
+    Parameters
+    ----------
+    times : numpy.ndarray
+        [shape=(n,)] in nanoseconds of UTC, in order.
+    energy : numpy.ndarray
+        [shape=(n,)] mean square of the sound of about a second.
+    quiet : Spans
+        Labelled quiet.
+    """
+    minutes, firsts = np.unique(times // MINUTE, return_index=True)
+    edges = np.arange(minutes[0], minutes[-1] + 2) * MINUTE
+    is_quiet = lengths(quiet, edges)[minutes - minutes[0]] >= _QUIET_SHARE * MINUTE
+    if not is_quiet.any():
+        return NONE
+    middles = np.array([np.median(part) for part in np.split(energy, firsts[1:])])
+    levels = 10 * np.log10(np.maximum(middles, _TINY))
+    minutes, levels = minutes[is_quiet], levels[is_quiet]
+    # A street may be 10 dB louder by day than at night: compared is the quiet of two hours around.
+    padded = np.pad(
+        levels, _QUIET_MINUTES, mode="symmetric" if len(levels) >= _QUIET_MINUTES else "edge"
+    )
+    around = np.median(
+        np.lib.stride_tricks.sliding_window_view(padded, 2 * _QUIET_MINUTES + 1), axis=1
+    )
+    starts = minutes[levels >= around + _LOUDER_DB] * MINUTE
+    spans = joined(starts, starts + MINUTE, _PAUSE)
+    long = spans.ends - spans.starts >= _SHORTEST
+    return Spans(spans.starts[long], spans.ends[long])
+
+
+def _read_energies(log: Path, topic: str, start: int, end: int) -> tuple[Int64, Float64] | None:
+    """Return log times, which lie in the span, and mean energies; None if there are none."""
+    try:
+        columns = read_columns([log], [topic], start, end, ["mean"]).get(topic)
+    except LogError:
+        return None  # as without statistics
+    energy = None if columns is None else _energy_of(columns, "mean")
+    return None if columns is None or energy is None else (columns.log_times, energy)
+
+
+def _energy_of(columns: Columns, field: str) -> Float64 | None:
+    """Return the energies among the features in a field; None without them."""
+    names, values = array_names(columns.metadata, field), columns[field]
+    if "energy" not in names or values.shape[1:] != (len(names),):
+        return None
+    energy: Float64 = values[:, names.index("energy")].astype(np.float64)
+    return energy

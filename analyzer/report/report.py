@@ -23,6 +23,7 @@ from hearthlog.analyzer.activity.doubtful_sounds import (
     DoubtfulSound,
     doubtful_events,
     read_doubtful_sounds,
+    read_steady_sound,
 )
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import (
@@ -31,7 +32,6 @@ from hearthlog.analyzer.activity.home_data import (
     read_home,
     read_scenario_minutes,
 )
-from hearthlog.analyzer.activity.steady_sound import read_steady_sound
 from hearthlog.analyzer.activity.values import BASELINE_DAYS
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, check_day, network_changes
 from hearthlog.analyzer.logs.labelling import Labelling
