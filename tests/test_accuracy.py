@@ -399,6 +399,24 @@ def test_the_page_says_of_a_night_what_its_table_counts(tmp_path):
     assert "coughing right" not in lines[0]
 
 
+NAMES = "coughing", "objects_activity"
+
+
+def test_of_a_night_only_coughing_crying_and_shouting_have_a_range(tmp_path):
+    sounds = [
+        (at(f"{hour:02}:00:05"), 2, name, 0.9) for hour in (2, 10, 11, 12, 13) for name in NAMES
+    ]
+    logs = write_day(tmp_path / "home", DAY, sounds)
+    for hour in range(10, 16):
+        check(logs, at(f"{hour:02}:00"), [(5, 7, NAMES[0])])
+    checks = read_checked_minutes(find_home_logs([tmp_path / "home"]), "live", 0, 1 << 62, [])
+    day = report_day(tmp_path / "home", checks)
+    for name, is_ranged in zip(NAMES, (True, False), strict=True):
+        assert (day.night_count(name).range is not None) == is_ranged
+        assert day.count(name).range is not None
+        assert day.count(name, day.waking).range is not None
+
+
 def test_a_day_of_which_little_was_heard_is_said_to_be_heard_in_part(tmp_path):
     write_day(tmp_path / "home", DAY, [(at("08:00"), 120, "speech", 0.9)])
     write_day(tmp_path / "home", DAY - timedelta(days=1), hours=[22, 23])

@@ -1,6 +1,6 @@
 """Checked minutes: reviewed labels, and random minutes with their true events."""
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
@@ -249,6 +249,15 @@ class CheckedMinutes:
         """
         (labelled, _, true, _), sounding = self._counted(name)
         return checked_rates(labelled, true, sounding, share)
+
+    def rates_by_class(self, labelled: Mapping[str, int]) -> dict[str, CheckedRates]:
+        """Return the rates of the classes with enough checked minutes, given labelled events."""
+        # No sound is truly `unknown`.
+        amounts = {name: n + 1 for name, n in labelled.items() if class_name(name) != UNKNOWN}
+        total = sum(amounts.values())
+        fewest = 1 / max(len(amounts), 1)  # rarely labelled classes may be missed more often
+        drawn = {name: self.rates(name, max(n / total, fewest)) for name, n in amounts.items()}
+        return {name: rates for name, rates in drawn.items() if rates is not None}
 
     def _counted(self, name: str) -> tuple[Int64, Bool]:
         """Return the events of a class, and what sounds, in the minutes that count for it."""

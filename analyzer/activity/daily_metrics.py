@@ -42,9 +42,7 @@ from hearthlog.analyzer.logs.spans import (
 from hearthlog.models.classes import (
     ON_TELEVISION,
     SILENCE,
-    TELEVISION,
-    UNKNOWN,
-    class_name,
+    WORRYING,
     ordered,
 )
 from hearthlog.schemas.arrays import Bool, Float32, Int64
@@ -148,21 +146,6 @@ def home_minutes(
     return minutes.rows(lengths(coverage, edges) > 0)
 
 
-def checked_rates_of(minutes: HomeMinutes, checks: CheckedMinutes) -> dict[str, CheckedRates]:
-    """Return the rates of the classes with enough checked minutes."""
-    amounts = {
-        name: int(counts[0].sum()) + 1
-        for name, counts in minutes.events.items()
-        if class_name(name) != UNKNOWN  # no sound is truly `unknown`
-    }
-    total = sum(amounts.values())
-    fewest = 1 / max(len(amounts), 1)  # rarely labelled classes may be missed more often
-    drawn = {
-        name: checks.rates(name, max(amount / total, fewest)) for name, amount in amounts.items()
-    }
-    return {name: rates for name, rates in drawn.items() if rates is not None}
-
-
 @dataclass(frozen=True)
 class HomeMetrics:
     """Sounds of a home, combined over all microphones."""
@@ -225,7 +208,8 @@ def metrics_of_home(data: HomeData, checks: CheckedMinutes | None = None) -> Hom
     gone_through = [data.gone_through.get(source, NONE) for source in data.segments]
     labelled = in_order(data.labelled.values())
     minutes = home_minutes(labelled, gone_through, everything, events)
-    rates = {} if checks is None else checked_rates_of(minutes, checks)
+    amounts = {name: int(counts[0].sum()) for name, counts in minutes.events.items()}
+    rates = {} if checks is None else checks.rates_by_class(amounts)
     starts, unsure = {}, {}
     for name, (begun, confidences) in events.items():
         doubtful = (confidences < UNSURE_BELOW) & (rows_at(minutes.reviewed, begun) < 0)
@@ -238,6 +222,8 @@ def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSegments:
     return HomeSegments(in_order(data.segments.values()), metrics.listened)
 
 
+# Of composed homes, 100 of 100 ranges of coughing hold in the night, but 38 of household sounds.
+RANGED_AT_NIGHT = frozenset(WORRYING)
 _RISING = 4  # local hour; earlier sound belongs to the night
 HOUR = 60 * MINUTE
 MOST = 0.75  # minimum covered share for a reported 0, and for comparisons of days
@@ -284,10 +270,7 @@ class DayMetrics:
 
     @property
     def logged(self) -> Spans:
-        """The part of the day from the first log to the last one; may have no length.
-
-        All of it if less than a minute lacks.
-        """
+        """The part of the day that has logs, if any; all of it if less than a minute lacks."""
         (start,), (end,) = self.span
         first, last = (min(max(time, start), end) for time in self.logs)
         first = start if first - start < MINUTE else first
@@ -389,8 +372,14 @@ class DayMetrics:
         return self.home.minutes.between(self.span).uncounted_events(name)
 
     def count_in(self, name: str, span: Spans) -> Count:
-        """Return the number of events of a class that begin in a span of this day or its night."""
-        return self.home.minutes.between(span).count(name, self.home.rates.get(name))
+        """Return the number of events of a class that begin in a span of this day or its night.
+
+        In the night only `RANGED_AT_NIGHT` classes have a range: for others, minutes checked at any
+        time say too little of how often a label of a quiet night is right.
+        """
+        is_ranged = span is not self.night or name in RANGED_AT_NIGHT
+        rates = self.home.rates.get(name) if is_ranged else None
+        return self.home.minutes.between(span).count(name, rates)
 
     @property
     def sound(self) -> Duration | None:
@@ -500,7 +489,6 @@ def _length(spans: Spans) -> Duration:
     return Duration(spans.length / MINUTE)
 
 
-_NO_EVENTS = {SILENCE, TELEVISION, UNKNOWN}
 _BEFORE = 3600 * NANOSECONDS  # an event that goes on at midnight, and a television, begin earlier
 
 
@@ -551,16 +539,6 @@ def read_day_totals(logs: HomeLogs, day: date, zone: tzinfo) -> dict[str, EventT
     start, end = night_span(day, zone)[0], awake_span(day, zone)[1]
     data = read_home(logs, LIVE, start - _BEFORE, (start, end))
     return event_totals(metrics_of_home(data), start, end)
-
-
-def marked_classes(data: HomeData) -> list[str]:
-    """Return the classes that have marks of people only, because the model does not know them.
-
-    A report has no row for them, because they are not complete.
-    """
-    marked = {name for own in data.segments.values() for name in np.unique(own.labels).tolist()}
-    labelled = set(chain.from_iterable(data.classes.values()))
-    return ordered(marked - labelled - data.hidden - _NO_EVENTS)
 
 
 def home_events(

@@ -3,6 +3,7 @@
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 
@@ -25,7 +26,16 @@ from hearthlog.analyzer.logs.selection import LogSelection, array_names, select
 from hearthlog.analyzer.logs.spans import NONE, SEGMENT_DELAY, Spans, cut, joined
 from hearthlog.analyzer.marks.label_files import find_class_names
 from hearthlog.analyzer.marks.marks import Mark, ReviewedSpan, read_marks, read_reviewed
-from hearthlog.models.classes import CLASS_NAME, OF_EVERY_SCENARIO, OTHER, class_name
+from hearthlog.models.classes import (
+    CLASS_NAME,
+    OF_EVERY_SCENARIO,
+    OTHER,
+    SILENCE,
+    TELEVISION,
+    UNKNOWN,
+    class_name,
+    ordered,
+)
 from hearthlog.schemas.errors import LogError, Progress, ignore_progress
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.logs.columns import Columns, join, read_columns
@@ -339,3 +349,16 @@ def _add(
             has_room = name in counted or len(counted) < _MOST_CLASSES
             if length and has_room and class_name(name) not in left_out:
                 counted[name] += length
+
+
+_NO_EVENTS = {SILENCE, TELEVISION, UNKNOWN}
+
+
+def marked_classes(data: HomeData) -> list[str]:
+    """Return the classes that have marks of people only, because the model does not know them.
+
+    A report has no row for them, because they are not complete.
+    """
+    marked = {name for own in data.segments.values() for name in np.unique(own.labels).tolist()}
+    labelled = set(chain.from_iterable(data.classes.values()))
+    return ordered(marked - labelled - data.hidden - _NO_EVENTS)

@@ -1,7 +1,7 @@
 """HTML page of a report."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -216,7 +216,7 @@ def _page(data: ReportData, shown: ReportData, picture: PagePicture, **parts: An
         confused=_listed(data.confused),
         everywhere=_listed(everywhere),
         dash=_NOTHING,
-        unsure=any(_is_unsure(shown, name) for name in names),
+        unsure=_is_unsure(it for _, it in parts["overview"]),
         scenarios=[(plain(name), _scenario(data, name)) for name in data.scenarios],
         days_before=BASELINE_DAYS,
         interrai=_interrai(data, days),
@@ -326,10 +326,9 @@ def _occurs(data: ReportData, name: str) -> bool:
     return uncounted or now or bool(baseline and baseline[0].highest)
 
 
-def _is_unsure(data: ReportData, name: str) -> bool:
-    """Whether the page shows how many events of a class are not sure."""
-    counts = [count for day in data.days if (count := day.count(name)) is not None]
-    return any(count.unsure and count.range is None for count in counts)
+def _is_unsure(tables: Iterable[PageTable]) -> bool:
+    """Whether tables show what is not sure: those with a range do not."""
+    return any(re.search(r"\d\?", cell.text) for it in tables for row in it.rows for cell in row)
 
 
 def _has_count(data: ReportData, name: str) -> bool:

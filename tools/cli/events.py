@@ -85,10 +85,9 @@ def events(
     from hearthlog.analyzer.activity.daily_metrics import (
         event_totals,
         home_events,
-        marked_classes,
         metrics_of_home,
     )
-    from hearthlog.analyzer.activity.home_data import read_home
+    from hearthlog.analyzer.activity.home_data import marked_classes, read_home
     from hearthlog.analyzer.logs.local_time import iso_time, midnight
 
     home_logs, zone = home_and_zone(logs, timezone)

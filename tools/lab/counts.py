@@ -14,6 +14,7 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
+from hearthlog.analyzer.activity.daily_metrics import RANGED_AT_NIGHT
 from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
     events_of,
@@ -32,7 +33,7 @@ from hearthlog.schemas.messages.topics import LIVE
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.home.person import read_truth
 
-_DAY = 1440  # minutes
+_DAY, _EVENING, _NIGHT = 1440, 22 * 60, 9 * 60  # minutes
 _CHECKED = (5, 10, 30)
 _DRAWS = 4  # of minutes, for each day and number
 
@@ -48,7 +49,9 @@ class Home(NamedTuple):
     starts : np.ndarray [shape=(n,)], int64
         In nanoseconds of UTC.
     day : np.ndarray [shape=(n,)], int64
-        Number of the day that each is of, from 0 on.
+        Number of the 24 hours to 22:00 that each is of, from 0 on.
+    night : np.ndarray [shape=(n,)], bool
+        Whether each is of 22:00 to 07:00.
     labelled, true : dict of str to np.ndarray [shape=(n,)], int64
         By class: events that begin in each minute.
     sounding, television : np.ndarray [shape=(n,)], bool
@@ -56,6 +59,7 @@ class Home(NamedTuple):
 
     starts: Int64
     day: Int64
+    night: Bool
     labelled: dict[str, Int64]
     true: dict[str, Int64]
     sounding: Bool
@@ -67,7 +71,8 @@ class Checked(NamedTuple):
 
     Attributes
     ----------
-    home, name : str
+    home, name, part : str
+        `part` is of the day: all, night or day.
     minutes : int
         That were checked.
     labelled, true, low, high : int
@@ -75,6 +80,7 @@ class Checked(NamedTuple):
 
     home: str
     name: str
+    part: str
     minutes: int
     labelled: int
     true: int
@@ -120,9 +126,11 @@ def read_simulated(folder: Path) -> Home:
         events = {name: events_of(source, name).starts for name in names}
         return {name: np.diff(np.searchsorted(own, edges))[heard] for name, own in events.items()}
 
+    since_evening = np.flatnonzero(heard) + _DAY - _EVENING
     return Home(
         edges[:-1][heard],
-        np.flatnonzero(heard) // _DAY,
+        since_evening // _DAY,
+        since_evening % _DAY < _NIGHT,
         counts(labels),
         counts(truth),
         sounding_minutes(labels, edges)[heard],
@@ -145,7 +153,7 @@ def check_counts(home: Home, name: str) -> Iterator[Checked]:
     """
     whole = sum(int(events.sum()) + 1 for events in home.labelled.values())
     has_sound = home.sounding & ~home.television  # as in the queue of a review
-    for day in range(int(home.day[-1]) + 1):
+    for day in range(int(home.day[-1])):  # the last one ends at its second hour
         others = np.flatnonzero(home.day != day)
         for number in _CHECKED:
             for draw in range(_DRAWS):
@@ -178,12 +186,17 @@ def _range(
     rates = checks.rates(name, share)
     if rates is None:
         return
-    here = home.day == day
+    counted = home.day == day
     if name in ON_TELEVISION:
-        here &= ~home.television
-    low, high = rates.range_of(strata_of(home.labelled[name][here], home.sounding[here]))
-    labelled, true = int(home.labelled[name][here].sum()), int(home.true[name][here].sum())
-    yield Checked(folder, name, number, labelled, true, low, high)
+        counted &= ~home.television
+    parts = {"all": counted, "day": ~home.night, "night": home.night}
+    if name not in RANGED_AT_NIGHT:
+        del parts["night"]  # as labelled in a report
+    for part, of_part in parts.items():
+        here = counted & of_part
+        low, high = rates.range_of(strata_of(home.labelled[name][here], home.sounding[here]))
+        labelled, true = int(home.labelled[name][here].sum()), int(home.true[name][here].sum())
+        yield Checked(folder, name, part, number, labelled, true, low, high)
 
 
 def summary(checked: list[Checked]) -> Iterator[tuple[str, list[_Row]]]:
@@ -204,6 +217,7 @@ def summary(checked: list[Checked]) -> Iterator[tuple[str, list[_Row]]]:
         ("minutes checked", attrgetter("minutes")),
         ("home", attrgetter("home")),
         ("class", attrgetter("name")),
+        ("part of the day", attrgetter("part")),
     ):
         rows: list[_Row] = []
         for group in dict.fromkeys(map(key, checked)):
