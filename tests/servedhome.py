@@ -245,6 +245,13 @@ class Phone:
         browser.call("Page.addScriptToEvaluateOnNewDocument", source=_WATCH)
 
     def open(self, served, width=390, height=844, scheme="light"):
+        self.resize(width, height)
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self._browser.call("Emulation.setEmulatedMedia", features=features)
+        self._browser.call("Page.navigate", url=served.url)
+        patiently(self._is_there, bool)
+
+    def resize(self, width, height):
         self._browser.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -252,10 +259,6 @@ class Phone:
             deviceScaleFactor=1,
             mobile=False,
         )
-        features = [{"name": "prefers-color-scheme", "value": scheme}]
-        self._browser.call("Emulation.setEmulatedMedia", features=features)
-        self._browser.call("Page.navigate", url=served.url)
-        patiently(self._is_there, bool)
 
     def _is_there(self):
         with suppress(AssertionError):  # it is still going on from the entrance

@@ -77,22 +77,24 @@ def test_an_evening_with_its_own_column_fits(phone, show, width, language):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1366])
-def test_important_sounds_are_tall_and_unsure_ones_lower_and_hollow(phone, show, width, scheme):
+def test_what_is_not_sure_is_half_as_high_and_what_does_not_count_is_pale(
+    phone, show, width, scheme
+):
     show(width, scheme=scheme)
-    full = 18 if width < 700 else 30
+    full = 20 if width < 700 else 30
     kinds = (".marks:not(.pale, .unsure)", ".unsure")
-    sure, unsure = (phone.of(f"{HEIGHTS}('Coughing', '{kind}')") for kind in kinds)
-    assert sure == full
-    assert unsure == pytest.approx(0.55 * full, abs=1)
-    pale = phone.of(f"{HEIGHTS}('Telephone', '.pale')")
-    assert 0 < pale < unsure
-    sure, unsure = (phone.of(f"{HEIGHTS}('Household', '{kind}')") for kind in kinds)
-    assert max(sure, unsure) < full, "by how much of it sounds"
-    style = "(({fill, stroke}) => [fill, stroke])(getComputedStyle(document.querySelector('%s')))"
-    (solid, _), (hollow, outline) = (phone.of(style % f".lane {kind}") for kind in kinds)
-    ground = phone.of("getComputedStyle(document.querySelector('.ground')).fill")
-    assert hollow == ground != solid
-    assert outline not in {ground, "none"}
+    for words in ("Coughing", "Household"):
+        sure, unsure = (phone.of(f"{HEIGHTS}('{words}', '{kind}')") for kind in kinds)
+        assert (sure, unsure) == (full, full / 2)
+    assert phone.of(f"{HEIGHTS}('Telephone', '.pale')") == full
+    style = (
+        "(({fill, fillOpacity}) => [fill, fillOpacity])(getComputedStyle(%s.querySelector('%s')))"
+    )
+    lane = "[...document.querySelectorAll('.lane')].find((e) => e.textContent.startsWith('%s'))"
+    (solid, full_opacity), (other, _) = (phone.of(style % (lane % "Cou", each)) for each in kinds)
+    assert solid == other
+    assert float(full_opacity) == 1
+    assert 0.2 < float(phone.of(style % (lane % "Tel", ".pale"))[1]) < 0.6
     widths = phone.of(
         "[...document.querySelectorAll('.lane path.marks')].flatMap((path) =>"
         "[...path.getAttribute('d').matchAll(/h([\\d.]+)/g)].map((each) => Number(each[1])))"
@@ -120,8 +122,12 @@ def test_on_a_screen_names_and_counts_are_left_of_the_picture(phone, show, width
     )
     assert hours <= svg
     show(390, language)
-    name = phone.of("document.querySelector('.lane .name').getBoundingClientRect().left")
-    assert name > phone.of("document.querySelector('.ground').getBoundingClientRect().left")
+    drawn = phone.of(
+        "[...document.querySelectorAll('.lane')].map((e) =>"
+        "['.name', '.count', '.marks:last-of-type'].map((each) => e.querySelector(each).getBoundingClientRect())"
+        ".map(({ top, bottom, height }) => [top, bottom, height]))"
+    )
+    assert all(max(name[1], figure[1]) - 1 <= marks[0] for name, figure, marks in drawn if marks[2])
 
 
 def test_a_day_of_the_week_is_marked_and_its_title_lies_above_its_sentence(phone, show):
@@ -169,6 +175,31 @@ def test_the_hours_of_a_week_lie_below_those_of_its_days(phone, show):
         "}))(document.querySelector('#week svg').getBoundingClientRect())"
     )
     assert np.abs(np.array(places) - (np.array([0, 6, 12, 18]) + 2) / 26).max() < 0.01
+
+
+def test_a_day_of_the_week_has_a_lane_for_each_class_in_the_order_of_the_key(phone, show):
+    show(390)
+    phone.of("document.getElementById('show-week').click()")
+    phone.until("document.querySelectorAll('#week .axis span').length")
+    phone.until("document.querySelectorAll('#week .about')[1].textContent")
+    key = phone.of("[...document.querySelectorAll('#week .note .entry')].map((e) => e.innerText)")
+    assert [text.strip() for text in key] == [
+        *("Coughing", "Shouting", "Telephone ringing", "Talking", "Household sounds"),
+    ]
+    colours = "getComputedStyle({}).getPropertyValue('--class')"
+    lanes = phone.of(
+        "[...document.querySelectorAll('#week svg')].map((svg) =>"
+        "[...svg.querySelectorAll('.marks')].filter((e) => e.getAttribute('d'))"
+        f".map((e) => [Math.round(e.getBBox().y + e.getBBox().height), {colours.format('e')}]))"
+    )
+    of_key = phone.of(
+        f"[...document.querySelectorAll('#week .swatch')].map((e) => {colours.format('e')})"
+    )
+    assert len(lanes) == 2
+    for day in lanes:
+        assert day
+        for foot, colour in day:
+            assert of_key.index(colour) == foot / 8 - 1
 
 
 def test_a_past_day_says_why_a_class_with_a_count_of_0_has_a_mark(phone, show):

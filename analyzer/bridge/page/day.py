@@ -40,7 +40,6 @@ BIN = 120 * NANOSECONDS  # as in the picture of the report
 # What people ask about: the page states which of these no model of the home can tell.
 EXPECTED = frozenset({*IMPORTANT, SPEECH, *WATER})
 _HOUR = 3600 * NANOSECONDS
-_LEAST = 3  # of nine: lowest height of a bar, to keep short events visible
 _MOST_TIMES = 40  # of a count
 _MOST_GAPS = 6  # in words
 _SILENT = 60 * NANOSECONDS  # shortest gap that is drawn
@@ -256,7 +255,6 @@ def _lane(
         "perhaps": bool(sounds.doubtful),
         "words": name,
         "colour": colour_on_paper(label),
-        "important": label in IMPORTANT,
         "bars": bars(counted, day),
         "sure_bars": bars((e for e in counted if not home.is_unsure(e)), day),
         "unsure_bars": bars(filter(home.is_unsure, counted), day),
@@ -309,21 +307,16 @@ def _few_clocks(events: Sequence[SoundEvent], home: HomeDay) -> str:
 
 
 def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
-    """Return how much of each two minutes of a day events fill: one digit per bin, 9 for full.
+    """Return which two minutes of a day have some of events: a digit for each, 1 or 0.
 
     Empty without events in the day.
     """
-    filled = [0] * -(-(day.end - day.start) // BIN)
+    filled = ["0"] * -(-(day.end - day.start) // BIN)
     for event in (each for each in events if each.end > day.start):
         start, end = max(event.start, day.start), min(max(event.end, event.start + 1), day.end)
-        for place in range((start - day.start) // BIN, -(-(end - day.start) // BIN)):
-            first = day.start + place * BIN
-            filled[place] += min(end, first + BIN) - max(start, first)
-    if not any(filled):
-        return ""
-    return "".join(
-        str(max(min(-(-9 * part // BIN), 9), _LEAST)) if part else "0" for part in filled
-    )
+        first, last = (start - day.start) // BIN, -(-(end - day.start) // BIN)
+        filled[first:last] = ["1"] * (last - first)
+    return "".join(filled) if "1" in filled else ""
 
 
 _QUIET_SHARE = 0.01  # most of a quiet night with any sound

@@ -1,5 +1,5 @@
 // The page of the home: what sounds now, what works, days, and the stream of news.
-import { ask, colour, draw, inside, keep, make, place, say, send, set, write } from "./elements.js";
+import { ask, draw, keep, make, place, say, send, set, swatch, write } from "./elements.js";
 import { beginMarks, drawAgain, showDay, showMarks, spans } from "./picture.js";
 import { allowSound, showEvents, showRecurring, showSoundsOf } from "./sounds.js";
 
@@ -163,6 +163,19 @@ function step(by) {
   if (dates[at]) chooseDay(dates[at][0]);
 }
 
+// On a phone, what one is asked about follows the picture; the counts are below it.
+const wide = matchMedia("(min-width: 62rem)");
+
+function placeQuestions() {
+  const active = document.activeElement, questions = place("looked-at");
+  if (wide.matches) place("aside").prepend(questions);
+  else place("day").after(questions);
+  if (questions.contains(active)) active.focus({ preventScroll: true });
+}
+
+wide.addEventListener("change", placeQuestions);
+placeQuestions();
+
 function openWeek() {
   const week = place("week");
   week.hidden = !week.hidden;
@@ -179,6 +192,7 @@ async function showWeek() {
       about: make("span", { class: "about" }) };
     row.button = make("button", { type: "button", "data-date": date }, make("span", { class: "what" }, date === today?.date ? say("today") : words),
       row.svg, row.about);
+    set(row.svg, "height", 1);
     row.button.addEventListener("click", async () => {
       await chooseDay(date);
       place("date").scrollIntoView();
@@ -186,21 +200,29 @@ async function showWeek() {
     });
     return row;
   });
-  const important = (today?.rooms ?? []).flatMap(({ lanes }) => lanes).filter((lane) => lane.important);
-  const names = [...new Set(important.map(({ words: name }) => inside(name)))].join(", ");
-  const axis = make("li", { class: "axis", "aria-hidden": "true" });
-  week.replaceChildren(...rows.map((row) => make("li", {}, row.button)), axis,
-    ...(names ? [make("li", { class: "note" }, say("week rows", { classes: names }))] : []));
+  const axis = make("li", { class: "axis", "aria-hidden": "true" }), key = make("li", { class: "note", "aria-hidden": "true" });
+  week.replaceChildren(...rows.map((row) => make("li", {}, row.button)), axis, key);
   showPlaceOfDay();
+  const drawn = [];
   for (const row of rows) {
     const day = row.date === today?.date ? today : await readDay(row.date);
     if (week.hidden || !row.button.isConnected) return;
-    if (day.error) write(row.about, day.error);
-    else {
-      showDayOfWeek(row, day);
-      if (!axis.firstChild) axis.append(...hoursBelow(day));
-    }
+    write(row.about, day.error ?? day.sentence);
+    if (day.error) continue;
+    drawn.push([row, day]);
+    const classes = classesOf(drawn.map(([, each]) => each));
+    const longest = drawn.map(([, each]) => each).reduce((a, b) => (b.hours.length > a.hours.length ? b : a));
+    for (const each of drawn) showDayOfWeek(...each, classes, longest.hours.length);
+    axis.replaceChildren(...hoursBelow(longest));
+    key.replaceChildren(`${say("week rows")} `, ...classes.map(([, it]) => make("span", { class: "entry" }, " ", swatch(it.colour), it.words)));
   }
+}
+
+// The classes that sounded on some days, by label, in the order of the lanes.
+function classesOf(days) {
+  const lanes = days.flatMap(({ rooms }) => rooms).flatMap((room) => room.lanes);
+  const sounded = new Set(lanes.filter(({ bars, pale }) => bars || pale).map(({ label }) => label));
+  return [...new Map(lanes.map((lane) => [lane.label, lane]))].filter(([label]) => sounded.has(label));
 }
 
 function hoursBelow(day) {
@@ -211,22 +233,21 @@ function hoursBelow(day) {
   });
 }
 
-function showDayOfWeek(row, day) {
-  const width = Math.max(Math.floor(row.svg.getBoundingClientRect().width), 100);
-  const height = 36, upper = 19; // what needs a look is in a row of its own
-  const lanes = day.rooms.flatMap((room) => room.lanes).filter(({ bars, pale }) => bars || pale);
-  const now = day.now ?? 1;
-  set(row.svg, "viewBox", `0 0 ${width} ${height}`);
-  row.svg.replaceChildren(draw("path", { class: "shade", d: spans(day.nights, width, height) }),
-    ...day.rooms.map(({ gaps }) => draw("path", { fill: "url(#unheard)", d: spans(gaps, width, height) })),
-    draw("rect", { class: "future", x: now * width, width: (1 - now) * width, height }),
-    draw("path", { class: "line", d: `M0 ${upper}.5H${width}` }),
-    ...lanes.toReversed().flatMap((lane) => {
-      const [top, tall] = lane.important ? [1, upper - 1] : [upper + 1, height - upper - 1], paths = beginMarks();
-      showMarks(paths, lane, width, day.hours.length, top, tall);
+const LANE = 8, GAP = 1; // pixels of a class in a day of the week
+
+function showDayOfWeek(row, day, classes, mostHours) {
+  const full = Math.max(Math.floor(row.svg.getBoundingClientRect().width), 100), width = full * day.hours.length / mostHours;
+  const height = Math.max(classes.length, 1) * LANE + GAP, bands = [[0, height]];
+  set(row.svg, "viewBox", `0 0 ${full} ${height}`);
+  set(row.svg, "height", height);
+  row.svg.replaceChildren(draw("path", { class: "shade", d: spans(day.nights, width, bands) }),
+    ...day.rooms.map(({ gaps }) => draw("path", { fill: "url(#unheard)", d: spans(gaps, width, bands) })),
+    draw("path", { class: "future", d: day.now === null ? "" : spans([[day.now, 1]], width, bands) }),
+    ...day.rooms.flatMap((room) => room.lanes).flatMap((lane) => {
+      const at = classes.findIndex(([label]) => label === lane.label), paths = beginMarks();
+      if (at >= 0) showMarks(paths, lane, width, day.hours.length, at * LANE + GAP, LANE - GAP);
       return paths;
     }));
-  write(row.about, day.sentence);
 }
 
 place("dates").addEventListener("change", () => chooseDay(place("dates").value));

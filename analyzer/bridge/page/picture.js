@@ -2,46 +2,41 @@
 import { breakable, colour, count, counted, draw, inside, keep, make, place, say, send, set, spoken, swatch, write } from "./elements.js";
 import { showEntries } from "./sounds.js";
 
-const LANE = 36, NAME = 15, GAP = 3, HOURS = 20, NARROWEST = 4; // pixels
+const LANE = 36, NAME = 18, STRIP = 20, GAP = 3, HOURS = 20, NARROWEST = 4; // pixels; on a phone, names are above their strips
 const WIDE = 700; // pixels of the page, from which on the names of lanes are left of the picture
 const MOST_NAME = 0.3; // of the width
 const BINS_AN_HOUR = 30;
 let open = null; // the lane or count whose times are shown
 
-// Bins of one height in a row are one mark, and the narrowest is seen. A share of the height is that
-// of each mark; without it, it is how much of the bin is filled.
+// Bins in a row are one mark, and the narrowest is seen.
 function marks(bars, width, hours, top, height, share) {
   const step = width / (hours * BINS_AN_HOUR), foot = top + height;
-  const shares = [...bars].map((digit) => digit === "0" ? 0 : share ?? 0.2 + 0.8 * digit / 9);
-  let path = "";
-  for (let i = 0; i < shares.length;) {
-    let end = i + 1;
-    while (end < shares.length && shares[end] === shares[i]) end += 1;
-    if (shares[i]) {
-      path += `M${(i * step).toFixed(1)} ${foot}V${(foot - height * shares[i]).toFixed(1)}h${
-        Math.max((end - i) * step, NARROWEST).toFixed(1)}V${foot}Z`;
-    }
-    i = end;
-  }
-  return path;
+  return [...bars.matchAll(/1+/g)].map(({ 0: { length }, index }) =>
+    `M${(index * step).toFixed(1)} ${foot}V${(foot - height * share).toFixed(1)}h${
+      Math.max(length * step, NARROWEST).toFixed(1)}V${foot}Z`).join("");
 }
 
-// The marks of a class, from the back: what does not count, what is not sure, and the rest. What needs
-// a look is an event, however short it is: its height only tells these three apart.
-const KINDS = [["pale", "marks pale", 0.3], ["unsure_bars", "marks unsure", 0.55], ["sure_bars", "marks", 1]];
+// The marks of a class, from the back, as in the report: pale what does not count, half as high what
+// is not sure, and the rest.
+const KINDS = [["pale", "marks pale", 1], ["unsure_bars", "marks unsure", 0.5], ["sure_bars", "marks", 1]];
 
 export const beginMarks = () => KINDS.map(([, kind]) => draw("path", { class: kind }));
 
 export function showMarks(paths, lane, width, hours, top, height) {
   KINDS.forEach(([key, , share], index) => {
-    set(paths[index], "d", marks(lane[key], width, hours, top, height, lane.important ? share : undefined));
+    set(paths[index], "d", marks(lane[key], width, hours, top, height, share));
     colour(paths[index], lane.colour);
   });
 }
 
-export function spans(list, width, height) {
-  return list.map(([a, b]) => `M${a * width} 0H${b * width}V${height}H${a * width}Z`).join("");
+// Spans of a day in bands of the picture, each with its top and height.
+export function spans(list, width, bands) {
+  return bands.flatMap(([top, height]) =>
+    list.map(([a, b]) => `M${a * width} ${top}H${b * width}v${height}H${a * width}Z`)).join("");
 }
+
+const lines = (places, width, bands) =>
+  bands.flatMap(([top, height]) => places.map((where) => `M${where * width} ${top}v${height}`)).join("");
 
 function timesOf(it, index) {
   const { times, before } = it.times[index];
@@ -176,20 +171,23 @@ function beginRoom(name, isAlone) {
   const room = { name, lanes: [], sounded: [], drawn: [], rows: [], where: isAlone ? "" : name };
   room.nights = draw("path", { class: "shade" });
   room.unheard = draw("path", { fill: "url(#unheard)" });
-  room.future = draw("rect", { class: "future" });
+  room.future = draw("path", { class: "future" });
+  room.hourLines = draw("path", { class: "line" });
   room.moment = draw("path", { class: "moment" });
   room.hours = draw("g", { class: "hours", "aria-hidden": "true" });
   room.group = draw("g");
-  room.ground = draw("rect", { class: "ground", rx: 6 });
+  room.ground = draw("path", { class: "ground" });
   room.plot = draw("g", {}, room.ground, room.nights, room.unheard,
-    room.future, room.moment, room.group, room.hours); // the counts lie over the line of now
+    room.future, room.hourLines, room.moment, room.group, room.hours); // the counts lie over the line of now
   room.svg = draw("svg", { class: "picture", role: "group" }, room.plot);
   room.heads = make("tr");
   room.body = make("tbody");
-  room.caption = make("caption", { class: "hidden" });
-  room.table = make("table", {}, room.caption, make("thead", {}, room.heads), room.body);
+  room.table = make("table", { "aria-label": isAlone ? say("often") : say("often in", { room: name }) },
+    make("thead", {}, room.heads), room.body);
   room.note = make("p", { class: "note" });
-  room.elements = [...(isAlone ? [] : [make("h3", {}, name)]), room.svg, room.note, room.table];
+  const heading = () => isAlone ? [] : [make("h3", {}, name)];
+  room.pictures = [...heading(), room.svg, room.note];
+  room.tables = [...heading(), room.table];
   return room;
 }
 
@@ -217,7 +215,6 @@ function showRoom(room, { gaps, unheard, lanes }, day) {
   room.lanes = lanes;
   room.sounded = lanes.filter(({ bars, pale }) => bars || pale);
   const full = Math.max(Math.floor(room.svg.getBoundingClientRect().width), 100);
-  const height = Math.max(room.sounded.length, 1) * LANE, whole = height + HOURS;
   while (room.drawn.length < room.sounded.length) {
     const lane = beginLane(room, room.drawn.length);
     room.drawn.push(lane);
@@ -225,42 +222,41 @@ function showRoom(room, { gaps, unheard, lanes }, day) {
   }
   while (room.drawn.length > room.sounded.length) room.drawn.pop().element.remove();
   const left = showNames(room, full), width = full - left;
+  const tall = left ? LANE : NAME + STRIP + GAP, head = left ? GAP : NAME, strip = left ? LANE - 2 * GAP : STRIP;
+  const height = Math.max(room.sounded.length, 1) * tall, whole = height + HOURS;
+  const bands = left || !room.sounded.length ? [[0, height]] : room.sounded.map((_, number) => [number * tall + head, strip]);
   set(room.plot, "transform", `translate(${left} 0)`);
   set(room.svg, "viewBox", `0 0 ${full} ${whole}`);
   set(room.svg, "height", whole);
-  set(room.svg, "aria-label", [say("picture", { day: [room.where, day.title].filter(Boolean).join(", ") }), unheard].filter(Boolean).join(" "));
-  for (const [name, value] of [["width", width], ["height", height]]) set(room.ground, name, value);
-  set(room.nights, "d", spans(day.nights, width, height));
-  set(room.unheard, "d", spans(gaps, width, height));
-  const now = day.now === null ? 1 : day.now;
-  for (const [name, value] of [["x", now * width], ["width", (1 - now) * width], ["height", height]]) {
-    set(room.future, name, value);
-  }
-  set(room.moment, "d", day.now === null ? "" : `M${now * width} 0V${height}`);
-  const head = left ? GAP : NAME; // marks do not lie below a name
+  set(room.svg, "aria-label", say("picture", { day: [room.where, day.title].filter(Boolean).join(", ") }));
+  set(room.ground, "d", spans([[0, 1]], width, bands));
+  set(room.nights, "d", spans(day.nights, width, bands));
+  set(room.unheard, "d", spans(gaps, width, bands));
+  set(room.future, "d", day.now === null ? "" : spans([[day.now, 1]], width, bands));
+  set(room.moment, "d", day.now === null ? "" : lines([day.now], width, bands));
   room.sounded.forEach((it, number) => {
-    const lane = room.drawn[number], top = number * LANE;
+    const lane = room.drawn[number], top = number * tall;
     set(lane.element, "aria-label", it.told);
-    for (const [name, value] of [["x", -left], ["y", top], ["width", full], ["height", LANE]]) set(lane.hit, name, value);
-    set(lane.line, "d", number ? `M${-left} ${top}H${width}` : "");
+    for (const [name, value] of [["x", -left], ["y", top], ["width", full], ["height", tall]]) set(lane.hit, name, value);
+    set(lane.line, "d", number && left ? `M${-left} ${top}H${width}` : "");
     if (open?.button === lane.element && lane.label !== it.label) close(); // its times would be those of another class
     lane.label = it.label;
-    showMarks(lane.marks, it, width, day.hours.length, top + head, LANE - head - GAP);
-    const places = left ? [[lane.name, -left, 15], [lane.figure, -left, 30]] : [[lane.name, 6, 12.5], [lane.figure, width - 6, 12.5]];
+    showMarks(lane.marks, it, width, day.hours.length, top + head, strip);
+    const places = left ? [[lane.name, -left, 15], [lane.figure, -left, 30]] : [[lane.name, 0, 13], [lane.figure, width, 13]];
     for (const [text, x, y] of places) { set(text, "x", x); set(text, "y", top + y); }
   });
-  const every = width < 520 ? 4 : 2;
-  room.hours.replaceChildren(...day.hours.filter(([, hour]) => hour % every === 0).map(([where, hour]) =>
+  const every = width < 420 ? 4 : 2, written = day.hours.filter(([, hour]) => hour % every === 0);
+  set(room.hourLines, "d", lines(written.map(([where]) => where).filter(Boolean), width, bands));
+  room.hours.replaceChildren(...written.map(([where, hour]) =>
     draw("text", { x: Math.min(Math.max(where * width, 8), width - 8), y: height + 14 }, String(hour).padStart(2, "0"))));
-  write(room.note, room.sounded.length ? "" : say("nothing"));
-  room.note.hidden = room.sounded.length > 0;
+  write(room.note, [room.sounded.length ? "" : say("nothing"), unheard].filter(Boolean).join(" "));
+  room.note.hidden = !room.note.textContent;
   showTable(room, day);
   if (open && !open.button.isConnected) close();
 }
 
 function showTable(room, day) {
   keep(room.heads, [say("sound"), ...day.columns, say("last")], () => make("th", { scope: "col" }), write);
-  write(room.caption, room.where ? say("often in", { room: room.where }) : say("often"));
   room.table.hidden = !room.lanes.length;
   const key = JSON.stringify([day.columns.length, room.lanes.map(({ label, words }) => [label, words])]);
   if (room.key !== key) { // else what somebody reads there stays
@@ -279,7 +275,7 @@ export function showDay(day) {
   const isNew = shown?.date !== day.date;
   shown = day;
   if (isNew) close();
-  place("legend").hidden = !day.rooms.length;
+  place("legend").hidden = place("counts").hidden = !day.rooms.length;
   write(place("missing"), day.missing);
   place("missing").hidden = !day.missing;
   place("key-unheard").hidden = !day.rooms.some(({ gaps }) => gaps.length);
@@ -290,7 +286,8 @@ export function showDay(day) {
     close();
     roomsOf = key;
     rooms = day.rooms.map(({ room }) => beginRoom(room, day.rooms.length === 1));
-    place("rooms").replaceChildren(...rooms.flatMap(({ elements }) => elements));
+    place("rooms").replaceChildren(...rooms.flatMap(({ pictures }) => pictures));
+    place("tables").replaceChildren(...rooms.flatMap(({ tables }) => tables));
   }
   day.rooms.forEach((room, index) => showRoom(rooms[index], room, day));
   if (open) showTimes();

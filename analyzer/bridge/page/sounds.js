@@ -1,5 +1,5 @@
 // Lists of sounds: what they were, what they really were, and their kept sound.
-import { ask, breakable, count, counted, inside, keep, make, place, say, send, spoken, swatch, write } from "./elements.js";
+import { ask, breakable, count, counted, inside, keep, language, make, place, say, send, spoken, swatch, write } from "./elements.js";
 
 const REST = 8000; // milliseconds without a touch, after which a list may change
 const SEPARATOR = "\u00a0· "; // ends a line, and begins none
@@ -14,6 +14,7 @@ const lists = { look: new Map(), events: new Map(), recurring: new Map() }; // i
 const playable = new Set(), requested = new Map(); // ids; when each was asked for
 const buttons = new Set();
 let playing = null, audio = null;
+const playProblem = make("p", { class: "problem", role: "alert" }); // of the sound that was to be played last
 
 export function allowSound(isAllowed) { isSoundAllowed = isAllowed; }
 
@@ -59,7 +60,7 @@ async function play(button, id) {
   const isSame = playing?.button === button;
   stop();
   if (isSame) return;
-  write(place("play-problem"), "");
+  playProblem.remove();
   audio ??= new AudioContext();
   const own = playing = { button };
   showButtons();
@@ -75,7 +76,8 @@ async function play(button, id) {
     own.source.start();
   } catch (error) {
     if (playing === own) stop();
-    write(place("play-problem"), error.name === "Error" && error.message ? error.message : say("no sound"));
+    write(playProblem, error.name === "Error" && error.message ? error.message : say("no sound"));
+    button.closest("li")?.append(playProblem);
   }
 }
 
@@ -105,8 +107,8 @@ function form(item, { legend, choices, save }) {
     const answer = await save(label);
     button.disabled = false;
     if (answer.error) { write(problem, answer.error); return; }
-    showAnswer(item, answer.said);
     item.isAnswered = true;
+    showAnswer(item, answer.said);
     close();
   });
   cancel.addEventListener("click", close);
@@ -120,14 +122,21 @@ function form(item, { legend, choices, save }) {
 function showAnswer(item, said) {
   write(item.said, said);
   item.element.classList.toggle("reviewed", Boolean(said) && item.isReviewable);
+  const isAsked = item.isReviewable && item.entry.look && !item.entry.doubtful && !said;
+  write(item.prompt, say(isAsked ? "no" : "that was"));
+  if (!item.yes) return;
+  if (!isAsked && document.activeElement === item.yes) item.summary.focus();
+  item.yes.hidden = !isAsked;
 }
 
-// Sounds that need a look: of each class the newest, and the others behind one tap.
-const TELEVISION = "television", GREY = [150, 158, 170]; // the fold of what does not count, of all classes
+// Sounds of which one is asked whether they are right: of each class the newest, and the others behind
+// one tap, as are those that were answered.
+const TELEVISION = "television", ANSWERED = "answered", GREY = [150, 158, 170]; // the fold of what does not count, of all classes
 const unfolded = new Set(); // keys of folds
 const sum = (numbers) => numbers.reduce((total, each) => total + each, 0);
 
-function folded(look) {
+function folded(every) {
+  const done = every.filter(({ id, said }) => said && !lists.look.get(id)?.isAnswered), look = every.filter((each) => !done.includes(each));
   const entries = [], seen = new Map();
   for (const entry of look) {
     const same = entry.doubtful ? [] : look.filter(({ label, doubtful, room }) => label === entry.label && room === entry.room && !doubtful);
@@ -142,6 +151,11 @@ function folded(look) {
       entries.push({ id: `fold ${key}`, key, colour: entry.colour, words: entry.words, often, inWords, about },
         ...earlier.map((each) => ({ ...each, isFolded: !unfolded.has(key) })));
     }
+  }
+  if (done.length) {
+    entries.push({ id: `fold ${ANSWERED}`, key: ANSWERED, colour: GREY, words: say(look.length ? "answered" : "all answered"),
+      often: sum(done.map(({ ids }) => ids.length)).toLocaleString(language), about: done.map((each) => each.time).join(", ") },
+    ...done.map((each) => ({ ...each, isFolded: !unfolded.has(ANSWERED) })));
   }
   return entries;
 }
@@ -197,12 +211,13 @@ function begin(question) {
     what: make("p", { class: "what" }),
     about: make("p", { class: "about" }),
     said: make("p", { class: "said", "aria-live": "polite" }),
-    summary: make("summary", {}, say("that was")),
+    prompt: make("span", {}, say("that was")),
+    summary: make("summary"),
     isReviewable: false,
   };
   item.details = make("details", {}, item.summary);
   item.element = make("li", {}, make("div", {}, item.what, item.about, item.said), item.details);
-  item.summary.append(item.hint = make("span", { class: "hidden" }));
+  item.summary.append(item.prompt, item.hint = make("span", { class: "hidden" }));
   item.details.addEventListener("toggle", () => {
     if (item.details.open && item.details.children.length === 1) item.details.append(form(item, question(item)));
     if (!item.details.open) item.details.querySelector("form")?.remove();
@@ -237,7 +252,7 @@ function beginBout(entry) {
   const item = begin(() => {
     const { id, label, words, time, doubtful, isSingle } = item.entry;
     const others = classes.filter(([name]) => doubtful || name !== label);
-    const isClear = !doubtful && label !== "unknown";
+    const isClear = !doubtful && label !== "unknown" && item.yes.hidden; // else there is a button for it
     return {
       legend: say("question", { class: words, time }),
       choices: [...(isClear ? [[label, say("right", { class: words })]] : []), ...others, ["television", say("television")], ["silence", say("silence")]],
@@ -248,8 +263,20 @@ function beginBout(entry) {
   item.isReviewable = true;
   item.what.append(...(entry.isSingle ? [entry.time] : [swatch(entry.colour), breakable(entry.words)]), item.often = make("span", { class: "often" }));
   item.play = playButton(() => item.entry.ids, () => `${item.entry.words}, ${item.entry.time}`);
-  item.details.before(item.play);
+  item.yes = make("button", { type: "button", class: "quiet yes", hidden: "" }, say("yes"), item.yesHint = make("span", { class: "hidden" }));
+  item.yes.addEventListener("click", () => confirm(item));
+  item.details.before(item.play, item.yes);
   return item;
+}
+
+// Marks a sound with the class that it already has.
+async function confirm(item) {
+  item.yes.disabled = true;
+  const { said, error } = await send("mark", { event: item.entry.id, label: item.entry.label });
+  item.yes.disabled = false;
+  if (error) { write(item.said, error); return; }
+  item.isAnswered = true;
+  showAnswer(item, said);
 }
 
 function showBout(item, entry) {
@@ -258,7 +285,9 @@ function showBout(item, entry) {
   write(item.often, entry.times ? `${SEPARATOR}${entry.times}` : "");
   write(item.about, entry.isSingle ? entry.about : [entry.time, entry.length, entry.sure, entry.beside, entry.room].filter(Boolean).join(SEPARATOR));
   if (entry.said || !item.isAnswered) showAnswer(item, entry.said); // the log has an answer later
-  write(item.hint, ` (${[entry.words, entry.time, entry.room].filter(Boolean).join(", ")})`);
+  const hint = ` (${[entry.words, entry.time, entry.room].filter(Boolean).join(", ")})`;
+  write(item.hint, hint);
+  write(item.yesHint, hint);
 }
 
 // The entries of single events, such as those of a count.
@@ -284,13 +313,21 @@ function showList(events) {
   showPlayable(events.flatMap(({ ids }) => ids));
 }
 
-// Whether nobody reads, points at or answers in the lists just now.
+// Whether nobody reads, points at or answers in the lists just now, or in what they would move.
 function isAtRest() {
-  const section = place("sounds");
-  if (section.contains(document.activeElement) || section.querySelector("details[open]")) return false;
-  if (matchMedia("(hover: hover)").matches && section.matches(":hover")) return false;
-  const { top, bottom } = section.getBoundingClientRect();
-  return (top > innerHeight || bottom < 0 || top >= 0) && Date.now() - touched > REST;
+  const sections = [place("looked-at"), place("sounds")];
+  if (document.querySelector(".listed :focus-visible, .listed details[open], #counts .panel")) return false;
+  if (matchMedia("(hover: hover)").matches && sections.some((each) => each.matches(":hover"))) return false;
+  const isReadFromItsTop = ({ top, bottom }) => top > innerHeight || bottom < 0 || top >= 0;
+  return sections.every((each) => isReadFromItsTop(each.getBoundingClientRect())) && Date.now() - touched > REST;
+}
+
+// What was answered goes behind its tap when nobody looks.
+function foldAnswered() {
+  const answered = [...lists.look.values()].filter(({ isAnswered, entry }) => isAnswered && entry?.said);
+  if (!answered.length || !isAtRest()) return;
+  for (const item of answered) item.isAnswered = false;
+  showList(shownEvents);
 }
 
 function showLatest(isWanted) {
@@ -337,10 +374,14 @@ export function showSoundsOf(events) {
 for (const kind of ["touchstart", "wheel", "keydown"]) {
   addEventListener(kind, () => { touched = Date.now(); }, { passive: true });
 }
-setInterval(() => { if (!place("new-sounds").hidden) showLatest(false); }, 2000);
+setInterval(() => {
+  if (!place("new-sounds").hidden) showLatest(false);
+  foldAnswered();
+}, 2000);
 place("new-sounds").addEventListener("click", () => {
+  const isAsked = latest.some(({ id, look }) => look && !shownIds?.has(id));
   showLatest(true);
-  const section = place("sounds");
+  const section = place(isAsked ? "looked-at" : "sounds");
   if (section.getBoundingClientRect().top < 0) section.scrollIntoView();
 });
 

@@ -150,6 +150,7 @@ _PAUSE = 300 * NANOSECONDS  # longest between two events of a bout
 _MOMENT = 60 * NANOSECONDS  # longest between two doubtful events of a bout
 _MOST_OF_BOUT = 50  # events
 _MOST_DOUBTFUL = 4  # bouts of a day
+_LONG = 60 * NANOSECONDS  # a shorter event is shown with its start alone
 
 
 class Bout(NamedTuple):
@@ -278,7 +279,8 @@ class ShownBouts(NamedTuple):
         count = len(bout.events)
         start = words.when(first.start, self.now, self.zone, is_past=self.is_past)
         end = clock(bout.end, self.zone)
-        is_range = count > 1 and end != clock(first.start, self.zone)
+        is_long = count > 1 or bout.end - first.start >= _LONG
+        is_range = is_long and end != clock(first.start, self.zone)
         corrections = [text for text in map(self.correction, bout.events) if text]
         length = words.length(sum(event.seconds for event in bout.events))
         return {

@@ -124,7 +124,7 @@ def _page(home: Home) -> Image.Image:
 
         show("en")
         seen = [browser.picture()]
-        browser.evaluate('document.getElementById("sounds").scrollIntoView()')
+        browser.evaluate('document.getElementById("looked-at").scrollIntoView()')
         seen.append(browser.picture())
         show("de", dark=True)
         browser.evaluate('document.getElementById("day-before").click()')
