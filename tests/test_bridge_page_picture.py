@@ -124,7 +124,8 @@ def test_on_a_screen_names_and_counts_are_left_of_the_picture(phone, show, width
     show(390, language)
     drawn = phone.of(
         "[...document.querySelectorAll('.lane')].map((e) =>"
-        "['.name', '.count', '.marks:last-of-type'].map((each) => e.querySelector(each).getBoundingClientRect())"
+        "['.name', '.count', '.marks:last-of-type']"
+        ".map((each) => e.querySelector(each).getBoundingClientRect())"
         ".map(({ top, bottom, height }) => [top, bottom, height]))"
     )
     assert all(max(name[1], figure[1]) - 1 <= marks[0] for name, figure, marks in drawn if marks[2])
