@@ -315,7 +315,8 @@ def test_of_a_day_that_was_hardly_heard_nothing_is_said_not_to_have_been(tmp_pat
     page = page_of(tmp_path, tmp_path)
     rows, text = rows_of(page), text_of(page)
     assert rows["Coughing"] == ["1", "12:05", "under 1 min"]
-    for title in ("Longest quiet stretch, 07:00 to 22:00", "Sound from", "Behaviour: shouting"):
+    longer = ("First longer sounds a minute or more in ten", "Last longer sounds a minute")
+    for title in ("Longest quiet stretch, 07:00 to 22:00", *longer, "Behaviour: shouting"):
         assert title not in rows
     assert "Shouting" not in rows
     assert "Too little was recorded to tell whether there was any of these: crying, shout" in text
@@ -688,7 +689,7 @@ def test_how_long_a_sound_lasted_is_apart_from_a_television(tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     week = page_of(tmp_path / "logs", other, first=DAY - timedelta(days=6), days=7)
-    assert f"<small>{apart}</small></th>" in week
+    assert f"0 min<small>{apart}</small></td>" in week
 
 
 def test_a_name_that_nobody_gave_is_not_shown(tmp_path):
@@ -715,9 +716,8 @@ def test_talking_and_music_beside_a_television_are_in_no_count_no_length_and_no_
     other = tmp_path / "other"
     other.mkdir()
     week = rows_of(page_of(tmp_path / "logs", other, DAY - timedelta(days=6), 7))
-    assert week["Talking 60 beside a television"] == ["1"]
-    assert week[f"Talking {minutes}"] == ["2 min"]
-    assert week[f"Music {minutes}"] == ["0 min"]
+    assert week["Talking"] == ["1 60 beside a television", f"2 min {minutes}"]
+    assert week["Music"] == ["0 60 beside a television", f"0 min {minutes}"]
 
 
 def test_water_and_a_sound_of_the_home_itself_count_beside_a_television_in_number_and_length(
@@ -748,8 +748,8 @@ def test_marks_of_which_the_model_is_not_sure_are_half_as_high(tmp_path):
     write_day(tmp_path / "logs", DAY, [*coughs, (at("18:00"), 1800, "objects_activity", 0.5)])
     page = page_of(tmp_path / "logs", tmp_path)
     assert '<path class="short" d="M720 0v1"/>' in page
-    assert '<path class="short low" d="M1020 0.5v0.5"/>' in page
-    assert '<path class="long low" d="M1200 0.5h30v0.5h-30z"/>' in page
+    assert '<g class="low"><path class="long" d="M1200 0.5h30v0.5h-30z"/>' in page
+    assert '<path class="short" d="M1020 0.5v0.5"/></g>' in page
     assert "half as high: not sure" in page
     assert ">Coughing 2; Household sounds 1. There are logs only from 00:00 on.</desc>" in page
 
@@ -838,10 +838,59 @@ def test_a_week_of_one_recorded_day_has_the_sentence_of_that_day(tmp_path):
     )
 
 
-def test_without_a_time_zone_the_page_says_what_to_set(tmp_path):
+def test_what_to_set_and_which_commands_to_use_is_at_the_end_for_whoever_set_it_up(tmp_path):
     write_day(tmp_path / "logs", DAY)
     page = page_of(tmp_path / "logs", tmp_path)
-    assert "Times are those of UTC; for those of the home, set <code>timezone</code>" in page
+    own, _, setup = page.partition("<h2>For whoever set this up</h2>")
+    assert "Times are UTC.</p>" in own
+    assert "says nothing about them: toilet flush, shower and water tap.</p>" in own
+    assert "<code>" not in own
+    assert "set <code>timezone</code>" in setup
+    assert "run <code>hearthlog annotate import</code>; then <code>hearthlog train" in setup
+    assert "<h2>" not in setup
+
+
+def test_a_home_that_is_set_up_and_whose_model_knows_all_has_no_such_part(tmp_path):
+    classes = [*GENERAL, "flushing_water", "shower", "tap_water"]
+    write_day(tmp_path / "logs", DAY, classes=classes, timezone="Europe/Vienna")
+    output = tmp_path / "page.html"
+    zone = ZoneInfo("Europe/Vienna")
+    make_report(find_home_logs([tmp_path / "logs"]), Period(DAY, 1, zone), output)
+    assert "Times are those of Europe/Vienna.</p>" in output.read_text()
+    assert "set this up" not in output.read_text()
+
+
+def test_the_first_and_the_last_longer_sounds_are_not_called_the_first_and_the_last_sound(tmp_path):
+    short = [(at(t), 20, "objects_activity", 0.9) for t in ("07:30", "22:30")]
+    talking = [(at(t), 90, "speech", 0.9) for t in ("12:00", "19:01")]
+    write_day(tmp_path / "logs", DAY, [*short, *talking])
+    for days in (1, 7):
+        page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=days - 1), days)
+        rows = rows_of(page)
+        assert rows["First longer sounds a minute or more in ten"] == ["12:00"]
+        assert rows["Last longer sounds a minute or more in ten"] == ["19:09"]
+        assert "There may be shorter sounds before and after them." in text_of(page)
+
+
+def test_what_a_day_says_of_its_night_names_the_morning_it_ends_on(tmp_path):
+    write_day(tmp_path / "logs", DAY, [(at("03:00"), 2, "coughing", 0.9)])
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert "<h2>Night to Sunday, 22:00 to 07:00</h2>" in page
+    (heads,) = re.findall(r"<tr><th scope=.col.>Sound.*?</tr>", page)
+    assert "Night to Sunday, 22\N{EN DASH}07" in re.sub("<.*?>", "", heads)
+    assert "In the night to Sunday, 22:00 to 07:00: 1 bout of coughing" in page
+    assert not re.search(r">Night[< ](?!to Sunday)", page), "no other night"
+
+
+def test_times_of_sounds_are_those_at_which_they_began(tmp_path):
+    busy = [(at("08:00") + 3600 * n, 240, "objects_activity", 0.9) for n in range(6)]
+    shown = [(at("16:00"), 240, "coughing", 0.9)]
+    write_day(tmp_path / "logs", DAY, [*busy, *shown])
+    page = page_of(tmp_path / "logs", tmp_path)
+    assert rows_of(page)["Household sounds"][3] == "first 08:00, last 13:00"
+    assert rows_of(page)["Coughing"][3] == "16:00"
+    assert "1 bout of coughing by day (16:00)." in page
+    assert "The time of a sound is that of its beginning." in page
 
 
 # The page
@@ -997,10 +1046,11 @@ def test_a_page_needs_nothing_but_itself(flat_page):
     assert "@import" not in flat_page
     assert outline.headings == [
         "What was heard",
-        "Night",
+        "Night to Sunday, 22:00 to 07:00",
         "Quiet and activity",
         "For the interRAI Home Care assessment",
         "How to read this",
+        "For whoever set this up",
     ]
 
 
@@ -1054,6 +1104,32 @@ def test_a_week_has_its_seven_days_and_their_total(flat, tmp_path):
     days = [day_of(home, DAY - timedelta(days=n), UTC) for n in range(7)]
     total = sum((day.count("shower") for day in days), Count())
     assert rows_of(page)["Shower"][-1] == total.show(total.middle)
+
+
+def test_a_week_of_one_logged_day_has_one_table_of_sounds_without_the_day(tmp_path):
+    talking = [(at("12:00"), 90, "speech", 0.9)]
+    write_day(tmp_path / "logs", DAY, [*talking, (at("14:00"), 2, "coughing", 0.9)])
+    page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
+    rows = rows_of(page)
+    assert rows["Sound"] == ["How often", "How long"]
+    assert rows["Recorded"] == ["92 %", ""]
+    assert (rows["Talking"], rows["Coughing"]) == (["1", "2 min"], ["1", "under 1 min"])
+    assert page.count('scope="col">Sun 1<') == 2, "of the night, and of quiet and activity"
+
+
+def test_sounds_of_less_than_a_minute_a_day_have_no_row_of_lengths_in_a_week(tmp_path):
+    for ago in (0, 1):
+        day = DAY - timedelta(days=ago)
+        events = [(at("12:00"), 90, "speech", 0.9), (at("14:00"), 2 + ago, "coughing", 0.9)]
+        write_day(tmp_path / "logs", day, events)
+    page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
+    often, _, long = page.partition("<h2>How long it was heard</h2>")
+    long = long.partition("<h2>")[0]
+    assert "Recorded" in often, "once"
+    assert "Recorded" not in long
+    assert "Coughing" not in long
+    assert "<p>Under a minute a day: coughing.</p>" in long
+    assert rows_of(long)["Talking"] == ["2 min", "2 min", "3 min"]
 
 
 def test_the_same_logs_give_the_same_bytes(flat, flat_page, tmp_path):

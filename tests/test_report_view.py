@@ -182,24 +182,30 @@ def test_no_text_leaves_its_place_on_a_narrow_screen(browser, days, tmp_path):
         assert json.loads(browser.evaluate(_OUTSIDE)) == [], width
 
 
-def test_a_phone_has_a_block_for_each_class_without_the_days_that_were_not_recorded(
-    browser, tmp_path
-):
+def test_on_a_phone_a_week_has_its_days_once_above_columns_of_figures(browser, tmp_path):
     write_day(tmp_path / "logs", DAY, [*_TELEVISION, *_DOUBTFUL])
     write_day(tmp_path / "logs", DAY - timedelta(days=2), hours=range(22))
     set_size(browser, *PHONE, mobile=True)
     browser.open(report_of(tmp_path / "logs", tmp_path, 7, DAY - timedelta(days=6)))
+    heads = boxes(browser, "table.wide:first-of-type thead th")
+    days = [f"{day:%a} {day.day}" for day in (DAY - timedelta(days=n) for n in (2, 1, 0))]
+    assert [text for text, *_ in heads][:4] == [*days, "All"]
     found = boxes(browser, "table.wide td")
-    assert found
-    assert not {"", "\N{EN DASH}"} & {text for text, *_ in found}
-    assert not boxes(browser, "table.wide thead")
-    after = (
-        "getComputedStyle(document.querySelector('table.wide tr[data-rest]'), '::after').content"
-    )
-    assert browser.evaluate(after) == '"others not recorded"'
-    day = tmp_path / "day"
-    day.mkdir()
-    browser.open(report_of(tmp_path / "logs", day))
+    assert {round(left) for _, left, *_ in found} == {round(left) for _, left, *_ in heads}
+    before = "getComputedStyle(document.querySelector('table.wide td'), '::before').content"
+    assert browser.evaluate(before) == "none", "no day at each figure"
+    names = boxes(browser, "table.wide tbody th")
+    assert {round(width) for _, _, width, _ in names} == {PHONE[0] - 32}, "above its figures"
+    text = browser.evaluate("document.body.textContent")
+    assert "A dash: not recorded, or too little of it." in text
+
+
+def test_a_phone_has_a_block_for_each_class_of_a_day_without_parts_in_which_there_was_none(
+    browser, tmp_path
+):
+    write_day(tmp_path / "logs", DAY, [*_TELEVISION, *_DOUBTFUL])
+    set_size(browser, *PHONE, mobile=True)
+    browser.open(report_of(tmp_path / "logs", tmp_path))
     assert not boxes(browser, "table.sounds thead")
     lefts = {
         round(left)
@@ -357,5 +363,59 @@ def test_all_words_of_a_page_stand_out_by_day_and_by_night(browser, short_sounds
         ground = browser.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (ground == "rgb(255, 255, 255)") == (scheme == "light")
         assert browser.evaluate(_CONTRAST) >= 4.5
+    finally:
+        browser.call("Emulation.setEmulatedMedia", features=[])
+
+
+def contrast_of(one, other):
+    """The contrast of two colours, as WCAG has it."""
+    shares = np.array([one, other]) / 255
+    linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    low, high = sorted(linear @ (0.2126, 0.7152, 0.0722))
+    return (high + 0.05) / (low + 0.05)
+
+
+_MIDDLE = """(() => {
+    const box = document.querySelector("%s").getBoundingClientRect();
+    return JSON.stringify([box.left + box.width / 2, box.bottom - box.height * %s]);
+})()"""
+
+
+def colour_at(browser, image, selector, height=0.5):
+    x, y = json.loads(browser.evaluate(_MIDDLE % (selector, height)))
+    return image[int(y), int(x)]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_keys_and_swatches_have_the_colours_of_the_marks_by_day_and_by_night(
+    browser, scheme, tmp_path
+):
+    things = [(at("12:00"), 1800, "objects_activity", 0.9), (at("20:10"), 180, "coughing", 0.9)]
+    things += [(at("20:32"), 180, "objects_activity", 0.9), (at("09:00"), 900, "coughing", 0.6)]
+    things += [(at("10:00"), 900, "coughing", 0.9)]
+    talking = [(at("19:30") + 20 * i, 15, "speech", 0.9) for i in range(360)]
+    talking = [row for row in talking if not any(a <= row[0] < a + b for a, b, *_ in things)]
+    write_day(tmp_path / "logs", DAY, [*things, *talking])
+    address = report_of(tmp_path / "logs", tmp_path)
+    feature = {"name": "prefers-color-scheme", "value": scheme}
+    browser.call("Emulation.setEmulatedMedia", features=[feature])
+    try:
+        set_size(browser, 1366, 1000)
+        browser.open(address)
+        image = pixels(browser.picture())
+        paper = image[2, 2]
+        lane, household = ".row:nth-child(%d) g%s .long", 8
+        swatches = ".row:nth-child(%d) .swatch"
+        for row in (1, household):
+            mark = colour_at(browser, image, lane % (row, ":not(.pale, .low)"))
+            assert np.abs(colour_at(browser, image, swatches % row) - mark).max() <= 2
+            pale = colour_at(browser, image, lane % (row, ".pale"))
+            assert contrast_of(mark, pale) > 1.5, "told from what is not pale"
+            if scheme == "dark":
+                assert contrast_of(pale, paper) >= 3
+        pale = colour_at(browser, image, lane % (1, ".pale"))
+        assert np.abs(colour_at(browser, image, ".key.beside") - pale).max() <= 3
+        low = colour_at(browser, image, lane % (1, ".low"))
+        assert np.abs(colour_at(browser, image, ".key.low", 0.25) - low).max() <= 3
     finally:
         browser.call("Emulation.setEmulatedMedia", features=[])

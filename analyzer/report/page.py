@@ -1,7 +1,7 @@
 """HTML page of a report."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -15,10 +15,10 @@ from hearthlog.analyzer.report.headline import day_headline, unlogged, week_head
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
     ASSESSED_ITEMS,
-    DAY_PARTS,
     FigureSection,
     ReportData,
     ReportFigure,
+    day_parts,
     day_sections,
     event_figure,
     minutes_figure,
@@ -83,7 +83,6 @@ class PageTable(NamedTuple):
     heads: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     kind: str = ""
-    rests: Sequence[str] = ()  # by row: on a phone, what stands in place of its dashes
 
 
 class PagePicture(NamedTuple):
@@ -116,6 +115,8 @@ _FEW_WORRYING = 12
 _MOST_TIMES = {**dict.fromkeys(WORRYING, _FEW_WORRYING), FLUSHING_WATER: 16, SHOWER: 16}
 _BESIDE = "beside a television"
 _SPACE = "\N{NO-BREAK SPACE}"
+_COMPLETE = 0.995  # share of a day
+_LONG = 1.0  # minutes
 
 
 class PageSection(NamedTuple):
@@ -141,10 +142,10 @@ def day_page(data: ReportData) -> str:
         title=title,
         headline=day_headline(day),
         summary=list(summarize_day(data, day)),
-        overview=[("What was heard", table)],
-        evening=[*DAY_PARTS][-1] in table.heads,
+        overview=[("What was heard", table, "")],
+        evening=[*day_parts(day.day)][-1] in table.heads,
         partly=_partly_covered(with_night),
-        parts=[_part(data, section, day) for section in day_sections()],
+        parts=[_part(data, section, day) for section in day_sections(day.day)],
     )
 
 
@@ -162,17 +163,11 @@ def week_page(data: ReportData) -> str:
         title=f"Week {first.isocalendar().week}, {spoken}",
         headline=week_headline(data.days, shown.days),
         summary=list(summarize_week(data)),
-        overview=[
-            ("How often it was heard", _week(shown, list(map(event_figure, names)))),
-            (
-                "How long it was heard",
-                _week(shown, list(map(minutes_figure, names)), has_share=False),
-            ),
-        ],
+        overview=list(_week_overview(shown, names)),
         evening=False,
         partly=[],
         parts=[
-            PageSection(section, _week(data, section.figures))
+            PageSection(section, _week(data, section.figures, has_share=_is_partly(data, section)))
             for section in week_sections(data.classes)
         ],
     )
@@ -216,7 +211,9 @@ def _page(data: ReportData, shown: ReportData, picture: PagePicture, **parts: An
         confused=_listed(data.confused),
         everywhere=_listed(everywhere),
         dash=_NOTHING,
-        unsure=_is_unsure(it for _, it in parts["overview"]),
+        unsure=_is_unsure(it for _, it, _ in parts["overview"]),
+        has_dash=len(data.days) > 1 and _has_dash(parts),
+        is_utc=str(data.zone) in {"Etc/UTC", "UTC"},
         scenarios=[(plain(name), _scenario(data, name)) for name in data.scenarios],
         days_before=BASELINE_DAYS,
         interrai=_interrai(data, days),
@@ -251,10 +248,9 @@ def _scenario(data: ReportData, name: str) -> PageTable:
         ]
         for label in classes
     ]
-    if len(data.days) == 1:
-        return PageTable(["Sound", "How long"], rows)
-    rests = [_rest([cell.text for cell in row[1:]], data.logged_days) for row in rows]
-    return PageTable(["Sound", *_day_heads(data)], rows, "wide", rests)
+    if len(data.logged_days) == 1:
+        return PageTable(["Sound", "How long"], rows, "figures")
+    return PageTable(["Sound", *_day_heads(data)], rows, "wide")
 
 
 def _scenario_text(minutes: float, day: DayMetrics) -> str:
@@ -264,7 +260,11 @@ def _scenario_text(minutes: float, day: DayMetrics) -> str:
 
 def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
     """Return how often each class was heard in each recorded part of the day, when and how long."""
-    parts = [p for p in DAY_PARTS if intersection(day.home.coverage, DAY_PARTS[p](day)).length]
+    parts = {
+        title: part
+        for title, part in day_parts(day.day).items()
+        if intersection(day.home.coverage, part(day)).length
+    }
     heads = ["Sound", *parts, "When", "How long"]
     rows = []
     for name in data.classes:
@@ -275,7 +275,7 @@ def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
             continue
         length, apart = _cell(data, lasting, day), _apart(lasting, [day])
         cells = [
-            *(_count_cell(data, part_figure(name, part), day) for part in parts),
+            *(_count_cell(data, part_figure(name, part), day) for part in parts.values()),
             Cell(_times(day, name)),
             length._replace(note=", ".join(note for note in (apart, length.note) if note)),
         ]
@@ -331,6 +331,12 @@ def _is_unsure(tables: Iterable[PageTable]) -> bool:
     return any(re.search(r"\d\?", cell.text) for it in tables for row in it.rows for cell in row)
 
 
+def _has_dash(parts: Mapping[str, Any]) -> bool:
+    """Whether tables have a dash in place of a figure."""
+    tables = [it for _, it, _ in parts["overview"]] + [part.table for part in parts["parts"]]
+    return any(cell.text == _NOTHING for it in tables for row in it.rows for cell in row)
+
+
 def _has_count(data: ReportData, name: str) -> bool:
     """Whether enough was recorded on some of the days to tell how often a class was heard."""
     return any(day.count(name) is not None or day.uncounted_events(name) for day in data.days)
@@ -357,8 +363,8 @@ def _text(value: Value | None) -> str:
 
 def _part(data: ReportData, section: FigureSection, day: DayMetrics) -> PageSection:
     shown = [figure for figure in section.figures if figure.value(day) is not None]
-    rows = [[Cell(figure.title), _cell(data, figure, day)] for figure in shown]
-    remarks = [_coughing(day) if section.title == "Night" else longest_quiet_text(day)]
+    rows = [[Cell(f.title, note=f.note), _cell(data, f, day)] for f in shown]
+    remarks = [_coughing(day) if section.title.startswith("Night") else longest_quiet_text(day)]
     if len(shown) < len(section.figures):
         more = "more" if shown else "anything"
         remarks.append(f"Too little was recorded to tell {more}.")
@@ -381,43 +387,88 @@ def _coughing(day: DayMetrics) -> str:
     return f"Bouts of coughing in the night, hour by hour: {', '.join(each)}."
 
 
-def _week(
-    data: ReportData, figures: Sequence[ReportFigure], *, has_share: bool = True
+def _week_overview(data: ReportData, names: Sequence[str]) -> Iterator[tuple[str, PageTable, str]]:
+    """Yield how often and how long each class was heard: titles, tables, and remarks on them.
+
+    Of a week with a single logged day it is one table.
+    """
+    often, long = [*map(event_figure, names)], [*map(minutes_figure, names)]
+    if len(data.logged_days) == 1:
+        yield "What was heard", _amounts(data, often, long), ""
+        return
+    yield "How often it was heard", _week(data, often, has_share=True), ""
+    lasting = [figure for figure in long if _is_long(data, figure)]
+    short = _listed([figure.name for figure in long if figure not in lasting])
+    remark = f"Under a minute a day: {short}." if short else ""
+    yield "How long it was heard", _week(data, lasting, has_share=False), remark
+
+
+def _is_long(data: ReportData, figure: ReportFigure) -> bool:
+    """Whether a class was heard for a minute on a day, or is usually on some days."""
+    baseline = data.baseline(figure) if data.comparable else None
+    minutes = [] if baseline is None else [baseline[0].highest]
+    for day in data.logged_days:
+        value = figure.value(day)
+        minutes += [0.0 if value is None else value.middle, day.uncounted_minutes(figure.name)]
+    return max(minutes) >= _LONG
+
+
+def _amounts(
+    data: ReportData, often: Sequence[ReportFigure], long: Sequence[ReportFigure]
 ) -> PageTable:
+    """Return how often and how long each class was heard in a week with a single logged day."""
+    (day,) = data.logged_days
+    rows = [[Cell("Recorded"), Cell(_recorded(often, day)), Cell("")]]
+    for count, lasting in zip(often, long, strict=True):
+        cells = [
+            Cell(_text(figure.value(day)), note=_notes(data, figure)) for figure in (count, lasting)
+        ]
+        rows.append([Cell(count.short, colour=colour_on_paper(count.name)), *cells])
+    return PageTable(["Sound", "How often", "How long"], rows, "amounts")
+
+
+def _notes(data: ReportData, figure: ReportFigure) -> str:
+    """Return what is in small letters at a figure of a week."""
+    usual = _dense(data.usually(figure)) if data.comparable else ""
+    notes = figure.note, _apart(figure, data.logged_days), f"usually {usual} a day" * bool(usual)
+    return ", ".join(filter(None, notes))
+
+
+def _week(data: ReportData, figures: Sequence[ReportFigure], *, has_share: bool) -> PageTable:
     """Return the figures of the days of a week that have logs, a column for each, and their total.
 
-    The first row is the share of each day that was recorded, unless another table has it.
+    With `has_share`, the first row is the share of each day that was recorded.
     """
     days = data.logged_days
-    shares = [_share(figures, day) for day in days]
-    recorded = [Cell(percent(share) if share else _NOTHING) for share in shares]
-    rows = [[Cell("Recorded"), *recorded, Cell("")]] if has_share else []
-    rests = [_rest([cell.text for cell in recorded], days)] if has_share else []
+    rows: list[list[Cell]] = []
+    if has_share:
+        rows.append([Cell("Recorded"), *(Cell(_recorded(figures, day)) for day in days), Cell("")])
     for figure in figures:
         values = [figure.value(day) if day.coverage.length else None for day in days]
-        usual = _dense(data.usually(figure)) if data.comparable else ""
-        notes = [_apart(figure, days), f"usually {usual} a day" * bool(usual)]
-        texts = [*map(_short, values)]
-        rests.append(_rest(texts, days))
         colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(
             [
-                Cell(figure.short, colour=colour, note=", ".join(filter(None, notes))),
-                *map(Cell, texts),
+                Cell(figure.short, colour=colour, note=_notes(data, figure)),
+                *(Cell(_short(value)) for value in values),
                 Cell(_total(days, figure)),
             ]
         )
     heads = ["", *_day_heads(data), "All"]
     if len(days) == 1:
-        heads, rows = heads[:-1], [row[:-1] for row in rows]
-    return PageTable(heads, rows, "wide", rests)
+        return PageTable(heads[:-1], [row[:-1] for row in rows], "figures")
+    return PageTable(heads, rows, "wide")
 
 
-def _rest(texts: Sequence[str], days: Sequence[DayMetrics]) -> str:
-    """Return what is with the days that have a dash."""
-    lacking = [day for text, day in zip(texts, days, strict=True) if text == _NOTHING]
-    why = "too little recorded" if any(day.coverage.length for day in lacking) else "not recorded"
-    return f"{'others ' * (len(lacking) < len(days))}{why}" if lacking else ""
+def _is_partly(data: ReportData, section: FigureSection) -> bool:
+    """Whether a day of a week was not all recorded for the classes of a section."""
+    return any(_share(section.figures, day) < _COMPLETE for day in data.logged_days)
+
+
+def _recorded(figures: Sequence[ReportFigure], day: DayMetrics) -> str:
+    """Return the share of a day that was recorded for all classes of some figures."""
+    share = _share(figures, day)
+    text = percent(share).replace("more than", ">").replace("less than", "<")
+    return text if share else _NOTHING
 
 
 def _day_heads(data: ReportData) -> list[str]:

@@ -26,7 +26,7 @@ from hearthlog.analyzer.activity.values import (
 from hearthlog.analyzer.logs.local_time import EVENING, MORNING
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import Spans, intersection, joined
-from hearthlog.analyzer.report.wording import several_in_words
+from hearthlog.analyzer.report.wording import several_in_words, weekday
 from hearthlog.models.classes import (
     COUGHING,
     CRYING,
@@ -56,6 +56,7 @@ class ReportFigure(NamedTuple):
     sums: bool = True  # whether a total over days is meaningful
     counts: bool = False  # whether these are the events of a day
     lasts: bool = False  # whether it is the time of a class
+    note: str = ""  # in small letters below the title
 
 
 class FigureSection(NamedTuple):
@@ -67,6 +68,7 @@ class FigureSection(NamedTuple):
 
 
 TELEVISION_PAUSE = 20 * MINUTE  # shorter pauses of a television are left out
+NIGHT_HOURS = f"{EVENING:02}:00 to {MORNING:02}:00"
 
 
 def day_television(day: DayMetrics, pause: int = 0) -> Spans:
@@ -75,10 +77,10 @@ def day_television(day: DayMetrics, pause: int = 0) -> Spans:
     return intersection(joined(starts, starts + MINUTE, pause), day.span)
 
 
-def day_sections() -> list[FigureSection]:
+def day_sections(day: date) -> list[FigureSection]:
     """Return the tables of a day below that of its sounds, which has those of its night."""
     return [
-        FigureSection("Night", _NIGHT, _NIGHT_NOTE),
+        FigureSection(f"Night to {weekday(day)}, {NIGHT_HOURS}", _NIGHT, _NIGHT_PAUSES),
         FigureSection("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
     ]
 
@@ -100,17 +102,18 @@ def minutes_figure(name: str) -> ReportFigure:
     return ReportFigure(title, title, lambda day: day.minutes(name), name, lasts=True)
 
 
-# Parts of a day with the night before it, by their titles; no two have a time in common.
-DAY_PARTS: Mapping[str, Callable[[DayMetrics], Spans]] = {
-    f"Night {EVENING:02}\N{EN DASH}{MORNING:02}": lambda day: day.night,
-    f"Day {MORNING:02}\N{EN DASH}{EVENING:02}": lambda day: day.waking,
-    f"After {EVENING}:00": lambda day: day.evening,
-}
+def day_parts(day: date) -> Mapping[str, Callable[[DayMetrics], Spans]]:
+    """Return the parts of a day with the night before it, by their titles; none overlap."""
+    return {
+        f"Night to {weekday(day)}, {EVENING:02}\N{EN DASH}{MORNING:02}": lambda day: day.night,
+        f"Day {MORNING:02}\N{EN DASH}{EVENING:02}": lambda day: day.waking,
+        f"After {EVENING}:00": lambda day: day.evening,
+    }
 
 
-def part_figure(name: str, part: str) -> ReportFigure:
-    """Return the figure of a class's event count in one of `DAY_PARTS`."""
-    return ReportFigure(name, part, lambda day: day.count(name, DAY_PARTS[part](day)), name)
+def part_figure(name: str, part: Callable[[DayMetrics], Spans]) -> ReportFigure:
+    """Return the figure of a class's event count in one of `day_parts`."""
+    return ReportFigure(name, name, lambda day: day.count(name, part(day)), name)
 
 
 def event_figure(name: str, title: str = "") -> ReportFigure:
@@ -141,6 +144,7 @@ def _bathroom(classes: Sequence[str]) -> Iterator[ReportFigure]:
 
 
 _IN_NIGHT = COUGHING, CRYING
+_LONGER = "a minute or more in ten"
 _NIGHT = (
     ReportFigure(
         "Times with half a minute of sound",
@@ -151,20 +155,31 @@ _NIGHT = (
 )
 _ACTIVITY = (
     ReportFigure("Time with sound", "Time with sound", lambda day: day.sound),
-    ReportFigure("Sound from", "Sound from", lambda day: day.first, sums=False),
-    ReportFigure("Sound until", "Sound until", lambda day: day.last, sums=False),
+    ReportFigure(
+        "First longer sounds",
+        "First longer sounds",
+        lambda day: day.first,
+        sums=False,
+        note=_LONGER,
+    ),
+    ReportFigure(
+        "Last longer sounds",
+        "Last longer sounds",
+        lambda day: day.last,
+        sums=False,
+        note=_LONGER,
+    ),
     ReportFigure(
         "Longest quiet stretch, 07:00 to 22:00", "Longest quiet", lambda day: day.quiet, sums=False
     ),
 )
-_BATHROOM_NOTE = "Night is 22:00 to 07:00. A person, not the report, knows who used the bathroom."
-_NIGHT_NOTE = (
-    "22:00 to 07:00, counted on the day on which the night ends. Times with sound are separated "
-    "by at least ten quiet minutes."
-)
+_BATHROOM_NOTE = f"Night is {NIGHT_HOURS}. A person, not the report, knows who used the bathroom."
+_NIGHT_PAUSES = "Times with sound are separated by at least ten quiet minutes."
+_NIGHT_NOTE = f"{NIGHT_HOURS}, counted on the day on which the night ends. {_NIGHT_PAUSES}"
 _ACTIVITY_NOTE = (
-    "“Sound from” and “until” are the first and the last ten minutes with at least one minute of "
-    "sound, from 04:00 on. Quiet can mean rest, reading, a nap, or nobody at home."
+    "Longer sounds: the first and the last ten minutes from 04:00 on with at least one minute of "
+    "sound. There may be shorter sounds before and after them. Quiet can mean rest, reading, a "
+    "nap, or nobody at home."
 )
 
 

@@ -13,13 +13,19 @@ from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import Spans, difference, intersection, joined, lengths
 from hearthlog.analyzer.report.headline import amount, states_missing_time, unlogged
-from hearthlog.analyzer.report.report_data import TELEVISION_PAUSE, ReportData, day_television
+from hearthlog.analyzer.report.report_data import (
+    NIGHT_HOURS,
+    TELEVISION_PAUSE,
+    ReportData,
+    day_television,
+)
 from hearthlog.analyzer.report.wording import (
     WEEK,
     clock_text,
     judgement_text,
     short_day,
     too_few_text,
+    weekday,
 )
 from hearthlog.models.classes import (
     COUGHING,
@@ -268,7 +274,7 @@ def _night(day: DayMetrics) -> str:
     partly = ""
     if day.night_hours < hours - _HALF:
         partly = f" Only {day.night_hours:.1f} of its {hours:.0f} hours were recorded."
-    return f"In the night, 22:00 to 07:00: {'; '.join(parts)}.{partly}"
+    return f"In the night to {weekday(day.day)}, {NIGHT_HOURS}: {'; '.join(parts)}.{partly}"
 
 
 def _unexplained(data: ReportData) -> int:

@@ -69,8 +69,8 @@ class TimelineLane(NamedTuple):
     def paths(self) -> Sequence[tuple[str, MarkPaths]]:
         """Marks by their look: pale beside a television, low if not sure."""
         return (
-            (" pale", _paths(self.uncounted)),
-            (" low", _paths(self.unsure, LOW)),
+            ("pale", _paths(self.uncounted)),
+            ("low", _paths(self.unsure, LOW)),
             ("", _paths(self.counted)),
         )
 

@@ -44,8 +44,8 @@ from hearthlog.analyzer.report.page import day_page
 from hearthlog.analyzer.report.report import Period, read_report_data
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_ITEMS,
-    DAY_PARTS,
     ReportData,
+    day_parts,
     day_sections,
     minutes_figure,
 )
@@ -168,13 +168,15 @@ def _statements_of(
     for kind, text in page.paragraphs:
         yield from _paragraph(kind, text, day, truth)
     figures = {
-        (part.title, figure.title): figure for part in day_sections() for figure in part.figures
+        (part.title, figure.title): figure
+        for part in day_sections(day.day)
+        for figure in part.figures
     }
     for title, heads, cells in page.rows:
         if title == "What was heard":
             yield from _sound_counts(heads, cells, day, truth)
-        elif (title, cells[0]) in figures:
-            yield from _figure(figures[title, cells[0]].value(truth.metrics), title, heads, cells)
+        elif (figure := figures.get((title, cells[0].partition(" | ")[0]))) is not None:
+            yield from _figure(figure.value(truth.metrics), title, heads, cells)
         elif title.startswith("For the interRAI"):
             yield from _assessed(heads, cells, [*before, truth])
 
@@ -403,12 +405,12 @@ def _sound_counts(
     if name is None:
         return
     by_head, with_night = dict(zip(heads, cells, strict=True)), truth.metrics.with_night
-    for part in (each for each in DAY_PARTS if each in by_head):
-        often = by_head[part]
+    for part, span in day_parts(day.day).items():
+        often = by_head.get(part, "")
         if (stated := read_count(often.partition(" | ")[0])) is not None:
             where = f"{cells[0]}, {part}: {often}"
             modest = is_modest(re.sub(r"\(\d+ labelled\)", "", where))
-            true = with_night.count_in(name, DAY_PARTS[part](with_night)).labelled
+            true = with_night.count_in(name, span(with_night)).labelled
             yield judge_count(REPORT, where, stated, true, modest=modest)
     when, lasting = by_head["When"], by_head["How long"]
     if clocks := _CLOCK.findall(when):
