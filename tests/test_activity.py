@@ -15,7 +15,6 @@ from log_fixtures import run
 
 from hearthlog.analyzer.activity.checked_minutes import read_checked_minutes
 from hearthlog.analyzer.activity.daily_metrics import (
-    EventTotal,
     day_of,
     home_sound,
     metrics_of_home,
@@ -23,6 +22,7 @@ from hearthlog.analyzer.activity.daily_metrics import (
 from hearthlog.analyzer.activity.day_profile import COUNT, LENGTH, Profiles
 from hearthlog.analyzer.activity.event_counts import MINUTE
 from hearthlog.analyzer.activity.home_data import read_home
+from hearthlog.analyzer.activity.home_events import EventTotal
 from hearthlog.analyzer.activity.segments import read_activity
 from hearthlog.analyzer.bridge.alerts.evaluation import notifications
 from hearthlog.analyzer.bridge.home_state import follow_home

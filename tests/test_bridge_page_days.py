@@ -20,8 +20,8 @@ from viewers import patiently
 
 from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import Sureness
-from hearthlog.analyzer.activity.daily_metrics import read_day_totals
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
+from hearthlog.analyzer.activity.home_events import read_day_sounds
 from hearthlog.analyzer.bridge.corrections import EventCorrections, user_error
 from hearthlog.analyzer.bridge.home_state import HomeState
 from hearthlog.analyzer.bridge.page import languages, past_days, preferred_language, translation_for
@@ -771,7 +771,7 @@ def test_the_night_and_the_day_have_the_counts_that_the_report_of_the_day_has(tm
     week = tmp_path / "week.html"
     make_report(find_home_logs([logs]), Period(monday, 7, UTC), week)
     assert '>Coughing</th><td data-head="Mon 2">3 (+1?)</td>' in week.read_text()
-    total = read_day_totals(find_home_logs([logs]), monday, UTC)["coughing"]
+    total = read_day_sounds(find_home_logs([logs]), monday, UTC).totals["coughing"]
     assert (total.counted, total.unsure) == (4, 1), "as info has it"
 
 

@@ -28,7 +28,7 @@ needs_setpriv = pytest.mark.skipif(shutil.which("setpriv") is None, reason="need
 DAY = date(2026, 3, 2)
 HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow", "pandas"}
 
-MOST = "labelled most, a television included: "
+MOST = "labelled most: "
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(
     assert recorded.startswith(f"Listened: 3 min of 3 min; {MOST}")
     assert state == f"All is well; next: {figures['next']}"
     assert state.endswith(f"review ten spans: hearthlog review {logs} --queue")
-    assert title == "hall: time labelled as each sound, also that of a television"
+    assert title == "hall: time labelled as each sound, sure or not, also by a television"
     minutes = figures["segment_minutes"]["hall"]
     rows = rest[: len(minutes)]
     assert [row.split("  ")[1] for row in rows] == [in_words(name) for name in ordered(minutes)]
@@ -110,13 +110,54 @@ def test_info_tells_times_of_the_home_and_trouble_and_names_no_class_that_is_hid
     result = hearthlog("info", tmp_path)
     assert result.returncode == 3
     what, recorded, state, _, *rest = result.stdout.splitlines()
-    assert re.search(r"2026-03-02 02:00 to 2026-03-03 01:00 \(Europe/Vienna\)", what)
-    assert recorded.endswith(f"; {MOST}talking 2 h 30 min and coughing 2 min")
+    assert re.search(r"24\.0 h, 2026-03-02 01:00 to 2026-03-03 01:00 \(Europe/Vienna\)", what)
+    assert recorded.startswith("Listened: 23.0 h of 24.0 h; ")
+    when = "labelled most in the 24 hours to 22:00 of Monday: "
+    apart = "; beside something like a television, not counted: 2 h 30 min"
+    assert recorded.endswith(f"; {when}coughing 2 min{apart}")
     assert state.startswith("Not heard: 1 gap, together 3600.000 s")
     assert [row.split()[0] for row in rest[:3]] == ["Coughing", "Talking", "Quiet"]
     assert "gap: mic 2026-03-02 21:00:00 3600.000 s" in result.stdout
     assert "usic" not in result.stdout
     assert "music" in json.loads(hearthlog("info", tmp_path, "--json").stdout)["segments"]["mic"]
+
+
+def test_info_names_first_what_is_counted_and_once_what_is_not_for_a_television(
+    hearthlog, tmp_path
+):
+    talking = [(at("18:00") + 20 * n, 15, "speech", 0.9) for n in range(360)]
+    things = [(at("09:00"), 200.0, "objects_activity", 0.9), (at("10:00"), 30.0, "speech", 0.9)]
+    write_day(tmp_path, DAY, [*things, *talking], hours=range(22))
+    _, recorded, *rest = hearthlog("info", tmp_path).stdout.splitlines()
+    assert recorded == (
+        "Listened: 22.0 h of 22.0 h; labelled most: household sounds 3 min and talking 30 s; "
+        "beside something like a television, not counted: 1 h 30 min"
+    )
+    assert "\n".join(rest).count("1 h 3") == 1, "the bar"
+
+
+def test_info_names_only_the_telephone_of_which_the_model_is_sure_among_what_is_counted(
+    hearthlog, tmp_path
+):
+    rings = [(at("09:00"), 30.0, "phone_ring", 0.9), (at("10:00"), 240.0, "phone_ring", 0.69)]
+    rings += [(at("11:00"), 5.0, "phone_ring", 0.6), (at("11:00:05"), 5.0, "phone_ring", 0.8)]
+    write_day(tmp_path, DAY, [*rings, (at("12:00"), 60.0, "phone_ring", 0.5)])
+    recorded = hearthlog("info", tmp_path).stdout.splitlines()[1]
+    assert recorded.endswith(
+        "labelled most in the 24 hours to 22:00 of Monday: telephone ringing 40 s"
+    )
+
+
+def test_info_never_says_that_more_was_listened_to_than_there_was(hearthlog, tmp_path):
+    write_day(tmp_path / "one", DAY)
+    lines = hearthlog("info", tmp_path / "one").stdout.splitlines()
+    assert lines[0].endswith(": 24.0 h, 2026-03-02 00:00 to 2026-03-03 00:00 (UTC)")
+    assert lines[1] == "Listened: 24.0 h of 24.0 h"
+    for node in ("flat", "attic"):
+        write_day(tmp_path / "two", DAY, node=node)
+    assert hearthlog("info", tmp_path / "two").stdout.splitlines()[1] == (
+        "Listened: 24.0 h of 24.0 h"
+    )
 
 
 def test_info_says_that_a_starter_labelled_and_leads_on_to_a_model_of_the_home(

@@ -110,11 +110,35 @@ def test_each_sound_that_the_report_counts_is_a_line(home, hearthlog):
 
 def test_lines_name_the_clock_of_the_home_and_end_their_figures_below_each_other(home, hearthlog):
     head, *lines = hearthlog("events", home, "--day", DAY).stdout.splitlines()
-    assert head.startswith("when (CET)  sound ")
+    assert re.match(r"when \(CET\) +sound ", head)
     rows = [line for line in lines if re.match(r"\d\d:\d\d:\d\d ", line)]
     lengths = {re.search(r"\d (s|min|h)\b(?= +\d+ %)", line).end() for line in rows}
     assert lengths == {head.index("length") + len("length")}
     assert {line.index(" %") + 2 for line in rows} == {head.index("sure") + len("sure")}
+
+
+def test_lines_are_parted_by_night_and_day_and_say_what_an_unknown_sound_may_be(
+    tmp_path, hearthlog
+):
+    rings = [(at("08:00"), 5.0, "phone_ring", 0.6), (at("09:00"), 5.0, "phone_ring", 0.9)]
+    coughs = [(at(text), 2.0, "coughing", 0.9) for text in ("03:00", "12:00", "22:30")]
+    write_day(tmp_path, DAY, [*rings, *coughs], classes=[*GENERAL, "unknown"])
+    lines = hearthlog("events", tmp_path, "--day", DAY).stdout.splitlines()[1:12]
+    assert [" ".join(line.split()[:3]) for line in lines] == [
+        "Night to Mon",
+        "03:00:00 Coughing 2.0",
+        "",
+        "Mon by day",
+        *("08:00:00 Not recognised", "09:00:00 Telephone ringing", "12:00:00 Coughing 2.0"),
+        "",
+        "Night to Tue",
+        "22:30:00 Coughing 2.0",
+        "Coughing on Monday,",
+    ]
+    assert lines[4].endswith("  perhaps telephone ringing")
+    assert "perhaps" not in lines[5]
+    one = hearthlog("events", tmp_path, "--day", DAY, "--label", "phone_ring").stdout.splitlines()
+    assert "Mon by day" not in one, "a single part needs no line"
 
 
 def test_a_night_is_that_of_the_report(home, hearthlog):

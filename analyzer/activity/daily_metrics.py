@@ -1,11 +1,11 @@
 """Metrics of a home and its days: coverage, durations, events, and counts with ranges."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, tzinfo
 from functools import reduce
 from itertools import chain
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,8 @@ from hearthlog.analyzer.activity.event_counts import (
     strata_of,
     television_minutes,
 )
-from hearthlog.analyzer.activity.home_data import HomeData, read_home
+from hearthlog.analyzer.activity.home_data import HomeData
 from hearthlog.analyzer.activity.values import Clock, Count, Duration, exactly
-from hearthlog.analyzer.logs.home_logs import HomeLogs
 from hearthlog.analyzer.logs.labelling import Labelling, in_order
 from hearthlog.analyzer.logs.local_time import at_hour, awake_span, day_span, local_time, night_span
 from hearthlog.analyzer.logs.spans import (
@@ -32,7 +31,6 @@ from hearthlog.analyzer.logs.spans import (
     Spans,
     cut,
     difference,
-    first_of_groups,
     intersection,
     joined,
     lengths,
@@ -46,8 +44,6 @@ from hearthlog.models.classes import (
     ordered,
 )
 from hearthlog.schemas.arrays import Bool, Float32, Int64
-from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.schemas.messages.topics import LIVE
 
 
 @dataclass(frozen=True)
@@ -333,8 +329,12 @@ class DayMetrics:
 
     def uncounted_minutes(self, name: str) -> float:
         """Return the minutes of the events of a class that do not count: beside a television."""
+        return self.uncounted_spans(name).length / MINUTE
+
+    def uncounted_spans(self, name: str) -> Spans:
+        """Return the spans of the events of a class that do not count."""
         _, apart = self.joined_events(name)
-        return self._spans_in(name, apart).length / MINUTE
+        return self._spans_in(name, apart)
 
     def _spans_in(self, name: str, events: Spans) -> Spans:
         spans = intersection(self.home.spans.get(name, NONE), events)
@@ -487,107 +487,3 @@ def _if_covered(value: _Figure, share: float) -> _Figure | None:
 
 def _length(spans: Spans) -> Duration:
     return Duration(spans.length / MINUTE)
-
-
-_BEFORE = 3600 * NANOSECONDS  # an event that goes on at midnight, and a television, begin earlier
-
-
-class HomeEvent(NamedTuple):
-    """Segments of one class, from any microphones, with at most ten seconds between them."""
-
-    label: str
-    start: int  # in nanoseconds of UTC
-    end: int  # likewise
-    seconds: float  # total length of the segments
-    confidence: float  # highest of the segments; 1 for a class that a person marked
-    microphones: tuple[str, ...]  # with a segment, sorted
-    reviewed: bool  # whether a person reviewed its start, at all microphones
-    television: bool  # beside something like a television; no report counts it
-
-    @property
-    def is_unsure(self) -> bool:
-        """Whether the model is not sure of it, and nobody reviewed it."""
-        return self.confidence < UNSURE_BELOW and not self.reviewed
-
-
-class EventTotal(NamedTuple):
-    """Events of a class that a report counts, and those beside something like a television."""
-
-    counted: int
-    television: int
-    unsure: int = 0  # counted, but the model is not sure, and nobody reviewed them
-
-
-def event_totals(metrics: HomeMetrics, start: int, end: int) -> dict[str, EventTotal]:
-    """Count the events of each class that begin in a time span, in nanoseconds of UTC."""
-    own = metrics.between(start, end)
-    totals = {}
-    for name in own.classes:
-        starts = own.events.get(name, NONE.starts)
-        counted = len(own.minutes.counted(name, starts))
-        if len(starts):
-            unsure = own.minutes.count(name, None).unsure
-            totals[name] = EventTotal(counted, len(starts) - counted, unsure)
-    return totals
-
-
-def read_day_totals(logs: HomeLogs, day: date, zone: tzinfo) -> dict[str, EventTotal]:
-    """Read the logs of the 24 hours to 22:00 of a day, and count their events as a report does.
-
-    Raise `DataError` without labels, `LogError` if segments are invalid.
-    """
-    start, end = night_span(day, zone)[0], awake_span(day, zone)[1]
-    data = read_home(logs, LIVE, start - _BEFORE, (start, end))
-    return event_totals(metrics_of_home(data), start, end)
-
-
-def home_events(
-    data: HomeData, metrics: HomeMetrics, classes: Sequence[str], start: int, end: int
-) -> list[HomeEvent]:
-    """List the events of classes except silence that begin in a span, end exclusive, by start.
-
-    Times are nanoseconds of UTC. Of each class, there are as many as the count of a report and
-    those beside a television together.
-    """
-    found = [
-        event
-        for name in classes
-        if name != SILENCE
-        for event in _events_of(data, metrics, name, start, end)
-    ]
-    return sorted(found, key=lambda event: (event.start, event.label))
-
-
-def _events_of(
-    data: HomeData, metrics: HomeMetrics, name: str, start: int, end: int
-) -> Iterator[HomeEvent]:
-    parts = []
-    for (_, microphone), labels in data.segments.items():
-        own = labels.rows(labels.labels == name)
-        parts.append(replace(own, labels=np.full(len(own), microphone, object)))
-    segments = in_order(parts)  # labelled with their microphones
-    firsts = first_of_groups(segments.starts, segments.ends, EVENT_PAUSE)
-    begin, stop = np.searchsorted(segments.starts[firsts], [start, end])
-    if begin == stop:
-        return
-    events = Spans(segments.starts[firsts], np.maximum.reduceat(segments.ends, firsts))
-    edges = np.append(events.starts, events.ends[-1])
-    seconds = lengths(segments.spans(), edges) / NANOSECONDS
-    highest = np.maximum.reduceat(segments.confidences, firsts)
-    counted = np.isin(events.starts, metrics.minutes.counted(name, events.starts))
-    through = reduce(
-        intersection, [data.gone_through.get(source, NONE) for source in data.segments]
-    )
-    reviewed = rows_at(through, events.starts) >= 0
-    microphones = np.split(segments.labels, firsts[1:])
-    for row in range(begin, stop):
-        yield HomeEvent(
-            name,
-            int(events.starts[row]),
-            int(events.ends[row]),
-            float(seconds[row]),
-            float(highest[row]),
-            tuple(sorted(set(microphones[row].tolist()))),
-            bool(reviewed[row]),
-            not counted[row],
-        )

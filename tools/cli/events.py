@@ -34,7 +34,8 @@ from hearthlog.tools.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from hearthlog.analyzer.activity.daily_metrics import HomeEvent, HomeMetrics
+    from hearthlog.analyzer.activity.daily_metrics import HomeMetrics
+    from hearthlog.analyzer.activity.home_events import HomeEvent
     from hearthlog.analyzer.logs.home_logs import HomeLogs
     from hearthlog.analyzer.logs.spans import Spans
 
@@ -82,12 +83,9 @@ def events(
         wrong_use("--start and --end exclude --day and --night")
     if play and as_json:
         wrong_use("--play and --json exclude each other")
-    from hearthlog.analyzer.activity.daily_metrics import (
-        event_totals,
-        home_events,
-        metrics_of_home,
-    )
+    from hearthlog.analyzer.activity.daily_metrics import metrics_of_home
     from hearthlog.analyzer.activity.home_data import marked_classes, read_home
+    from hearthlog.analyzer.activity.home_events import event_totals, home_events, perhaps_of
     from hearthlog.analyzer.logs.local_time import iso_time, midnight
 
     home_logs, zone = home_and_zone(logs, timezone)
@@ -126,7 +124,9 @@ def events(
             }
         )
     else:
-        _print(found, span, classes, marked, missing, zone)
+        _print_events(found, perhaps_of(data, found), zone)
+        _print_sums(found, span, classes, marked)
+        _tell_pauses(found, span, missing, zone)
     if play:
         _play(found, home_logs, zone)
     end_with_warnings(data.losses)
@@ -259,20 +259,29 @@ _MENTIONED = 600 * 1_000_000_000  # ns: shortest pause in listening that is list
 _MOST_PAUSES = 5
 
 
-def _print(
-    found: Sequence["HomeEvent"],
-    span: ListedSpan,
-    classes: Sequence[str],
-    marked: Collection[str],
-    missing: "Spans",
-    zone: tzinfo,
-) -> None:
+def _form(found: Sequence["HomeEvent"], zone: tzinfo) -> str:
+    """Return how times are written: with the day, if there are several."""
+    days = {_date(event.start, zone) for event in found}
+    return "%a %H:%M:%S" if len(days) > 1 else "%H:%M:%S"
+
+
+def _part(time: int, zone: tzinfo) -> str:
+    """Return the part of a day, or the night, that a time is in."""
+    from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
+
+    moment = local_time(time, zone)
+    if MORNING <= moment.hour < EVENING:
+        return f"{moment:%a} by day"
+    return f"Night to {moment + timedelta(days=moment.hour >= EVENING):%a}"
+
+
+def _print_events(found: Sequence["HomeEvent"], perhaps: Sequence[str], zone: tzinfo) -> None:
+    """Print a line for each event, and one for each part of a day, if there are several."""
     from hearthlog.analyzer.logs.local_time import local_time
     from hearthlog.models.classes import in_words
 
     several = len({name for event in found for name in event.microphones}) > 1
-    days = len({_date(event.start, zone) for event in found}) > 1
-    form = "%a %H:%M:%S" if days else "%H:%M:%S"
+    form = _form(found, zone)
     clock = " or ".join(
         dict.fromkeys(f"{local_time(event.start, zone):%Z}" for event in (found[0], found[-1]))
         if found
@@ -286,23 +295,36 @@ def _print(
         f"when ({clock})" if clock else "when", "sound", next(lengths), next(shares),
         *(["where"] if several else []), "",
     )  # fmt: skip
-    print_table(
-        head,
-        [
+    rows: list[Sequence[str]] = []
+    parts = [_part(event.start, zone) for event in found]
+    for place, (event, might_be) in enumerate(zip(found, perhaps, strict=True)):
+        if len(set(parts)) > 1 and (not place or parts[place] != parts[place - 1]):
+            empty = [""] * (len(head) - 1)
+            rows += [["", *empty]] * bool(place) + [[parts[place], *empty]]
+        notes = [f"perhaps {in_words(might_be).lower()}"] if might_be else []
+        notes += ["reviewed"] * event.reviewed + ["beside a television"] * event.television
+        rows.append(
             (
                 f"{local_time(event.start, zone):{form}}",
                 in_words(event.label),
                 next(lengths),
                 next(shares),
                 *([", ".join(event.microphones)] if several else []),
-                ", ".join(
-                    ["reviewed"] * event.reviewed + ["beside a television"] * event.television
-                ),
+                ", ".join(notes),
             )
-            for event in found
-        ],
-        words=len(head),
-    )
+        )
+    print_table(head, rows, words=len(head))
+
+
+def _print_sums(
+    found: Sequence["HomeEvent"],
+    span: ListedSpan,
+    classes: Sequence[str],
+    marked: Collection[str],
+) -> None:
+    """Print how many events of each class there were."""
+    from hearthlog.models.classes import in_words
+
     for name in classes:
         own = [event for event in found if event.label == name]
         if not own and len(classes) > 1:
@@ -314,6 +336,15 @@ def _print(
         television = f", and {apart} while something like a television sounded" if apart else ""
         by_hand = ", only what people marked: the model does not know it" * (name in marked)
         print(f"{in_words(name)} {span.words}: {sure}{doubt}{television}{by_hand}")
+
+
+def _tell_pauses(
+    found: Sequence["HomeEvent"], span: ListedSpan, missing: "Spans", zone: tzinfo
+) -> None:
+    """Say when nobody listened."""
+    from hearthlog.analyzer.logs.local_time import local_time
+
+    form = _form(found, zone)
     pauses = [
         f"{local_time(start, zone):{form[:-3]}} to {local_time(end, zone):{form[:-3]}}"
         for start, end in missing.pairs()

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from datetime import UTC, date, tzinfo
+from datetime import UTC, tzinfo
 from itertools import islice
 from pathlib import Path
 from shlex import quote
@@ -29,7 +29,7 @@ from hearthlog.tools.cli.terminal import (
 if TYPE_CHECKING:
     from collections import Counter
 
-    from hearthlog.analyzer.activity.daily_metrics import EventTotal
+    from hearthlog.analyzer.activity.home_events import DaySounds
     from hearthlog.analyzer.logs.catalog import Catalog, HomeTotals, LabelAmount
     from hearthlog.analyzer.logs.home_logs import HomeLogs
     from hearthlog.analyzer.logs.summary import LogSummary
@@ -60,7 +60,7 @@ def info(
     from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.models.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
-    from hearthlog.tools.cli.info_summary import Overview, day_lines, next_step
+    from hearthlog.tools.cli.info_summary import Counted, Overview, day_lines, next_step
 
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
@@ -73,12 +73,12 @@ def info(
     following, accuracy = next_step(summary, path), _accuracy(summary, logs)
     scenarios = _scenarios(summary, logs)
     zone, hidden = _zone_and_hidden(logs)
-    day = _last_day(summary, logs, zone)
+    sounds = _last_day(summary, logs, zone)
     if as_json:
         counts = None
-        if day is not None:
-            totals = {name: total._asdict() for name, total in day[1].items()}
-            counts = {"date": day[0].isoformat(), "counts": totals}
+        if sounds is not None:
+            totals = {name: total._asdict() for name, total in sounds.totals.items()}
+            counts = {"date": sounds.day.isoformat(), "counts": totals}
         more = {
             "scenarios": [one._asdict() for one in scenarios],
             "checked": None if accuracy is None else accuracy.as_json(),
@@ -87,11 +87,12 @@ def info(
         }
         print(json.dumps(_as_json(summary) | more, indent=2))
     else:
-        overview = Overview(summary, zone, hidden)
+        start = min((entry.start for entry in logs.between()), default=None)
+        overview = Overview(summary, zone, hidden, Counted(start, sounds))
         print_lines(overview.lines(following))
         _print_amounts(overview)
-        if day is not None:
-            print_lines(day_lines(*day))
+        if sounds is not None:
+            print_lines(day_lines(sounds.day, sounds.totals))
         print_lines(_stream_lines(summary))
         print_lines(_model_lines(summary, path, logs, scenarios))
         print_lines(() if accuracy is None else accuracy.lines())
@@ -141,21 +142,18 @@ def _scenarios(summary: "LogSummary", logs: "HomeLogs") -> "list[RecordedScenari
     return [last[key] for key in sorted(last)]
 
 
-def _last_day(
-    summary: "LogSummary", logs: "HomeLogs", zone: tzinfo
-) -> "tuple[date, dict[str, EventTotal]] | None":
-    """Return the last complete day and its events; None without any."""
-    from hearthlog.analyzer.activity.daily_metrics import read_day_totals
+def _last_day(summary: "LogSummary", logs: "HomeLogs", zone: tzinfo) -> "DaySounds | None":
+    """Return the sounds of the last complete day; None without any."""
+    from hearthlog.analyzer.activity.home_events import read_day_sounds
     from hearthlog.analyzer.errors import DataError
 
     if not summary.segments:
         return None
     try:
-        day = logs.last_complete_day(zone)
-        totals = read_day_totals(logs, day, zone)
+        sounds = read_day_sounds(logs, logs.last_complete_day(zone), zone)
     except (DataError, LogError):  # of no home, or without labels
         return None
-    return (day, totals) if totals else None
+    return sounds if sounds.totals else None
 
 
 def _accuracy(summary: "LogSummary", logs: "HomeLogs") -> "Accuracy | None":
@@ -281,7 +279,8 @@ def _print_amounts(overview: "Overview") -> None:
     for microphone, amounts in overview.bars():
         width = max((len(one.time) for one in amounts), default=0)
         name = max((len(one.words) for one in amounts), default=0)
-        print(printable(f"{microphone}: time labelled as each sound, also that of a television"))
+        what = "time labelled as each sound, sure or not, also by a television"
+        print(printable(f"{microphone}: {what}"))
         for one in amounts:
             bar = long_bar(one.share, _BAR_WIDTH)
             print(printable(f"  {one.words:{name}}  {bar:{_BAR_WIDTH}}  {one.time:>{width}}"))

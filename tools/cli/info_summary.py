@@ -15,8 +15,8 @@ from hearthlog.analyzer.activity.checked_minutes import (
     quiet_weight,
     read_reviewed_labels,
 )
-from hearthlog.analyzer.activity.daily_metrics import EventTotal
 from hearthlog.analyzer.activity.event_counts import FEWEST
+from hearthlog.analyzer.activity.home_events import DaySounds, EventTotal
 from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs
@@ -25,7 +25,7 @@ from hearthlog.analyzer.logs.summary import LogSummary
 from hearthlog.models.classes import ON_TELEVISION, SILENCE, UNKNOWN, class_name, in_words, ordered
 from hearthlog.models.starter import GENERAL
 from hearthlog.schemas.errors import listed
-from hearthlog.schemas.frames import FRAME_SECONDS
+from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import REVIEW_LAYER, log_name
 from hearthlog.schemas.messages.topics import LIVE, REVIEW, is_scenario, topic
 from hearthlog.tools.cli.options import models_folder
@@ -35,6 +35,7 @@ _DAY = 86_400  # seconds
 _NO_SOUNDS = {SILENCE, UNKNOWN}
 _HOUR = 60  # minutes
 _MOST_NAMED = 3  # classes in the line of what was labelled most
+_LEAST_NAMED = 1.0  # minutes while something like a television sounded
 
 
 class ClassAmount(NamedTuple):
@@ -45,6 +46,13 @@ class ClassAmount(NamedTuple):
     share: float
 
 
+class Counted(NamedTuple):
+    """What of the labels of logs a report counts."""
+
+    start: int | None = None  # of the first log, in nanoseconds of UTC: its first sound ends later
+    sounds: DaySounds | None = None  # of the last complete day
+
+
 class Overview:
     """What people want to know of logs: whose they are, what was heard, and whether all is well.
 
@@ -52,10 +60,19 @@ class Overview:
     ----------
     hidden : collection of str
         Classes that no output shows.
+    counted : Counted
+        What a report counts.
     """
 
-    def __init__(self, summary: LogSummary, zone: tzinfo, hidden: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        summary: LogSummary,
+        zone: tzinfo,
+        hidden: Collection[str] = (),
+        counted: Counted = Counted(),  # noqa: B008
+    ) -> None:
         self._summary, self._zone, self._hidden = summary, zone, hidden
+        self._counted = counted
         labels = {name for seconds in summary.segment_seconds.values() for name in seconds}
         logs = [path for path in summary.files if path not in summary.layers]
         self._common = common_names_of(logs[-1], labels) if logs else {}
@@ -115,32 +132,55 @@ class Overview:
             subject += (
                 f", {'microphone' if len(names) == 1 else 'microphones'} {listed(names, 'and')}"
             )
-        if self._summary.span is None:
+        if (span := self._span()) is None:
             return f"{subject}: no messages"
-        first, last = self._summary.span
-        length = _hours(self._summary.seconds)
+        first, last = span
+        length = _hours((last - first) / NANOSECONDS)
         begin, end = (f"{local_time(time, self._zone):%Y-%m-%d %H:%M}" for time in (first, last))
-        span = f"{begin} to {end} ({zone_name(self._zone)})"
-        return f"{subject}: {length}, {span}"
+        return f"{subject}: {length}, {begin} to {end} ({zone_name(self._zone)})"
+
+    def _span(self) -> tuple[int, int] | None:
+        """Return when the logs begin and end; a message may be later than what it is about."""
+        if self._summary.span is None or self._counted.start is None:
+            return self._summary.span
+        first, last = self._summary.span
+        return min(first, self._counted.start), last
 
     def _activity(self) -> str:
-        span, listened = self._summary.seconds, self._listened()
+        first, last = self._span() or (0, 0)
+        span = (last - first) / NANOSECONDS
+        # Two recorders may have microphones of one name.
+        listened = {name: min(own, span) for name, own in self._listened().items()}
         hours = listed([f"{name} {_hours(listened[name])}" for name in sorted(listened)], "and")
         if len(listened) == 1 or len(set(map(_hours, listened.values()))) == 1:
             hours = _hours(next(iter(listened.values())))
         text = f"Listened: {hours} of {_hours(span)}"
-        total: Counter[str] = Counter()
-        for seconds in self._segments().values():
-            total.update(seconds)
-        sounds = [name for name, _ in total.most_common() if class_name(name) not in _NO_SOUNDS]
-        most = [
-            f"{in_words(name).lower()} {_minutes(total[name] / 60)}"
-            for name in sounds
-            if class_name(name) not in self._hidden
-        ][:_MOST_NAMED]
-        if not most:
-            return text
-        return f"{text}; labelled most, a television included: {listed(most, 'and')}"
+        sounds = self._counted.sounds
+        if sounds is None:
+            total: Counter[str] = Counter()
+            for seconds in self._segments().values():
+                total.update(seconds)
+            most = self._most({name: own / 60 for name, own in total.items()})
+            return f"{text}; labelled most, a television included: {most}" if most else text
+        parts = [self._most(sounds.minutes)] if self._most(sounds.minutes) else []
+        if sounds.uncounted >= _LEAST_NAMED:
+            apart = _minutes(sounds.uncounted)
+            parts.append(f"beside something like a television, not counted: {apart}")
+        is_all = sounds.span[0] <= first and last <= sounds.span[1]
+        when = "" if is_all else f" in the 24 hours to {EVENING}:00 of {sounds.day:%A}"
+        return f"{text}; labelled most{when}: {'; '.join(parts)}" if parts else text
+
+    def _most(self, minutes: Mapping[str, float]) -> str:
+        """Return the sounds that lasted longest."""
+        names = [name for name, _ in Counter(minutes).most_common()]
+        return listed(
+            [
+                f"{in_words(name).lower()} {_minutes(minutes[name])}"
+                for name in names
+                if class_name(name) not in {*_NO_SOUNDS, *self._hidden}
+            ][:_MOST_NAMED],
+            "and",
+        )
 
     def _trouble(self) -> str:
         summary = self._summary

@@ -20,8 +20,9 @@ import numpy as np
 import typer
 
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness, read_sureness
-from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics, event_totals
+from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
+from hearthlog.analyzer.activity.home_events import sounds_of_day
 from hearthlog.analyzer.bridge.page import ENGLISH
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
@@ -56,7 +57,7 @@ from hearthlog.models.classes import (
     UNKNOWN,
     in_words,
 )
-from hearthlog.tools.cli.info_summary import Overview, day_lines
+from hearthlog.tools.cli.info_summary import Counted, Overview, day_lines
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.statements import (
     FALSE,
@@ -353,10 +354,6 @@ def _busiest(sound: Spans, start: int, end: int) -> float:
     return float(max(lengths(sound, np.append(edges, end)) / MINUTE)) if end > start else 0.0
 
 
-def _minutes(day: DayMetrics, name: str) -> float:
-    return intersection(day.home.spans.get(name, NONE), day.span).length / MINUTE
-
-
 def _counted_minutes(day: DayMetrics, name: str) -> float:
     return day.spans_of(name).length / MINUTE
 
@@ -566,18 +563,18 @@ def info_statements(
     """Yield the statements of the first lines of `info` about the logs of a day."""
     summary = summarise(logs)
     truth = true_day(sounds, day)
-    true = truth.everywhere
+    true = truth.metrics.to_evening
+    counted = sounds_of_day(day)
     day = day.to_evening
-    totals = event_totals(day.home, int(day.span.starts[0]), int(day.span.ends[0]))
-    line = " ".join(day_lines(day.day, totals))
-    for name, total in totals.items():
+    line = " ".join(day_lines(day.day, counted.totals))
+    for name, total in counted.totals.items():
         if name in _sounds_of(day):
             stated = (total.counted, total.counted)
             text = f"{in_words(name)} {total.counted}"
             minutes = truth.metrics.home.minutes.between(day.span)
             number = minutes.count(name, None).labelled
             yield judge_count(INFO, text, stated, number, modest=is_modest(line))
-    for line in Overview(summary, day.zone).lines(None):
+    for line in Overview(summary, day.zone, (), Counted(None, counted)).lines(None):
         for name in (n for n in _sounds_of(day) if _mentions(line, n)):
             words = re.escape(in_words(name).lower())
             match = re.search(rf"{words} ((?:\d+ h )?[\d.]+ (?:min|s|h)\b)", line, re.IGNORECASE)
@@ -585,7 +582,9 @@ def info_statements(
                 stated = read_minutes(match[1])
                 assert stated is not None
                 text = f"{in_words(name)} {match[1]}"
-                yield judge_length(INFO, text, stated, _minutes(true, name), modest=is_modest(line))
+                yield judge_length(
+                    INFO, text, stated, _counted_minutes(true, name), modest=is_modest(line)
+                )
 
 
 def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:

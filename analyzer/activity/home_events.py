@@ -1,0 +1,182 @@
+"""Events of a home: their list, and the totals of a day."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from datetime import date, tzinfo
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+
+from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
+from hearthlog.analyzer.activity.daily_metrics import (
+    DayMetrics,
+    HomeMetrics,
+    day_of,
+    metrics_of_home,
+)
+from hearthlog.analyzer.activity.doubtful_sounds import without_too_doubtful
+from hearthlog.analyzer.activity.event_counts import MINUTE
+from hearthlog.analyzer.activity.home_data import HomeData, read_home
+from hearthlog.analyzer.logs.home_logs import HomeLogs
+from hearthlog.analyzer.logs.labelling import in_order
+from hearthlog.analyzer.logs.local_time import awake_span, night_span
+from hearthlog.analyzer.logs.spans import (
+    EVENT_PAUSE,
+    NONE,
+    Spans,
+    first_of_groups,
+    intersection,
+    lengths,
+    rows_at,
+    union,
+)
+from hearthlog.models.classes import SILENCE, UNKNOWN
+from hearthlog.schemas.frames import NANOSECONDS
+from hearthlog.schemas.messages.topics import LIVE
+
+_BEFORE = 3600 * NANOSECONDS  # an event that goes on at its start, and a television, begin earlier
+
+
+class HomeEvent(NamedTuple):
+    """Segments of one class, from any microphones, with at most ten seconds between them."""
+
+    label: str
+    start: int  # in nanoseconds of UTC
+    end: int  # likewise
+    seconds: float  # total length of the segments
+    confidence: float  # highest of the segments; 1 for a class that a person marked
+    microphones: tuple[str, ...]  # with a segment, sorted
+    reviewed: bool  # whether a person reviewed its start, at all microphones
+    television: bool  # beside something like a television; no report counts it
+
+    @property
+    def is_unsure(self) -> bool:
+        """Whether the model is not sure of it, and nobody reviewed it."""
+        return self.confidence < UNSURE_BELOW and not self.reviewed
+
+
+class EventTotal(NamedTuple):
+    """Events of a class that a report counts, and those beside something like a television."""
+
+    counted: int
+    television: int
+    unsure: int = 0  # counted, but the model is not sure, and nobody reviewed them
+
+
+def event_totals(metrics: HomeMetrics, start: int, end: int) -> dict[str, EventTotal]:
+    """Count the events of each class that begin in a time span, in nanoseconds of UTC."""
+    own = metrics.between(start, end)
+    totals = {}
+    for name in own.classes:
+        starts = own.events.get(name, NONE.starts)
+        counted = len(own.minutes.counted(name, starts))
+        if len(starts):
+            unsure = own.minutes.count(name, None).unsure
+            totals[name] = EventTotal(counted, len(starts) - counted, unsure)
+    return totals
+
+
+def home_events(
+    data: HomeData, metrics: HomeMetrics, classes: Sequence[str], start: int, end: int
+) -> list[HomeEvent]:
+    """List the events of classes except silence that begin in a span, end exclusive, by start.
+
+    Times are nanoseconds of UTC. Of each class, there are as many as the count of a report and
+    those beside a television together.
+    """
+    found = [
+        event
+        for name in classes
+        if name != SILENCE
+        for event in _events_of(data, metrics, name, start, end)
+    ]
+    return sorted(found, key=lambda event: (event.start, event.label))
+
+
+def _events_of(
+    data: HomeData, metrics: HomeMetrics, name: str, start: int, end: int
+) -> Iterator[HomeEvent]:
+    parts = []
+    for (_, microphone), labels in data.segments.items():
+        own = labels.rows(labels.labels == name)
+        parts.append(replace(own, labels=np.full(len(own), microphone, object)))
+    segments = in_order(parts)  # labelled with their microphones
+    firsts = first_of_groups(segments.starts, segments.ends, EVENT_PAUSE)
+    begin, stop = np.searchsorted(segments.starts[firsts], [start, end])
+    if begin == stop:
+        return
+    events = Spans(segments.starts[firsts], np.maximum.reduceat(segments.ends, firsts))
+    edges = np.append(events.starts, events.ends[-1])
+    seconds = lengths(segments.spans(), edges) / NANOSECONDS
+    highest = np.maximum.reduceat(segments.confidences, firsts)
+    counted = np.isin(events.starts, metrics.minutes.counted(name, events.starts))
+    through = reduce(
+        intersection, [data.gone_through.get(source, NONE) for source in data.segments]
+    )
+    reviewed = rows_at(through, events.starts) >= 0
+    microphones = np.split(segments.labels, firsts[1:])
+    for row in range(begin, stop):
+        yield HomeEvent(
+            name,
+            int(events.starts[row]),
+            int(events.ends[row]),
+            float(seconds[row]),
+            float(highest[row]),
+            tuple(sorted(set(microphones[row].tolist()))),
+            bool(reviewed[row]),
+            not counted[row],
+        )
+
+
+class DaySounds(NamedTuple):
+    """Sounds of the 24 hours to 22:00 of a day, as a report counts them."""
+
+    day: date
+    span: tuple[int, int]  # in nanoseconds of UTC
+    totals: Mapping[str, EventTotal]  # of classes that occurred
+    minutes: Mapping[str, float]  # counted, of classes that have any
+    uncounted: float  # minutes while something like a television sounded, of all classes together
+
+
+def sounds_of_day(day: DayMetrics) -> DaySounds:
+    """Return the sounds of the 24 hours to 22:00 of a day."""
+    day = day.to_evening
+    start, end = int(day.span.starts[0]), int(day.span.ends[0])
+    names = [name for name in day.home.classes if name != SILENCE]
+    minutes = {name: day.spans_of(name).length / MINUTE for name in names}
+    apart = union(*(day.uncounted_spans(name) for name in names))
+    return DaySounds(
+        day.day,
+        (start, end),
+        event_totals(day.home, start, end),
+        {name: length for name, length in minutes.items() if length},
+        apart.length / MINUTE,
+    )
+
+
+def read_day_sounds(logs: HomeLogs, day: date, zone: tzinfo) -> DaySounds:
+    """Read the sounds of the 24 hours to 22:00 of a day.
+
+    Raise `DataError` without labels, `LogError` if segments are invalid.
+    """
+    start, end = night_span(day, zone)[0], awake_span(day, zone)[1]
+    data = read_home(logs, LIVE, start - _BEFORE, (start, end))
+    return sounds_of_day(day_of(metrics_of_home(data), day, zone))
+
+
+def perhaps_of(data: HomeData, events: Sequence[HomeEvent]) -> list[str]:
+    """Return the class that each event might be of, though it is called `unknown`; else nothing."""
+    parts = []
+    for source, labels in data.labelled.items():
+        rest = without_too_doubtful(labels, data.gone_through.get(source, NONE))
+        parts.append(labels.rows(labels.labels != rest.labels))
+    if not parts:
+        return [""] * len(events)
+    doubted = in_order(parts)
+    found = []
+    for event in events:
+        own = (doubted.starts < event.end) & (doubted.ends > event.start)
+        is_any = event.label == UNKNOWN and own.any()
+        found.append(str(doubted.labels[own][0]) if is_any else "")
+    return found
