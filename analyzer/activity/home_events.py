@@ -176,7 +176,9 @@ def perhaps_of(data: HomeData, events: Sequence[HomeEvent]) -> list[str]:
     doubted = in_order(parts)
     found = []
     for event in events:
-        own = (doubted.starts < event.end) & (doubted.ends > event.start)
-        is_any = event.label == UNKNOWN and own.any()
-        found.append(str(doubted.labels[own][0]) if is_any else "")
+        own = []
+        if event.label == UNKNOWN:
+            is_common = (doubted.starts < event.end) & (doubted.ends > event.start)
+            own = doubted.labels[is_common].tolist()
+        found.append(own[0] if own else "")
     return found

@@ -126,7 +126,7 @@ def events(
     else:
         _print_events(found, perhaps_of(data, found), zone)
         _print_sums(found, span, classes, marked)
-        _tell_pauses(found, span, missing, zone)
+        _print_pauses(found, span, missing, zone)
     if play:
         _play(found, home_logs, zone)
     end_with_warnings(data.losses)
@@ -297,8 +297,9 @@ def _print_events(found: Sequence["HomeEvent"], perhaps: Sequence[str], zone: tz
     )  # fmt: skip
     rows: list[Sequence[str]] = []
     parts = [_part(event.start, zone) for event in found]
+    has_parts = len(set(parts)) > 1
     for place, (event, might_be) in enumerate(zip(found, perhaps, strict=True)):
-        if len(set(parts)) > 1 and (not place or parts[place] != parts[place - 1]):
+        if has_parts and (not place or parts[place] != parts[place - 1]):
             empty = [""] * (len(head) - 1)
             rows += [["", *empty]] * bool(place) + [[parts[place], *empty]]
         notes = [f"perhaps {in_words(might_be).lower()}"] if might_be else []
@@ -338,10 +339,10 @@ def _print_sums(
         print(f"{in_words(name)} {span.words}: {sure}{doubt}{television}{by_hand}")
 
 
-def _tell_pauses(
+def _print_pauses(
     found: Sequence["HomeEvent"], span: ListedSpan, missing: "Spans", zone: tzinfo
 ) -> None:
-    """Say when nobody listened."""
+    """Print a notice of when nobody listened."""
     from hearthlog.analyzer.logs.local_time import local_time
 
     form = _form(found, zone)
