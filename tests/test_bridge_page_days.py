@@ -770,7 +770,7 @@ def test_the_night_and_the_day_have_the_counts_that_the_report_of_the_day_has(tm
     assert page["Talking"] == ["0", "0"]
     week = tmp_path / "week.html"
     make_report(find_home_logs([logs]), Period(monday, 7, UTC), week)
-    assert '>Coughing</th><td data-head="Mon 2">3 (+1?)</td>' in week.read_text()
+    assert '>Coughing</th><td data-head="How often">3 (+1?)</td>' in week.read_text()
     total = read_day_sounds(find_home_logs([logs]), monday, UTC).totals["coughing"]
     assert (total.counted, total.unsure) == (4, 1), "as info has it"
 
