@@ -378,6 +378,16 @@ def test_an_entry_says_in_few_words_how_many_of_it_are_not_sure_or_not_counted()
         assert about["unsure"] == 2
 
 
+def test_an_entry_of_a_minute_or_more_has_its_end_and_a_short_one_only_its_start():
+    home = home_at(9, tiled((-3, 9), (1.9999, 4, "coughing"), (3.99, 90, "speech")))
+    shown = ShownBouts(home.moment.now, UTC, home.words, lambda _: "", True)
+    times = {}
+    for label in ("coughing", "speech"):
+        (bout,) = bouts(home.microphones[0].events(label, 0))
+        times[label] = shown.describe(bout)["time"]
+    assert times == {"coughing": "01:59", "speech": "03:59 to 04:00"}
+
+
 def test_a_ring_that_is_not_sure_is_listed_as_not_counted_until_somebody_confirms_it():
     home = home_at(9, tiled((-3, 9), (2, 4, "phone_ring")))
     (ring,) = home.microphones[0].events("phone_ring", 0)

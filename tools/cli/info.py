@@ -60,7 +60,7 @@ def info(
     from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.models.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
-    from hearthlog.tools.cli.info_summary import Counted, Overview, day_lines, next_step
+    from hearthlog.tools.cli.info_summary import Overview, day_lines, next_step
 
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
@@ -88,7 +88,7 @@ def info(
         print(json.dumps(_as_json(summary) | more, indent=2))
     else:
         start = min((entry.start for entry in logs.between()), default=None)
-        overview = Overview(summary, zone, hidden, Counted(start, sounds))
+        overview = Overview(summary, zone, hidden, start, sounds)
         print_lines(overview.lines(following))
         _print_amounts(overview)
         if sounds is not None:

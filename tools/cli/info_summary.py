@@ -46,13 +46,6 @@ class ClassAmount(NamedTuple):
     share: float
 
 
-class Counted(NamedTuple):
-    """What of the labels of logs a report counts."""
-
-    start: int | None = None  # of the first log, in nanoseconds of UTC: its first sound ends later
-    sounds: DaySounds | None = None  # of the last complete day
-
-
 class Overview:
     """What people want to know of logs: whose they are, what was heard, and whether all is well.
 
@@ -60,8 +53,10 @@ class Overview:
     ----------
     hidden : collection of str
         Classes that no output shows.
-    counted : Counted
-        What a report counts.
+    start : int or None
+        When the first log begins, in nanoseconds of UTC: its first message may be later.
+    sounds : DaySounds or None
+        Of the last complete day.
     """
 
     def __init__(
@@ -69,10 +64,11 @@ class Overview:
         summary: LogSummary,
         zone: tzinfo,
         hidden: Collection[str] = (),
-        counted: Counted = Counted(),  # noqa: B008
+        start: int | None = None,
+        sounds: DaySounds | None = None,
     ) -> None:
         self._summary, self._zone, self._hidden = summary, zone, hidden
-        self._counted = counted
+        self._start, self._sounds = start, sounds
         labels = {name for seconds in summary.segment_seconds.values() for name in seconds}
         logs = [path for path in summary.files if path not in summary.layers]
         self._common = common_names_of(logs[-1], labels) if logs else {}
@@ -140,11 +136,11 @@ class Overview:
         return f"{subject}: {length}, {begin} to {end} ({zone_name(self._zone)})"
 
     def _span(self) -> tuple[int, int] | None:
-        """Return when the logs begin and end; a message may be later than what it is about."""
-        if self._summary.span is None or self._counted.start is None:
+        """Return when the logs begin and end."""
+        if self._summary.span is None or self._start is None:
             return self._summary.span
         first, last = self._summary.span
-        return min(first, self._counted.start), last
+        return min(first, self._start), last
 
     def _activity(self) -> str:
         first, last = self._span() or (0, 0)
@@ -155,14 +151,14 @@ class Overview:
         if len(listened) == 1 or len(set(map(_hours, listened.values()))) == 1:
             hours = _hours(next(iter(listened.values())))
         text = f"Listened: {hours} of {_hours(span)}"
-        sounds = self._counted.sounds
+        sounds = self._sounds
         if sounds is None:
             total: Counter[str] = Counter()
             for seconds in self._segments().values():
                 total.update(seconds)
             most = self._most({name: own / 60 for name, own in total.items()})
             return f"{text}; labelled most, a television included: {most}" if most else text
-        parts = [self._most(sounds.minutes)] if self._most(sounds.minutes) else []
+        parts = [most] if (most := self._most(sounds.minutes)) else []
         if sounds.uncounted >= _LEAST_NAMED:
             apart = _minutes(sounds.uncounted)
             parts.append(f"beside something like a television, not counted: {apart}")

@@ -57,7 +57,7 @@ from hearthlog.models.classes import (
     UNKNOWN,
     in_words,
 )
-from hearthlog.tools.cli.info_summary import Counted, Overview, day_lines
+from hearthlog.tools.cli.info_summary import Overview, day_lines
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.statements import (
     FALSE,
@@ -574,7 +574,7 @@ def info_statements(
             minutes = truth.metrics.home.minutes.between(day.span)
             number = minutes.count(name, None).labelled
             yield judge_count(INFO, text, stated, number, modest=is_modest(line))
-    for line in Overview(summary, day.zone, (), Counted(None, counted)).lines(None):
+    for line in Overview(summary, day.zone, sounds=counted).lines(None):
         for name in (n for n in _sounds_of(day) if _mentions(line, n)):
             words = re.escape(in_words(name).lower())
             match = re.search(rf"{words} ((?:\d+ h )?[\d.]+ (?:min|s|h)\b)", line, re.IGNORECASE)

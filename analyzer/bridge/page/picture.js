@@ -178,7 +178,7 @@ function beginRoom(name, isAlone) {
   room.group = draw("g");
   room.ground = draw("path", { class: "ground" });
   room.plot = draw("g", {}, room.ground, room.nights, room.unheard,
-    room.future, room.hourLines, room.moment, room.group, room.hours); // the counts lie over the line of now
+    room.future, room.hourLines, room.moment, room.group, room.hours); // marks lie over the line of now
   room.svg = draw("svg", { class: "picture", role: "group" }, room.plot);
   room.heads = make("tr");
   room.body = make("tbody");

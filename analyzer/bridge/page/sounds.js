@@ -131,7 +131,7 @@ function showAnswer(item, said) {
 
 // Sounds of which one is asked whether they are right: of each class the newest, and the others behind
 // one tap, as are those that were answered.
-const TELEVISION = "television", ANSWERED = "answered", GREY = [150, 158, 170]; // the fold of what does not count, of all classes
+const TELEVISION = "television", ANSWERED = "answered", GREY = [150, 158, 170]; // of a fold of several classes
 const unfolded = new Set(); // keys of folds
 const sum = (numbers) => numbers.reduce((total, each) => total + each, 0);
 
