@@ -9,11 +9,7 @@ from hearthlog.analyzer.activity import SoundEvent
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness
 from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE
 from hearthlog.analyzer.bridge.corrections import NO_CORRECTIONS, EventCorrections
-from hearthlog.analyzer.bridge.home_state import (
-    MOST,
-    ClassSounds,
-    LiveMicrophone,
-)
+from hearthlog.analyzer.bridge.home_state import MOST, ClassSounds, LiveMicrophone
 from hearthlog.analyzer.bridge.page import ENGLISH, Translation, clock, room
 from hearthlog.analyzer.logs.local_time import (
     EVENING,
@@ -39,6 +35,7 @@ from hearthlog.schemas.frames import NANOSECONDS
 BIN = 120 * NANOSECONDS  # as in the picture of the report
 # What people ask about: the page states which of these no model of the home can tell.
 EXPECTED = frozenset({*IMPORTANT, SPEECH, *WATER})
+MAIN = (*IMPORTANT, SPEECH)  # in the week, which has no room for more
 _HOUR = 3600 * NANOSECONDS
 _MOST_TIMES = 40  # of a count
 _MOST_GAPS = 6  # in words
@@ -147,6 +144,7 @@ def picture_of(home: HomeDay) -> Any:
         "date": home.date.isoformat(),
         "title": home.words.long_date(home.date),
         "sentence": day_sentence(home),
+        "night": "" if home.is_past or _is_before_noon(home) else night_sentence(home),
         "now": None if home.is_past else day.place(now - now % BIN),
         "hours": [(day.place(hour), local_time(hour, home.zone).hour) for hour in hours],
         "nights": [(day.place(start), day.place(end)) for start, end in nights],
@@ -253,6 +251,7 @@ def _lane(
     return {
         "label": label,
         "perhaps": bool(sounds.doubtful),
+        "main": label in MAIN,
         "words": name,
         "colour": colour_on_paper(label),
         "bars": bars(counted, day),
@@ -326,8 +325,7 @@ _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 4  # of a class
 _TELEVISION_PAUSE = 20 * MINUTE  # shorter pauses of a television are left out, as in the report
 _MOST_TELEVISION = 2  # times of a television
-_LONGEST = 52  # characters of a sentence about several classes: three lines of a phone
-_LONGEST_OF_ONE = 76  # about one of several
+_LONGEST = 84  # characters of a sentence about several classes: four lines of a phone
 
 
 SoundsOfRooms = dict[str, dict[str, Sequence[SoundEvent]]]  # by class and microphone
@@ -338,17 +336,24 @@ def day_sentence(home: HomeDay) -> str:
 
     A night or a day that was not listened to is never called quiet.
     """
+    is_about_day = home.is_past or not _is_before_noon(home)
+    return _sentence_of_day(home) if is_about_day else night_sentence(home)
+
+
+def _is_before_noon(home: HomeDay) -> bool:
+    return local_time(home.moment.now, home.zone).hour < _NOON
+
+
+def night_sentence(home: HomeDay) -> str:
+    """Return a sentence about the last night, or the one that has begun."""
     moment = home.moment
-    hour = local_time(moment.now, home.zone).hour
-    if home.is_past or hour >= _NOON:
-        return _sentence_of_day(home)
     start, end = moment.night, min(moment.morning, moment.now)
     words, found = home.words, _events_of(home, start, moment.morning)
     is_over = moment.now >= moment.morning
-    rooms, television = _by_room(found), _television(home, start, end)
+    television = _television(home, start, end)
     if not all(each.is_night_covered(moment) for each in home.microphones) or not home.microphones:
         when = words.text("night.partly")
-    elif all(_is_quiet(each, rooms.get(each.name, {}), start, end) for each in home.microphones):
+    elif all(_is_quiet(each, found, start, end) for each in home.microphones):
         when, television = words.text("night.quiet" if is_over else "night.quiet so far"), ""
         found = _important(found)
     else:
@@ -367,22 +372,19 @@ def _sentence_of_day(home: HomeDay) -> str:
         both = (("day.past night", start, morning), ("day.past day", morning, span.end))
         parts = [
             DayPart(
-                words.text(key), _important(_events_of(home, *times)), _television(home, *times)
+                words.text(key if _listened_share(home, *times) >= MOST else f"{key} partly"),
+                _important(_events_of(home, *times)),
+                _television(home, *times),
             )
             for key, *times in both
         ]
     parts = [part for part in parts if _important(part.found) or part.television]
-    shares = [m.listened_share(start, moment.now) for m in home.microphones]
-    if min(shares, default=0) < MOST:
+    is_split = home.is_past and bool(parts)
+    if not is_split and _listened_share(home, start, moment.now) < MOST:
         partly = words.text("day.past partly" if home.is_past else "day.partly")
-        is_split = home.is_past and bool(parts)
-        return _sentence(
-            [DayPart(partly, {}), *parts] if is_split else [day._replace(when=partly)], home
-        )
+        return _sentence([day._replace(when=partly)], home)
     if any(_important(part.found) for part in parts):
-        short = words.text("television") if len(parts) > 1 else ""  # two parts are long enough
-        named = [p._replace(television=short) if short and p.television else p for p in parts]
-        return _sentence(named, home)
+        return _sentence(parts, home)
     detectable = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
     names = [words.inside(words.class_words(name)) for name in ordered(detectable)]
     if not names:
@@ -390,6 +392,11 @@ def _sentence_of_day(home: HomeDay) -> str:
     key = "day.past none" if home.is_past else "day.none"
     none = words.text(key, when=since, classes=words.listed(names, "or"))
     return "; ".join(filter(None, (none, day.television))) + "."
+
+
+def _listened_share(home: HomeDay, start: int, end: int) -> float:
+    """Return the share of a time span to which each microphone listened."""
+    return min((each.listened_share(start, end) for each in home.microphones), default=0.0)
 
 
 def _important(found: SoundsOfRooms) -> SoundsOfRooms:
@@ -407,21 +414,11 @@ def _events_of(home: HomeDay, start: int, end: int) -> SoundsOfRooms:
     return {name: found[name] for name in ordered(found)}
 
 
-def _by_room(found: SoundsOfRooms) -> dict[str, dict[str, Sequence[SoundEvent]]]:
-    """Return events by microphone and class."""
-    rooms: dict[str, dict[str, Sequence[SoundEvent]]] = {}
-    for label, own in found.items():
-        for microphone, events in own.items():
-            rooms.setdefault(microphone, {})[label] = events
-    return rooms
-
-
-def _is_quiet(
-    microphone: LiveMicrophone, found: Mapping[str, Sequence[SoundEvent]], start: int, end: int
-) -> bool:
+def _is_quiet(microphone: LiveMicrophone, found: SoundsOfRooms, start: int, end: int) -> bool:
     """Whether a night was quiet in a room, by its events that count; no television is quiet."""
-    seconds = sum(event.seconds for events in found.values() for event in events)
-    important = sum(len(events) for name, events in found.items() if name in IMPORTANT)
+    own = [(name, event) for name in found for event in found[name].get(microphone.name, ())]
+    seconds = sum(event.seconds for _, event in own)
+    important = sum(name in IMPORTANT for name, _ in own)
     sound = seconds * NANOSECONDS + cut(microphone.television(), start, end).length
     return important <= _QUIET_EVENTS and sound <= _QUIET_SHARE * (end - start)
 
@@ -494,9 +491,7 @@ def _ever_fewer_classes(parts: list[DayPart]) -> Iterator[list[DayPart]]:
 
 def _room_for(parts: Sequence[DayPart]) -> int:
     """Return the most characters of the sentences about some parts of a day."""
-    count = sum(len(part.found) for part in parts)
-    limit = _LONGEST if count > 1 and len(parts) == 1 else _LONGEST_OF_ONE
-    limit += sum(len(part.television) for part in parts)  # is never left out
+    limit = _LONGEST + sum(len(part.television) for part in parts)  # is never left out
     return limit + (sum(len(part.when) for part in parts) if len(parts) > 1 else 0)
 
 
@@ -545,13 +540,15 @@ def _class_and_times(
         if unsure:
             count = len(unsure)
             times = words.more_times(count, len(sure)) if sure else words.times(count)
-            where = _where(name, "" if sure else microphone, unsure, home, most)
-            if parts:
-                text = _times_of(times, where, "", words)
-                parts.append(words.text("perhaps", what=text))
-            else:
-                alike = words.text("alike", **{"class": shown})
-                parts.append(_times_of(times, where, alike, words))
+            # Without those of the sure ones, its times would be taken for all of them.
+            own = (
+                0
+                if sure and most is not None and not _are_times_written(sure, home, most)
+                else most
+            )
+            where = _where(name, "" if sure else microphone, unsure, home, own)
+            text = _times_of(times, where, "" if parts else shown, words)
+            parts.append(words.text("perhaps", what=text))
     return parts
 
 
@@ -574,11 +571,16 @@ def _where(
     each = [clock(event.start, home.zone) for event in events]
     clocks = [*dict.fromkeys(each)]
     when = _clocks_in_words(each, words)
-    if most is not None and len(clocks) > most:
+    if not _are_times_written(events, home, most):
         return place
     if len(clocks) > _MOST_CLOCKS:
         when = words.text("range", first=clocks[0], last=clocks[-1])
     return words.text("room and clocks", room=place, clocks=when) if place else when
+
+
+def _are_times_written(events: Sequence[SoundEvent], home: HomeDay, most: int | None) -> bool:
+    clocks = {clock(event.start, home.zone) for event in events}
+    return most is None or len(clocks) <= most
 
 
 def _clocks_in_words(clocks: Sequence[str], words: Translation) -> str:

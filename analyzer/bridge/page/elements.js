@@ -73,7 +73,7 @@ export function swatch(of) {
 export function colour(element, of) {
   const [red, green, blue] = of.map((part) => (part / 255) ** 2.2);
   const isDark = 0.21 * red + 0.72 * green + 0.07 * blue < 0.2;
-  const light = isDark ? of.map((part) => Math.round(0.55 * part + 0.45 * 255)) : of;
+  const light = isDark ? of.map((part) => Math.round(0.4 * part + 0.6 * 255)) : of;
   element.style.setProperty("--class", `rgb(${of.join(" ")})`);
   element.style.setProperty("--light", `rgb(${light.join(" ")})`);
 }

@@ -1,5 +1,5 @@
 // The page of the home: what sounds now, what works, days, and the stream of news.
-import { ask, draw, keep, make, place, say, send, set, swatch, write } from "./elements.js";
+import { ask, count, counted, draw, inside, keep, make, place, say, send, set, swatch, write } from "./elements.js";
 import { beginMarks, drawAgain, showDay, showMarks, spans } from "./picture.js";
 import { allowSound, showEvents, showRecurring, showSoundsOf } from "./sounds.js";
 
@@ -94,12 +94,14 @@ function showChosen(day) {
 }
 
 // The sentence of a day keeps its height when it gets shorter: what is below stays where it is.
-function showSentence({ date, sentence }) {
+function showSentence({ date, sentence, night }) {
   const element = place("day-sentence");
   element.style.minHeight = element.dataset.date === date ? `${element.offsetHeight}px` : "";
   element.dataset.date = date;
   element.classList.toggle("long", sentence.length > 80);
   write(element, sentence);
+  write(place("night-sentence"), night);
+  place("night-sentence").hidden = !night;
 }
 
 async function readDates() {
@@ -140,6 +142,7 @@ async function readDay(date) {
 }
 
 async function chooseDay(date) {
+  showWeekOnly(false);
   chosen = date === today?.date ? "" : date;
   showPlaceOfDay();
   write(place("day-status"), "");
@@ -176,9 +179,16 @@ function placeQuestions() {
 wide.addEventListener("change", placeQuestions);
 placeQuestions();
 
+// The week alone, until one of its days is chosen.
+function showWeekOnly(isWanted) {
+  if (place("day").classList.toggle("week-only", isWanted)) return;
+  drawAgain(); // what is not shown has no width
+}
+
 function openWeek() {
   const week = place("week");
   week.hidden = !week.hidden;
+  showWeekOnly(!week.hidden);
   place("date").classList.toggle("hidden", week.hidden); // else the list of days has it
   set(place("show-week"), "aria-expanded", String(!week.hidden));
   showWeek();
@@ -207,20 +217,29 @@ async function showWeek() {
   for (const row of rows) {
     const day = row.date === today?.date ? today : await readDay(row.date);
     if (week.hidden || !row.button.isConnected) return;
-    write(row.about, day.error ?? day.sentence);
+    keep(row.about, day.error ? [day.error] : countsOf(day), () => make("span"), write);
     if (day.error) continue;
     drawn.push([row, day]);
     const classes = classesOf(drawn.map(([, each]) => each));
     const longest = drawn.map(([, each]) => each).reduce((a, b) => (b.hours.length > a.hours.length ? b : a));
     for (const each of drawn) showDayOfWeek(...each, classes, longest.hours.length);
     axis.replaceChildren(...hoursBelow(longest));
-    key.replaceChildren(`${say("week rows")} `, ...classes.map(([, it]) => make("span", { class: "entry" }, " ", swatch(it.colour), it.words)));
+    key.replaceChildren(dates.length < 7 ? `${count("days so far", dates.length)} ` : "", `${say("week rows")} `, ...classes.map(([, it]) => make("span", { class: "entry" }, " ", swatch(it.colour), it.words)));
   }
 }
 
-// The classes that sounded on some days, by label, in the order of the lanes.
+// The counts of a day by its night and day, so that days can be compared; its sentence if nothing of importance is counted.
+function countsOf({ rooms, sentence }) {
+  const lines = rooms.flatMap(({ room, lanes }) => lanes.filter(({ main, count: all }) => main && all).map(({ words, counts, unsure }) => {
+    const parts = counts.map((value, index) => say(`part.${index}`, { count: value === null ? say("not known") : counted(value, unsure[index + 1]) }));
+    return say("class and parts", { class: rooms.length > 1 ? `${room}, ${inside(words)}` : words, parts: parts.join(", ") });
+  }));
+  return [...(lines.length ? lines : [sentence]), ...rooms.map(({ unheard }) => unheard).filter(Boolean)];
+}
+
+// The classes that people ask about and that sounded on some days, by label, in the order of the lanes.
 function classesOf(days) {
-  const lanes = days.flatMap(({ rooms }) => rooms).flatMap((room) => room.lanes);
+  const lanes = days.flatMap(({ rooms }) => rooms).flatMap((room) => room.lanes).filter(({ main }) => main);
   const sounded = new Set(lanes.filter(({ bars, pale }) => bars || pale).map(({ label }) => label));
   return [...new Map(lanes.map((lane) => [lane.label, lane]))].filter(([label]) => sounded.has(label));
 }
@@ -233,7 +252,7 @@ function hoursBelow(day) {
   });
 }
 
-const LANE = 8, GAP = 1; // pixels of a class in a day of the week
+const LANE = 12, GAP = 2; // pixels of a class in a day of the week
 
 function showDayOfWeek(row, day, classes, mostHours) {
   const full = Math.max(Math.floor(row.svg.getBoundingClientRect().width), 100), width = full * day.hours.length / mostHours;

@@ -81,15 +81,11 @@ function showTimes() {
 
 function uncountedNote({ uncounted, uncounted_times: times }) {
   if (!uncounted) return "";
-  const text = count("uncounted", uncounted);
+  const text = count("uncounted in words", uncounted);
   return times ? say("uncounted at", { text, times }) : say("uncounted note", { text });
 }
 
-// The count of a lane; if it is 0, why the lane has marks nevertheless.
-function figureOf({ count: value, unsure, uncounted }) {
-  if (value) return counted(value, unsure[0]);
-  return uncounted ? `${value ?? "–"} · ${count("uncounted", uncounted)}` : "";
-}
+const figureOf = ({ count: value, unsure }) => (value === null ? "–" : counted(value, unsure[0]));
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 const dayName = () => shown.now === null ? shown.title : say("since evening");
 
@@ -143,19 +139,23 @@ function showZero({ zero, rows, lanes }) {
   rows.forEach(({ element, counts }, index) => {
     element.hidden = isFolded && none[index] && !counts.includes(open?.button);
   });
-  const names = lanes.filter(({ label, perhaps }, index) => none[index] && label !== "unknown" && !perhaps).map(({ words }) => inside(words));
-  write(zero.button, say("zero", { classes: names.join(", ") }));
-  zero.element.hidden = !names.length;
+  const named = lanes.filter(({ label }, index) => none[index] && label !== "unknown");
+  const texts = [["zero", false], ["zero perhaps", true]].map(([key, isPerhaps]) => {
+    const names = named.filter(({ perhaps }) => perhaps === isPerhaps).map(({ words }) => inside(words));
+    return names.length ? say(key, { classes: names.join(", ") }) : "";
+  }).filter(Boolean);
+  write(zero.button, texts.join(". "));
+  zero.element.hidden = !texts.length;
 }
 
 function showRow(row, it, where, { columns, now }) {
   const isPast = now === null;
   if (!row.name.firstChild) {
     row.name.append(make("span", { class: "with-swatch" }, swatch(it.colour),
-      make("span", {}, breakable(it.words), row.comma = make("span", { class: "hidden" }), row.about = make("span", { class: "about" }))));
+      make("span", {}, breakable(it.words), row.comma = make("span", { class: "hidden" }), row.about = make("span", { class: "about", "aria-hidden": "true" }))));
   }
   const note = it.uncounted ? count("uncounted", it.uncounted) : "";
-  write(row.comma, note && ", "); // for a screen reader, which reads on
+  write(row.comma, note && `, ${count("uncounted in words", it.uncounted)}`); // for a screen reader
   write(row.about, note);
   it.counts.forEach((value, index) => {
     row.cells[index].className = value ? "" : "none";
@@ -269,6 +269,13 @@ function showTable(room, day) {
   showZero(room);
 }
 
+// What the signs in the table mean.
+function showKey(lanes) {
+  const key = [["key unsure", lanes.some(({ unsure }) => unsure.some(Boolean))], ["key uncounted", lanes.some(({ uncounted }) => uncounted)]];
+  write(place("counts-key"), key.filter(([, isThere]) => isThere).map(([each]) => say(each)).join(" · "));
+  place("counts-key").hidden = !place("counts-key").textContent;
+}
+
 let rooms = [], roomsOf = "", shown = null;
 
 export function showDay(day) {
@@ -281,6 +288,7 @@ export function showDay(day) {
   place("key-unheard").hidden = !day.rooms.some(({ gaps }) => gaps.length);
   place("key-unsure").hidden = !day.rooms.some(({ lanes }) => lanes.some((lane) => lane.unsure_bars));
   place("key-beside").hidden = !day.rooms.some(({ lanes }) => lanes.some(({ pale }) => pale));
+  showKey(day.rooms.flatMap(({ lanes }) => lanes));
   const key = JSON.stringify(day.rooms.map(({ room }) => room));
   if (key !== roomsOf) {
     close();

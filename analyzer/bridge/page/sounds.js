@@ -88,16 +88,22 @@ function choice(name, value, ...words) {
 }
 
 // A form in which one says what a sound was; `save` is told it, and answers what came of it.
-function form(item, { legend, choices, save }) {
+function form(item, { legend, choices, elsewhere = [], leave, save }) {
   const own = make("input", { type: "text", maxlength: 64, autocomplete: "off", "aria-label": say("what") });
-  const something = choice("label", "", say("own"));
+  const something = choice("label", "", say("own")), others = elsewhere.map(([label, words]) => choice("label", label, words));
   something.classList.add("own");
+  for (const each of [...others, something]) each.classList.add("other");
   something.append(own);
   own.addEventListener("input", () => { something.firstElementChild.checked = true; });
   const problem = make("p", { class: "problem", role: "alert" });
   const button = make("button", {}, say("save")), cancel = make("button", { type: "button", class: "quiet" }, say("cancel"));
   const question = make("form", {}, make("fieldset", {}, make("legend", {}, legend),
-    ...choices.map(([label, words]) => choice("label", label, words)), something), problem, make("div", { class: "save" }, button, cancel));
+    ...choices.map(([label, words]) => choice("label", label, breakable(words))), ...others, something), problem, make("div", { class: "save" }, button, cancel));
+  if (leave) {
+    const unknown = make("button", { type: "button", class: "quiet" }, say("do not know"));
+    unknown.addEventListener("click", () => { leave(); close(); });
+    button.after(unknown);
+  }
   question.addEventListener("submit", async (submitted) => {
     submitted.preventDefault();
     const label = new FormData(question).get("label") || own.value.trim();
@@ -119,6 +125,23 @@ function form(item, { legend, choices, save }) {
   return question;
 }
 
+// Sounds of which somebody does not know what they were: this browser asks no more.
+const LEFT_OPEN = "left open", MOST_LEFT = 200;
+const leftOpen = new Set(readLeftOpen());
+
+function readLeftOpen() {
+  try { return JSON.parse(localStorage.getItem(LEFT_OPEN)) ?? []; } catch { return []; } // a browser may forbid it
+}
+
+function leaveOpen(item) {
+  leftOpen.add(item.entry.id);
+  try { localStorage.setItem(LEFT_OPEN, JSON.stringify([...leftOpen].slice(-MOST_LEFT))); } catch { /* until it is closed */ }
+  item.isAnswered = true;
+  showAnswer(item, say("left open"));
+}
+
+const isDone = ({ id, said }) => said || leftOpen.has(id);
+
 function showAnswer(item, said) {
   write(item.said, said);
   item.element.classList.toggle("reviewed", Boolean(said) && item.isReviewable);
@@ -136,7 +159,7 @@ const unfolded = new Set(); // keys of folds
 const sum = (numbers) => numbers.reduce((total, each) => total + each, 0);
 
 function folded(every) {
-  const done = every.filter(({ id, said }) => said && !lists.look.get(id)?.isAnswered), look = every.filter((each) => !done.includes(each));
+  const done = every.filter((each) => isDone(each) && !lists.look.get(each.id)?.isAnswered), look = every.filter((each) => !done.includes(each));
   const entries = [], seen = new Map();
   for (const entry of look) {
     const same = entry.doubtful ? [] : look.filter(({ label, doubtful, room }) => label === entry.label && room === entry.room && !doubtful);
@@ -255,7 +278,9 @@ function beginBout(entry) {
     const isClear = !doubtful && label !== "unknown" && item.yes.hidden; // else there is a button for it
     return {
       legend: say("question", { class: words, time }),
-      choices: [...(isClear ? [[label, say("right", { class: words })]] : []), ...others, ["television", say("television")], ["silence", say("silence")]],
+      choices: [...(isClear ? [[label, say("right", { class: words })]] : []), ...others],
+      elsewhere: [["television", say("television")], ["silence", say("silence")]],
+      leave: item.entry.look && !doubtful && (() => leaveOpen(item)),
       save: (chosen) => send(isSingle ? "mark-one" : "mark", { event: id, label: chosen }),
     };
   });
@@ -324,7 +349,7 @@ function isAtRest() {
 
 // What was answered goes behind its tap when nobody looks.
 function foldAnswered() {
-  const answered = [...lists.look.values()].filter(({ isAnswered, entry }) => isAnswered && entry?.said);
+  const answered = [...lists.look.values()].filter(({ isAnswered, entry }) => isAnswered && entry && isDone(entry));
   if (!answered.length || !isAtRest()) return;
   for (const item of answered) item.isAnswered = false;
   showList(shownEvents);

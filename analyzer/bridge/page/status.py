@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity import ANY_SOUND, HOLD_SECONDS, SoundEvent
+from hearthlog.analyzer.activity.doubtful_sounds import is_too_doubtful
 from hearthlog.analyzer.activity.segments import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import OutputUpdate
@@ -74,12 +75,26 @@ def _sounds_in_words(microphone: LiveMicrophone, words: Translation) -> str:
     if not microphone.is_listening():
         return words.text("now.not listening")
     active, uncounted = active_classes(microphone), _television_classes(microphone)
-    names = [words.class_words(label) for label in active if label not in uncounted]
+    unsure = [label for label in active if _may_be_another(microphone, label)]
+    named = [label for label in active if label not in unsure and label not in uncounted]
+    names = [words.class_words(label) for label in named]
     names += [words.text("now.television")] * bool(uncounted)
+    for label in unsure:  # a carer would take it for a telephone that nobody answers
+        name = words.inside(words.class_words(label))
+        later, first = words.text("perhaps", what=name), words.text("doubt.perhaps", classes=name)
+        names.append(later if names else first)
     if names:
         return words.listed([names[0], *map(words.inside, names[1:])])
     is_sound_now = microphone.active.is_active(ANY_SOUND)
     return words.text("now.sound") if is_sound_now else words.class_words(SILENCE)
+
+
+def _may_be_another(microphone: LiveMicrophone, label: str) -> bool:
+    """Whether a label without certainty is none, as of a telephone, and no sure event is going."""
+    if not is_too_doubtful(label, 0.0):
+        return False
+    last, end = microphone.last_event(label), microphone.active.time - _HELD
+    return last is None or last.end < end or is_too_doubtful(label, last.confidence)
 
 
 def active_classes(microphone: LiveMicrophone) -> list[str]:
