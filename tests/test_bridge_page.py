@@ -665,7 +665,7 @@ def test_a_microphone_that_is_away_is_not_said_to_listen(output, why):
 
 
 @pytest.mark.parametrize(
-    ("minutes", "words"), [(60, "Something like a television"), (2, "Telephone ringing")]
+    ("minutes", "words"), [(60, "Something like a television"), (2, "Perhaps telephone ringing")]
 )
 def test_a_ring_of_a_television_is_not_called_a_telephone_that_rings_now(tmp_path, minutes, words):
     with serving(tmp_path) as home:

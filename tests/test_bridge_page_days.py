@@ -193,12 +193,12 @@ def test_the_sentence_is_true_and_calls_nothing_quiet_that_was_not_listened_to(
             (4, 14),
             [*NIGHT[1:], (9, 3, "coughing")],
             (
-                "Only part of the day was heard. In the night: coughing once (06:13). By day: "
-                "coughing once (09:00)."
+                "In the night, as far as listened to: coughing once (06:13). By day: coughing "
+                "once (09:00)."
             ),
             (
-                "Nicht durchgehend mitgehört. In der Nacht: einmal Husten (06:13). Am Tag: einmal "
-                "Husten (09:00)."
+                "In der Nacht, soweit mitgehört: einmal Husten (06:13). Am Tag: einmal Husten "
+                "(09:00)."
             ),
         ),
         (
@@ -267,13 +267,13 @@ def coughs_at(*hours, sure=True):
         ),
         (
             coughs_at(0.67, 6.44, sure=False),
-            "something like coughing twice (00:40 and 06:26)",
-            "zweimal etwas wie Husten (00:40 und 06:26)",
+            "perhaps coughing twice (00:40 and 06:26)",
+            "vielleicht zweimal Husten (00:40 und 06:26)",
         ),
         (
             coughs_at(3, sure=False),
-            "something like coughing once (03:00)",
-            "einmal etwas wie Husten (03:00)",
+            "perhaps coughing once (03:00)",
+            "vielleicht einmal Husten (03:00)",
         ),
         (
             [*coughs_at(3), *coughs_at(4, sure=False), (5, 3, "crying", 0.9)],
@@ -282,13 +282,16 @@ def coughs_at(*hours, sure=True):
         ),
         (
             [*coughs_at(1, 2, 2.5, 3), (5, 3, "crying", 0.9)],
-            "coughing 4 times and crying once",
-            "4\N{NON-BREAKING HYPHEN}mal Husten und einmal Weinen",
+            "coughing 4 times (01:00, 02:00, 02:30 and 03:00) and crying once (05:00)",
+            (
+                "4\N{NON-BREAKING HYPHEN}mal Husten (01:00, 02:00, 02:30 und 03:00) und einmal Weinen "
+                "(05:00)"
+            ),
         ),
         (
             [*coughs_at(3), (5, 3, "crying", 0.6)],
-            "coughing once and something like crying once",
-            "einmal Husten und einmal etwas wie Weinen",
+            "coughing once (03:00) and perhaps crying once (05:00)",
+            "einmal Husten (03:00) und vielleicht einmal Weinen (05:00)",
         ),
     ],
 )
@@ -344,10 +347,13 @@ def test_a_count_with_what_is_not_sure_is_one_grammar_in_the_day_and_beside_othe
         *coughs_at(*(12 + n / 2 for n in range(11)), sure=False),
     ]
     home = home_at(19, tiled((-3, 19), *coughs, *rings))
-    assert picture_of(home)["sentence"] == ("Since 07:00: coughing 4 times, perhaps 11 more.")
+    assert picture_of(home)["sentence"] == (
+        "Since 07:00: coughing 4 times (08:00, 08:30, 09:06 and 10:06), perhaps 11 more."
+    )
     german = home._replace(words=translation_for("de"))
     assert picture_of(german)["sentence"] == (
-        "Seit 07:00: 4\N{NON-BREAKING HYPHEN}mal Husten, vielleicht noch "
+        "Seit 07:00: 4\N{NON-BREAKING HYPHEN}mal Husten (08:00, 08:30, 09:06 und 10:06), "
+        "vielleicht noch "
         "11\N{NON-BREAKING HYPHEN}mal."
     )
 
@@ -388,14 +394,14 @@ def test_an_entry_of_a_minute_or_more_has_its_end_and_a_short_one_only_its_start
     assert times == {"coughing": "01:59", "speech": "03:59 to 04:00"}
 
 
-def test_a_ring_that_is_not_sure_is_listed_as_not_counted_until_somebody_confirms_it():
+def test_a_ring_that_is_not_sure_is_listed_as_not_recognised_until_somebody_confirms_it():
     home = home_at(9, tiled((-3, 9), (2, 4, "phone_ring")))
     (ring,) = home.microphones[0].events("phone_ring", 0)
     ring = ring._replace(confidence=0.6)
     (bout,) = bouts([ring])
     shown = ShownBouts(home.moment.now, UTC, home.words, lambda _: "", True)
     about = shown.describe(bout)
-    assert (about["sure"], about["look"]) == ("not sure, so not counted", False)
+    assert (about["sure"], about["look"]) == ("not sure, so counted as not recognised", False)
     assert about["words"] == "Perhaps telephone ringing"
     confirmed = shown._replace(correction=lambda _: "You said: Telephone ringing")
     assert confirmed.describe(bout)["sure"] == ""
@@ -416,18 +422,20 @@ def test_a_sentence_about_several_classes_is_short_and_begins_with_the_most_impo
     home = home_at(23, tiled((-3, 23), *sounds, *rings))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "yelling", "phone_ring"]
     assert picture_of(home)["sentence"] == (
-        "By day: coughing 4 times, perhaps once more; shouting once."
+        "By day: coughing 4 times, perhaps once more; shouting once (11:00)."
     )
     counts = {lane["label"]: lane["count"] for lane in picture_of(home)["rooms"][0]["lanes"]}
     assert counts["phone_ring"] == 3, "the rest is below"
     home = home_at(23, tiled((-3, 23), *sounds[:-1], *rings))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "phone_ring"]
-    assert picture_of(home)["sentence"] == ("By day: coughing 4 times, perhaps once more (12:00).")
+    assert picture_of(home)["sentence"] == (
+        "By day: coughing 4 times (08:00, 08:30, 09:06 and 10:06), perhaps once more (12:00)."
+    )
     crying = [(hour, 3, "crying", 0.9) for hour in (13, 14, 15)]
     home = home_at(23, tiled((-3, 23), *sounds, *crying))._replace(is_past=True)
     home.microphones[0].names = ["silence", "coughing", "crying", "yelling"]
     assert picture_of(home)["sentence"] == (
-        "By day: coughing 4 times, perhaps once more; crying 3 times; shouting once."
+        "By day: coughing 4 times, perhaps once more; crying 3 times; shouting once (11:00)."
     ), "none that worries is left out"
 
 
@@ -561,7 +569,7 @@ def test_what_people_say_of_a_sound_is_what_the_page_counts(tmp_path):
     assert [time for time, *_ in lanes["coughing"]["times"][0]["times"]] == ["13:24", "11:30"]
     assert [time for time, *_ in lanes["crying"]["times"][0]["times"]] == ["10:30"]
     assert picture["sentence"].startswith(
-        "Since 07:00: coughing twice; crying once (10:30); something like"
+        "Since 07:00: coughing twice (11:30 and 13:24); crying once (10:30); something like"
     )
 
 
@@ -608,7 +616,7 @@ def test_times_of_the_first_class_are_there_though_a_telephone_rang():
     coughs = coughs_at(-0.53, 1.86, 2.27, 6.02, sure=False)
     home = home_at(9, tiled((-3, 9), *rings, *coughs, (1, 400, "speech", 0.9)))
     assert picture_of(home)["sentence"] == (
-        "Last night: something like coughing 4 times (23:28, 01:51, 02:16 and 06:01)."
+        "Last night: perhaps coughing 4 times (23:28, 01:51, 02:16 and 06:01)."
     )
 
 
@@ -962,7 +970,7 @@ def test_a_german_browser_gets_german_words_dates_and_errors(lived):
     assert "Letzte Geräusche" in page
     assert "{{" not in page
     _, day = got(lived, f"/day?{lived.date}", **GERMAN)
-    assert {"Husten", "Weinen", "Telefon"} <= {n["words"] for n in day["rooms"][0]["lanes"]}
+    assert {"Husten", "Weinen", "Telefonklingeln"} <= {n["words"] for n in day["rooms"][0]["lanes"]}
     assert day["title"].split(",")[0] in translation_for("de").texts["weekdays"].split()
     assert got(lived, "/day?x", **GERMAN)[1]["error"].startswith("Von diesem Tag")
     origin = f"http://127.0.0.1:{lived.port}"
@@ -1322,7 +1330,7 @@ def test_one_tap_confirms_a_sound_and_its_row_folds_away_when_nobody_looks(phone
         phone.until(f"{count} === '1 (+1?)'")
         assert phone.of("document.querySelectorAll('#look > li').length") == 2, "it stays in sight"
         phone.of("(() => { const now = Date.now; Date.now = () => now() + 60000; })()")
-        phone.shows("#look .fold .what", "Answered · 1")
+        phone.shows("#look .fold .what", "Done · 1")
         drawn = "[...document.querySelectorAll('#look > li')].filter((e) => e.offsetHeight)"
         assert phone.of(f"{drawn}.length") == 2
         phone.of("document.querySelector('#look .fold button').click()")
@@ -1377,7 +1385,7 @@ def test_a_dark_class_is_lighter_on_a_dark_ground_and_what_does_not_count_is_pal
         )
         phone.until("document.getElementById('brown')")
         brown = phone.of("getComputedStyle(document.getElementById('brown')).backgroundColor")
-        assert brown == {"light": "rgb(139, 69, 19)", "dark": "rgb(191, 153, 125)"}[scheme]
+        assert brown == {"light": "rgb(139, 69, 19)", "dark": "rgb(209, 181, 161)"}[scheme]
 
 
 _SHIFTS = """

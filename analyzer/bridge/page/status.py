@@ -75,9 +75,9 @@ def _sounds_in_words(microphone: LiveMicrophone, words: Translation) -> str:
     if not microphone.is_listening():
         return words.text("now.not listening")
     active, uncounted = active_classes(microphone), _television_classes(microphone)
-    unsure = [label for label in active if _may_be_another(microphone, label)]
-    named = [label for label in active if label not in unsure and label not in uncounted]
-    names = [words.class_words(label) for label in named]
+    counted = [label for label in active if label not in uncounted]
+    unsure = [label for label in counted if _may_be_another(microphone, label)]
+    names = [words.class_words(label) for label in counted if label not in unsure]
     names += [words.text("now.television")] * bool(uncounted)
     for label in unsure:  # a carer would take it for a telephone that nobody answers
         name = words.inside(words.class_words(label))
