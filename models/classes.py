@@ -53,7 +53,7 @@ class SoundClass(NamedTuple):
 # fmt: off
 CLASSES = (
     SoundClass(COUGHING,         (210,  94,   1),   1.0, "Coughing",
-               "Bouts of coughing", ("cough",)),
+               "Times of coughing", ("cough",)),
     SoundClass(CRYING,           ( 11, 112, 196),  10.0, "Crying",
                "Times of crying", ("crying_sobbing", "crying_and_sobbing")),
     SoundClass(YELLING,          (232, 160,   0),  10.0, "Shouting",

@@ -220,7 +220,7 @@ def home_sound(data: HomeData, metrics: HomeMetrics) -> HomeSegments:
 
 # Of composed homes, 100 of 100 ranges of coughing hold in the night, but 38 of household sounds.
 RANGED_AT_NIGHT = frozenset(WORRYING)
-_RISING = 4  # local hour; earlier sound belongs to the night
+RISING = 4  # local hour; earlier sound belongs to the night
 HOUR = 60 * MINUTE
 MOST = 0.75  # minimum covered share for a reported 0, and for comparisons of days
 _Figure = TypeVar("_Figure", Count, Duration)
@@ -430,13 +430,13 @@ class DayMetrics:
 
         The first block of a day begins at 04:00.
         """
-        edges = np.arange(at_hour(self.day, _RISING, self.zone), self.span.ends[0] + 1, _BIN)
+        edges = np.arange(at_hour(self.day, RISING, self.zone), self.span.ends[0] + 1, _BIN)
         return edges[:-1][lengths(self.home.sound, edges) >= _BUSY]
 
     @property
     def first(self) -> Clock | None:
         """Start of the first of the `active` blocks; None if unknown, or without a block."""
-        before = at_hour(self.day, _RISING, self.zone)
+        before = at_hour(self.day, RISING, self.zone)
         return self._clock(self.active[:1], lambda time: (before, time))
 
     @property

@@ -1,4 +1,4 @@
-"""Headline of a report: what a day or a week was like, in two or three short sentences."""
+"""Headline of a report: what a day or a week was like, in a few short sentences."""
 
 from collections.abc import Iterator, Sequence
 from datetime import timedelta
@@ -26,6 +26,7 @@ from hearthlog.analyzer.report.wording import (
     several_in_words,
     short_day,
     times_in_words,
+    times_of,
     weekday,
 )
 from hearthlog.models.classes import (
@@ -57,18 +58,19 @@ class Headline(NamedTuple):
 
 
 def day_headline(day: DayMetrics) -> Headline:
-    """Return the headline of a day: whether it was quiet, coughing, crying and shouting.
+    """Return the headline of a day: coughing, crying and shouting, and whether it was quiet.
 
-    A day is quiet if three quarters of it, and of the time from 07:00 to 22:00, were recorded,
+    A day is quiet if three quarters of it, and of the time from 07:00 to 22:00, were listened to,
     and if at most six of its hours have five minutes of sound or more. Of a day with less than
-    that: what was labelled, and how much is missing.
+    that: what was labelled, and how much is missing. What was counted comes first, if anything.
     """
-    rest = [*map(_sentence, _sounds(day)), *_missing(day)]
-    return Headline(f"{_day(day)}.", " ".join(rest))
+    counts, quiet = [*map(_sentence, _sounds(day))], f"{_day(day)}."
+    first, rest = (" ".join(counts), [quiet]) if counts else (quiet, [])
+    return Headline(first, " ".join([*rest, *_steady(day), *_missing(day)]))
 
 
 def week_headline(days: Sequence[DayMetrics], counted: Sequence[DayMetrics]) -> Headline:
-    """Return the headline of a week: its quiet days; coughing, crying and shouting.
+    """Return the headline of a week: coughing, crying and shouting; its quiet days.
 
     Sounds are those of the `counted` days, which may begin in the evening before.
     """
@@ -76,21 +78,32 @@ def week_headline(days: Sequence[DayMetrics], counted: Sequence[DayMetrics]) -> 
     complete_days = [day for day in recorded if _is_covered(day)]
     others = [day for day in days if day not in complete_days]
     covered = [day for day in counted if day.coverage.length]
-    sounds = (_sentence(text) for text in _sounds_of_week(covered, len(days)))
-    first = f"{_quiet_days(complete_days, len(others))}{_too_little(complete_days, others)}."
-    return Headline(first, " ".join(sounds))
+    if complete_days and len(recorded) == len(covered) == 1:
+        return _only_day(recorded[0], [text for text, _ in _sounds_of_week(covered, len(days))])
+    sounds = " ".join(_sentence(f"{a}{b}") for a, b in _sounds_of_week(covered, len(days)))
+    quiet = f"{_quiet_days(complete_days, len(others))}{_too_little(complete_days, others)}."
+    return Headline(sounds, quiet) if sounds else Headline(quiet, "")
+
+
+def _only_day(day: DayMetrics, sounds: Sequence[str]) -> Headline:
+    """Return the headline of a week of which a single day was listened to."""
+    only = f"Only {weekday(day.day)} was listened to"
+    quiet = _day(day, weekday(day.day) if day.before_logs or day.after_logs else "it")
+    if sounds:
+        return Headline(f"{only}: {'; '.join(sounds)}.", _sentence(quiet))
+    return Headline(f"{only}: {quiet}.", "")
 
 
 def _quiet_days(days: Sequence[DayMetrics], others: int) -> str:
     """Return how many of the judged days of a week were quiet."""
     if not days:
-        return f"Too little was recorded to judge any of the {number_in_words(others)} days"
+        return f"The box listened too little to judge any of the {number_in_words(others)} days"
     if others and len(days) == 1:
         return _day(days[0])
     quiet = [day for day in days if is_quiet(day)]
     which = {0: "none", len(days): "all" if len(days) > _ONE_MORE else "both"}
     was = _capital(which.get(len(quiet), number_in_words(len(quiet))))
-    of = f"{number_in_words(len(days))}{' recorded' * bool(others)} days"
+    of = f"{number_in_words(len(days))} days{' listened to' * bool(others)}"
     but = " but for a few hours" if any(_lively(day).any() for day in quiet) else ""
     return f"{was} of the {of} {'were' if len(quiet) > 1 else 'was'} quiet{but}"
 
@@ -106,19 +119,18 @@ def _too_little(days: Sequence[DayMetrics], others: Sequence[DayMetrics]) -> str
     return f"; there are no logs of the {which}"
 
 
-def _sounds_of_week(recorded: Sequence[DayMetrics], number: int) -> Iterator[str]:
-    """Yield the counts of coughing, crying and shouting of some of a number of days."""
+def _sounds_of_week(recorded: Sequence[DayMetrics], number: int) -> Iterator[tuple[str, str]]:
+    """Yield the counts of coughing, crying and shouting of some of a number of days; and when."""
     for name in WORRYING:
         counts = [(count, day) for day in recorded if (count := day.count(name)) and count.labelled]
         if not counts:
             continue
         total = sum((count for count, _ in counts), Count())
         most, day = max(counts, key=lambda pair: pair[0].labelled)
-        when = f"{len(counts)} days" if len(counts) > 1 else short_day(day.day)
-        text = amount(name, total, f"on {when}")
+        when = f" on {len(counts)} days" if len(counts) > 1 else f" on {short_day(day.day)}"
         if len(counts) > 1 and most.labelled > total.labelled / number:
-            text += f"; most on {short_day(day.day)}: {most.labelled}"
-        yield text
+            when += f"; most on {short_day(day.day)}: {most.labelled}"
+        yield amount(name, total), when
 
 
 def is_quiet(day: DayMetrics) -> bool:
@@ -127,29 +139,33 @@ def is_quiet(day: DayMetrics) -> bool:
 
 
 def amount(name: str, count: Count, when: str = "", *, named: bool = True) -> str:
-    """Return a number of events, as labelled: `2 bouts of coughing`, `crying once`.
+    """Return a number of events, as labelled: `2 toilet flushes`, `coughing once`.
 
-    Without the name of the class, just `2`, `once`. With events that are not sure, `2 bouts of
-    coughing, perhaps 3 more`, or `perhaps 3 bouts of coughing`. `when` goes after the name.
+    Without the name of the class, just `2`, `once`. With events that are not sure, `coughing twice,
+    perhaps 3 more`, or `perhaps coughing 3 times`. `when` goes after the name.
     """
-    unsure = count.unsure if count.range is None else 0
-    sure = count.labelled - unsure
-    perhaps, number = ("", sure) if sure or not unsure else ("perhaps ", unsure)
+    perhaps, number, more = _amounts(count)
     several, sound = several_in_words(name).lower(), in_words(name).lower()
     if several.startswith("times of "):
-        often = {1: "once", 2: "twice"}.get(number, f"{number} times")
-        text = f"{perhaps}{sound} {often}" if named else f"{perhaps}{often}"
+        text = f"{perhaps}{sound} {times_of(number)}" if named else f"{perhaps}{times_of(number)}"
     else:
-        one = several.replace("bouts", "bout", 1) if several.startswith("bouts ") else sound
-        text = f"{perhaps}{number} {one if number == 1 else several}"
+        text = f"{perhaps}{number} {sound if number == 1 else several}"
         text = text if named else f"{perhaps}{number}"
-    more = f", perhaps {unsure} more" if unsure and not perhaps else ""
     return f"{text} {when}".strip() + more
 
 
-def _day(day: DayMetrics) -> str:
+def _amounts(count: Count) -> tuple[str, int, str]:
+    """Return `perhaps ` if no event is sure, the number, and how many more there may be."""
+    unsure = count.unsure if count.range is None else 0
+    sure = count.labelled - unsure
+    if unsure and not sure:
+        return "perhaps ", unsure, ""
+    return "", sure, f", perhaps {unsure} more" if unsure else ""
+
+
+def _day(day: DayMetrics, name: str = "") -> str:
     """Return whether a day was quiet, and how much of it is known, without a full stop."""
-    name = weekday(day.day)
+    name = name or weekday(day.day)
     hours = rounded(day.coverage.length / MINUTE) / 60  # as the page says it
     hours_of_day = rounded(day.logged.length / HOUR)
     if states_missing_time(day):
@@ -160,11 +176,10 @@ def _day(day: DayMetrics) -> str:
     name += f" {'to' if day.before_logs else 'until'} {end}" * bool(day.after_logs)
     partly = ""
     if day.missing.length / HOUR >= _MISSING_HOURS:
-        partly = f" ({int(hours)} of {hours_of_day} hours recorded)"
+        partly = f" (listened to {int(hours)} of {hours_of_day} hours)"
     if not is_quiet(day):
         return f"{name} had sound in {lively.sum()} of {hours_of_day} hours{partly}"
-    exceptions = _exceptions(day, lively) if lively.any() else ""
-    but = ", and ".join(text for text in (exceptions, _steady(day)) if text)
+    but = _exceptions(day, lively) if lively.any() else ""
     return f"{name} was quiet{' but for ' * bool(but)}{but}{partly}"
 
 
@@ -182,15 +197,16 @@ def _exceptions(day: DayMetrics, lively: Bool) -> str:
     return listed(runs, "and")
 
 
-def _steady(day: DayMetrics) -> str:
-    """Return when there was steady sound that no label names; empty if it was short."""
+def _steady(day: DayMetrics) -> Iterator[str]:
+    """Yield when a quiet day had steady sound that no label names, if it was not short."""
     spans = intersection(day.home.steady, day.span)
-    if spans.length < LIVELY_MINUTES * MINUTE:
-        return ""
+    if not is_quiet(day) or spans.length < LIVELY_MINUTES * MINUTE:
+        return
     times = _times(day, spans)
     if len(times) > _ONE_MORE:
-        return f"steady sound at {number_in_words(len(times))} times"
-    return f"steady sound from {listed(times, 'and')}"
+        yield f"Steady sound at {number_in_words(len(times))} times."
+    else:
+        yield f"Steady sound from {listed(times, 'and')}."
 
 
 def states_missing_time(day: DayMetrics) -> bool:
@@ -202,16 +218,17 @@ def _recorded_part(day: DayMetrics) -> str:
     """Return when a partly recorded day was recorded, and what was labelled then."""
     name = weekday(day.day)
     if day.coverage.length < MINUTE:
-        return f"Less than a minute of {name} was recorded"
+        return f"The box listened for less than a minute of {name}"
     stretches = joined(*day.coverage, _PAUSE)
     hours = rounded(day.coverage.length / HOUR)
     if len(stretches.starts) == 1:
         start, end = (clock_text(int(edge[0]), day.zone) for edge in stretches)
         when = f"{name} from {start} to {'24:00' if end == '00:00' else end}"
     elif hours >= _EXACT_HOURS:
-        when = f"In the {hours} recorded hours of {name}"
+        when = f"In the {hours} hours that the box listened on {name}"
     else:
-        when = f"In the recorded {Duration(day.coverage.length / MINUTE).text} of {name}"
+        lasting = Duration(day.coverage.length / MINUTE).text
+        when = f"In the {lasting} that the box listened on {name}"
     return f"{when}: {_labelled(day)}"
 
 
@@ -235,12 +252,12 @@ def _missing(day: DayMetrics) -> Iterator[str]:
         return
     if not (day.before_logs or day.after_logs):
         hours = rounded(day.coverage.length / HOUR)
-        other = f"other {rounded(day.span.length / HOUR) - hours} hours were"
-        yield f"The {other if hours else 'rest of the day was'} not recorded."
+        other = f"other {rounded(day.span.length / HOUR) - hours} hours"
+        yield f"The box did not listen in the {other if hours else 'rest of the day'}."
         return
     yield unlogged([day])
     if day.missing.length >= MINUTE:
-        yield f"{Duration(day.missing.length / MINUTE).text} of the rest were not recorded."
+        yield f"In between, it did not listen for {Duration(day.missing.length / MINUTE).text}."
 
 
 def unlogged(days: Sequence[DayMetrics], *, with_day: bool = False) -> str:
@@ -291,32 +308,42 @@ def _times(day: DayMetrics, spans: Spans) -> list[str]:
 def _sounds(day: DayMetrics) -> Iterator[str]:
     """Yield the counts of coughing, crying and shouting.
 
-    Those of the night that ends on the day, of 07:00 to 22:00, and of the evening after that.
+    Those of the 24 hours to 22:00, with those of the night among them, and of the evening after
+    that. The table has the times of all; here are those of a few, if all are in one part.
     """
-    times_of_day = (
-        (day.night, "in the night"),
-        (day.waking, "by day"),
-        (day.evening, f"after {EVENING}:00"),
-    )
+    before = day.to_evening
     for name in WORRYING:
-        parts: list[str] = []
-        for span, when in times_of_day:
-            starts = day.counted_events(name, span)
-            if len(starts):
-                count, clocks = day.count_in(name, span), _when(day, name, starts)
-                times = f" ({clocks})" if clocks else ""
-                parts.append(amount(name, count, when, named=not parts) + times)
-        if parts:
-            yield "; ".join(parts)
+        parts = {
+            when: starts
+            for when, span in (("in the night", day.night), ("by day", day.waking))
+            if len(starts := day.counted_events(name, span))
+        }
+        texts = []
+        if len(parts) == 1:
+            (when,), (starts,) = parts, parts.values()
+            count = before.count_in(name, before.span)
+            texts.append(amount(name, count, when) + times_of_events(day, name, starts))
+        elif parts:
+            perhaps, number, more = _amounts(day.count_in(name, day.night))
+            at_night = f" ({perhaps}{number} at night{more})"
+            texts.append(amount(name, before.count_in(name, before.span)) + at_night)
+        late = day.counted_events(name, day.evening)
+        if len(late):
+            count = day.count_in(name, day.evening)
+            text = amount(name, count, f"after {EVENING}:00", named=not texts)
+            texts.append(text + times_of_events(day, name, late))
+        if texts:
+            yield "; ".join(texts)
 
 
-def _when(day: DayMetrics, name: str, starts: Int64) -> str:
-    """Return the times of a few events; of more, how many were on the day before, if any."""
+def times_of_events(day: DayMetrics, name: str, starts: Int64) -> str:
+    """Return in brackets the times of a few events; of more, how many were on the day before."""
     if len(starts) <= _TIMES:
-        return times_in_words(starts, day.zone, first=day.day, unsure=day.unsure_events(name))
+        times = times_in_words(starts, day.zone, first=day.day, unsure=day.unsure_events(name))
+        return f" ({times})" if times else ""
     number, before = int((starts < day.span.starts[0]).sum()), day.day - timedelta(days=1)
     which = f"{number} of them" if number < len(starts) else "all"
-    return f"{which} on {weekday(before)}" if number else ""
+    return f" ({which} on {weekday(before)})" if number else ""
 
 
 def _sentence(text: str) -> str:

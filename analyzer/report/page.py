@@ -9,8 +9,9 @@ import jinja2
 import numpy as np
 
 from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
-from hearthlog.analyzer.activity.values import BASELINE_DAYS, Count, Duration, Value
-from hearthlog.analyzer.logs.spans import intersection
+from hearthlog.analyzer.activity.values import BASELINE_DAYS, Clock, Count, Duration, Value
+from hearthlog.analyzer.logs.local_time import EVENING
+from hearthlog.analyzer.logs.spans import Spans, intersection
 from hearthlog.analyzer.report.headline import day_headline, unlogged, week_headline
 from hearthlog.analyzer.report.report_data import (
     ASSESSED_DAYS,
@@ -49,6 +50,7 @@ from hearthlog.analyzer.report.wording import (
     day_in_words,
     short_day,
     times_in_words,
+    times_of,
 )
 from hearthlog.models.classes import (
     COUGHING,
@@ -113,7 +115,7 @@ _HOME, _MICROPHONE = "home", "mic"  # names that nobody gave
 _FEW = 5  # events of which every time is written
 _FEW_WORRYING = 12
 _MOST_TIMES = {**dict.fromkeys(WORRYING, _FEW_WORRYING), FLUSHING_WATER: 16, SHOWER: 16}
-_BESIDE = "beside a television"
+_BESIDE, _AFTER = "beside a television", f"after {EVENING}:00"
 _SPACE = "\N{NO-BREAK SPACE}"
 _COMPLETE = 0.995  # share of a day
 _LONG = 1.0  # minutes
@@ -145,7 +147,7 @@ def day_page(data: ReportData) -> str:
         overview=[("What was heard", table, "")],
         evening=[*day_parts(day.day)][-1] in table.heads,
         partly=_partly_covered(with_night),
-        parts=[_part(data, section, day) for section in day_sections(day.day)],
+        parts=[_part(data, section, day) for section in day_sections()],
     )
 
 
@@ -165,7 +167,7 @@ def week_page(data: ReportData) -> str:
         summary=list(summarize_week(data)),
         overview=list(_week_overview(shown, names)),
         evening=False,
-        partly=[],
+        partly=_partly_covered(shown.logged_days[0]) if len(shown.logged_days) == 1 else [],
         parts=[
             PageSection(section, _week(data, section.figures, has_share=_is_partly(data, section)))
             for section in week_sections(data.classes)
@@ -175,11 +177,12 @@ def week_page(data: ReportData) -> str:
 
 def _description(timeline: DayTimeline) -> str:
     """Return the text alternative of a timeline."""
-    parts = []
-    for lane in timeline.lanes:
-        uncounted = f", and {len(lane.uncounted)} {_BESIDE}" if len(lane.uncounted) else ""
-        if not lane.empty:
-            parts.append(f"{lane.words} {len(lane.counted) + len(lane.unsure)}{uncounted}")
+    parts, day = [], timeline.day.to_evening
+    for lane in (each for each in timeline.lanes if not each.empty):
+        number, beside = len(day.counted_events(lane.name, day.span)), _beside(day, lane.name)
+        late = len(timeline.day.counted_events(lane.name, timeline.day.evening))
+        texts = f"{number}", f"and {beside}" * bool(beside), f"{late} {_AFTER}" * bool(late)
+        parts.append(f"{lane.words} {', '.join(filter(None, texts))}")
     zone, spans = timeline.day.zone, timeline.day.missing
     gaps = [
         f"{clock_text(start, zone)} to {clock_text(end, zone)}"
@@ -187,7 +190,7 @@ def _description(timeline: DayTimeline) -> str:
         if end - start >= HOUR
     ]
     text = f"{'; '.join(parts) or 'Nothing was heard'}. {unlogged([timeline.day])}".strip()
-    return text + (f" Not recorded: {', '.join(gaps)}." if gaps else "")
+    return text + (f" Not listening: {', '.join(gaps)}." if gaps else "")
 
 
 def _page(data: ReportData, shown: ReportData, picture: PagePicture, **parts: Any) -> str:
@@ -197,6 +200,7 @@ def _page(data: ReportData, shown: ReportData, picture: PagePicture, **parts: An
     absent = [name for name in names if _has_count(shown, name) and not _occurs(shown, name)]
     uncertain = [name for name in names if not _has_count(shown, name)]
     everywhere = [name for name in names if name not in ON_TELEVISION]
+    is_utc = str(data.zone) in {"Etc/UTC", "UTC"}
     return fill_page(
         data=data,
         picture=picture,
@@ -213,10 +217,11 @@ def _page(data: ReportData, shown: ReportData, picture: PagePicture, **parts: An
         dash=_NOTHING,
         unsure=_is_unsure(it for _, it, _ in parts["overview"]),
         has_dash=len(data.days) > 1 and _has_dash(parts),
-        is_utc=str(data.zone) in {"Etc/UTC", "UTC"},
+        is_utc=is_utc,
+        zone_is_unset=is_utc and not data.has_zone,
         scenarios=[(plain(name), _scenario(data, name)) for name in data.scenarios],
         days_before=BASELINE_DAYS,
-        interrai=_interrai(data, days),
+        interrai=_interrai(data, [day.to_evening for day in days]),
         interrai_days=ASSESSED_DAYS,
         interrai_covered=_covered_days(days),
         **parts,
@@ -266,24 +271,41 @@ def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
         if intersection(day.home.coverage, part(day)).length
     }
     heads = ["Sound", *parts, "When", "How long"]
-    rows = []
+    rows, before, late = [], day.to_evening, [*day_parts(day.day)][-1]
     for name in data.classes:
-        lasting, uncounted = minutes_figure(name), day.uncounted_events(name)
+        lasting = minutes_figure(name)
         if name == SILENCE or not _occurs(data, name):
             continue
-        if day.count(name) is None and not uncounted:
+        if day.count(name) is None and not day.uncounted_events(name):
             continue
         length, apart = _cell(data, lasting, day), _apart(lasting, [day])
         cells = [
             *(_count_cell(data, part_figure(name, part), day) for part in parts.values()),
-            Cell(_times(day, name)),
+            Cell(_times(day, name, before.span)),
             length._replace(note=", ".join(note for note in (apart, length.note) if note)),
         ]
+        if late in parts:
+            cells[len(parts) - 1] = _late_cell(cells[len(parts) - 1], day, name)
         right = [Cell(data.accuracy_text(name))] * data.checked
-        beside = f"{uncounted} {_BESIDE}" if uncounted else ""
-        head = Cell(in_words(name), colour=colour_on_paper(name), note=beside)
+        head = Cell(in_words(name), colour=colour_on_paper(name), note=_beside(before, name))
         rows.append([head, *cells, *right])
     return PageTable([*heads, *["Right here"] * data.checked], rows, "sounds stack")
+
+
+def _late_cell(cell: Cell, day: DayMetrics, name: str) -> Cell:
+    """Add to the count of a class after 22:00 its times, and what is beside a television."""
+    minutes = day.home.minutes.between(day.evening)
+    uncounted = minutes.uncounted_events(name)
+    beside = f"{uncounted} {_BESIDE}" if uncounted else ""
+    notes = _times(day, name, day.evening), beside, cell.note
+    kind = "count" if uncounted else cell.kind
+    return cell._replace(note=", ".join(filter(None, notes)), kind=kind)
+
+
+def _beside(day: DayMetrics, name: str) -> str:
+    """Return how many events of a class are beside a television, if any, and so not counted."""
+    number = day.uncounted_events(name)
+    return f"{number} {_BESIDE}" if number else ""
 
 
 def _partly_covered(day: DayMetrics) -> list[str]:
@@ -300,15 +322,16 @@ def _partly_covered(day: DayMetrics) -> list[str]:
 
 def _apart(figure: ReportFigure, days: Sequence[DayMetrics]) -> str:
     """Return how much of a figure is beside a television, and so not in it: `11 beside a …`."""
-    number = sum(day.uncounted_events(figure.name) for day in days) if figure.counts else 0
-    minutes = sum(day.uncounted_minutes(figure.name) for day in days) if figure.lasts else 0.0
+    shown = [day.to_evening for day in days]
+    number = sum(day.uncounted_events(figure.name) for day in shown) if figure.counts else 0
+    minutes = sum(day.uncounted_minutes(figure.name) for day in shown) if figure.lasts else 0.0
     amount = f"{number}" if number else Duration(minutes).text.replace(" ", _SPACE)
     return f"{amount} {_BESIDE}" if number or minutes >= 1 else ""
 
 
-def _times(day: DayMetrics, name: str) -> str:
-    """Return the times of a few events of a class, else the first and the last."""
-    starts = day.counted_events(name, day.span)
+def _times(day: DayMetrics, name: str, span: Spans) -> str:
+    """Return the times of a few events of a class in a span, else the first and the last."""
+    starts = day.counted_events(name, span)
     if len(starts) <= _MOST_TIMES.get(name, _FEW):
         return times_in_words(starts, day.zone, first=day.day, unsure=day.unsure_events(name))
     first, last = (
@@ -344,11 +367,12 @@ def _has_count(data: ReportData, name: str) -> bool:
 
 def _cell(data: ReportData, figure: ReportFigure, day: DayMetrics) -> Cell:
     """Return a figure, how it differs, and its usual range if there is a baseline."""
-    text = _text(figure.value(day))
+    text = _text(figure.value(day), is_often=figure.is_often)
+    apart = _apart_sound(figure, [day])
     if not data.comparable:
-        return Cell(text, unbroken=True)
+        return Cell(text, unbroken=True, note=apart)
     usual = data.usually(figure)
-    note = f"usually {usual}" if usual else ""
+    note = ", ".join(filter(None, (apart, f"usually {usual}" * bool(usual))))
     return Cell(text, data.change(figure, day), unbroken=True, note=note)
 
 
@@ -357,23 +381,43 @@ def _count_cell(data: ReportData, figure: ReportFigure, day: DayMetrics) -> Cell
     return cell._replace(kind="count zero" if cell.text == "0" else "count")
 
 
-def _text(value: Value | None) -> str:
-    return _NOTHING if value is None else value.text
+def _text(value: Value | None, *, is_often: bool = False) -> str:
+    if value is None:
+        return _NOTHING
+    return times_of(round(value.middle)) if is_often else value.text
+
+
+def _apart_sound(figure: ReportFigure, days: Sequence[DayMetrics]) -> str:
+    """Return how much of the time with any sound is beside a television."""
+    minutes = sum(figure.apart(day) for day in days if day.coverage.length)
+    return f"{Duration(minutes).text} of it {_BESIDE}" if minutes >= 1 else ""
 
 
 def _part(data: ReportData, section: FigureSection, day: DayMetrics) -> PageSection:
+    heads = ["", f"24 hours to {EVENING}:00", _AFTER.capitalize()]
     shown = [figure for figure in section.figures if figure.value(day) is not None]
-    rows = [[Cell(f.title, note=f.note), _cell(data, f, day)] for f in shown]
-    remarks = [_coughing(day) if section.title.startswith("Night") else longest_quiet_text(day)]
+    has_late = bool(intersection(day.home.coverage, day.evening).length)
+    rows = []
+    for figure in shown:
+        cells = [_cell(data, figure, day), Cell(_text(figure.late(day)).strip(_NOTHING))]
+        value = figure.value(day)
+        if isinstance(value, Clock) and value.minutes >= EVENING * 60:
+            cells.reverse()
+        rows.append([Cell(figure.title, note=figure.note), *cells[: 1 + has_late]])
+    remarks = [_coughing(day), longest_quiet_text(day)]
     if len(shown) < len(section.figures):
         more = "more" if shown else "anything"
-        remarks.append(f"Too little was recorded to tell {more}.")
-    return PageSection(section, PageTable(["", "This day"], rows, "figures"), remarks)
+        remarks.append(f"The box listened too little to tell {more}.")
+    return PageSection(
+        section,
+        PageTable(heads[: 2 + has_late], rows, "amounts" if has_late else "figures"),
+        remarks,
+    )
 
 
 def _coughing(day: DayMetrics) -> str:
     """Return when coughing was labelled in the night, unless the table of sounds has each time."""
-    listed_day, starts = day.with_night, day.night_events(COUGHING)
+    listed_day, starts = day.to_evening, day.night_events(COUGHING)
     if len(listed_day.counted_events(COUGHING, listed_day.span)) <= _FEW_WORRYING or not len(
         starts
     ):
@@ -384,7 +428,7 @@ def _coughing(day: DayMetrics) -> str:
         return f"Coughing in the night at {times}."
     hours = [clock_text(time, day.zone)[:2] for time in np.sort(starts).tolist()]
     each = [f"{hours.count(hour)} after {hour}:00" for hour in dict.fromkeys(hours)]
-    return f"Bouts of coughing in the night, hour by hour: {', '.join(each)}."
+    return f"Coughing in the night, hour by hour: {', '.join(each)}."
 
 
 def _week_overview(data: ReportData, names: Sequence[str]) -> Iterator[tuple[str, PageTable, str]]:
@@ -418,7 +462,7 @@ def _amounts(
 ) -> PageTable:
     """Return how often and how long each class was heard in a week with a single logged day."""
     (day,) = data.logged_days
-    rows = [[Cell("Recorded"), Cell(_recorded(often, day)), Cell("")]]
+    rows = []
     for count, lasting in zip(often, long, strict=True):
         cells = [
             Cell(_text(figure.value(day)), note=_notes(data, figure)) for figure in (count, lasting)
@@ -430,7 +474,9 @@ def _amounts(
 def _notes(data: ReportData, figure: ReportFigure) -> str:
     """Return what is in small letters at a figure of a week."""
     usual = _dense(data.usually(figure)) if data.comparable else ""
-    notes = figure.note, _apart(figure, data.logged_days), f"usually {usual} a day" * bool(usual)
+    days = data.logged_days
+    apart = _apart(figure, days), _apart_sound(figure, days)
+    notes = figure.note, *apart, f"usually {usual} a day" * bool(usual)
     return ", ".join(filter(None, notes))
 
 
@@ -442,14 +488,17 @@ def _week(data: ReportData, figures: Sequence[ReportFigure], *, has_share: bool)
     days = data.logged_days
     rows: list[list[Cell]] = []
     if has_share:
-        rows.append([Cell("Recorded"), *(Cell(_recorded(figures, day)) for day in days), Cell("")])
+        rows.append([Cell("Listened"), *(Cell(_recorded(figures, day)) for day in days), Cell("")])
     for figure in figures:
         values = [figure.value(day) if day.coverage.length else None for day in days]
         colour = colour_on_paper(figure.name) if figure.name else None
         rows.append(
             [
                 Cell(figure.short, colour=colour, note=_notes(data, figure)),
-                *(Cell(_short(value)) for value in values),
+                *(
+                    Cell(_short(value, is_often=figure.is_often and len(days) == 1))
+                    for value in values
+                ),
                 Cell(_total(days, figure)),
             ]
         )
@@ -480,16 +529,13 @@ def _share(figures: Sequence[ReportFigure], day: DayMetrics) -> float:
     return min([day.share, *(day.share_of(f.name) for f in figures if f.name)])
 
 
-def _short(value: Value | None) -> str:
+def _short(value: Value | None, *, is_often: bool = False) -> str:
     """Return a figure in short form, with a dash for `to`, and without what was labelled."""
-    if value is None:
-        return _NOTHING
-    return _dense(re.sub(r" \(\d+ labelled\)", "", value.text))
+    return _dense(re.sub(r" \(\d+ labelled\)", "", _text(value, is_often=is_often)))
 
 
 def _dense(text: str) -> str:
-    text = re.sub(r"(\d h \d\d) min", r"\1", text.replace("under 1 min", "< 1 min"))
-    return text.replace(" to ", _TO)
+    return text.replace("under 1 min", "< 1 min").replace(" to ", _TO)
 
 
 def _total(days: Sequence[DayMetrics], figure: ReportFigure) -> str:

@@ -6,7 +6,7 @@ from datetime import date, tzinfo
 from typing import NamedTuple
 
 from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes
-from hearthlog.analyzer.activity.daily_metrics import DayMetrics
+from hearthlog.analyzer.activity.daily_metrics import MOST, DayMetrics
 from hearthlog.analyzer.activity.day_anomaly import DayAnomaly
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound
 from hearthlog.analyzer.activity.event_counts import FEWEST as FEWEST_CHECKED
@@ -47,7 +47,7 @@ from hearthlog.schemas.errors import listed
 
 
 class ReportFigure(NamedTuple):
-    """A figure of a day."""
+    """A figure of a day: counts and lengths are of the 24 hours to 22:00, as `info` has them."""
 
     title: str  # in the table of one day
     short: str  # column head
@@ -57,6 +57,9 @@ class ReportFigure(NamedTuple):
     counts: bool = False  # whether these are the events of a day
     lasts: bool = False  # whether it is the time of a class
     note: str = ""  # in small letters below the title
+    late: Callable[[DayMetrics], Value | None] = lambda _: None  # the same after 22:00
+    is_often: bool = False  # whether it is how often something was: `never`, `once`
+    apart: Callable[[DayMetrics], float] = lambda _: 0.0  # minutes of it beside a television
 
 
 class FigureSection(NamedTuple):
@@ -77,12 +80,16 @@ def day_television(day: DayMetrics, pause: int = 0) -> Spans:
     return intersection(joined(starts, starts + MINUTE, pause), day.span)
 
 
-def day_sections(day: date) -> list[FigureSection]:
-    """Return the tables of a day below that of its sounds, which has those of its night."""
-    return [
-        FigureSection(f"Night to {weekday(day)}, {NIGHT_HOURS}", _NIGHT, _NIGHT_PAUSES),
-        FigureSection("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
-    ]
+def sound_near_television(day: DayMetrics) -> Spans:
+    """Return when there was sound in the minutes of something like a television."""
+    return intersection(day.home.sound, day_television(day))
+
+
+def day_sections() -> list[FigureSection]:
+    """Return the table of a day below that of its sounds."""
+    sound, *edges = _ACTIVITY
+    note = f"{_NIGHT_PAUSES} {_ACTIVITY_NOTE}"
+    return [FigureSection("Quiet and activity", [sound, *_NIGHT, *edges], note)]
 
 
 def week_sections(classes: Sequence[str]) -> list[FigureSection]:
@@ -99,7 +106,7 @@ def week_sections(classes: Sequence[str]) -> list[FigureSection]:
 def minutes_figure(name: str) -> ReportFigure:
     """Return the figure of a class's duration, without that beside a television."""
     title = in_words(name)
-    return ReportFigure(title, title, lambda day: day.minutes(name), name, lasts=True)
+    return ReportFigure(title, title, lambda day: day.to_evening.minutes(name), name, lasts=True)
 
 
 def day_parts(day: date) -> Mapping[str, Callable[[DayMetrics], Spans]]:
@@ -119,7 +126,7 @@ def part_figure(name: str, part: Callable[[DayMetrics], Spans]) -> ReportFigure:
 def event_figure(name: str, title: str = "") -> ReportFigure:
     """Return the figure of a class's event count."""
     title = title or in_words(name)
-    return ReportFigure(title, title, lambda day: day.count(name), name, counts=True)
+    return ReportFigure(title, title, lambda day: day.to_evening.count(name), name, counts=True)
 
 
 def _at_night(name: str, title: str, short: str) -> ReportFigure:
@@ -143,18 +150,33 @@ def _bathroom(classes: Sequence[str]) -> Iterator[ReportFigure]:
             yield from _day_and_night(name)
 
 
+def _late_sound(day: DayMetrics) -> Duration | None:
+    """Return the duration of any sound after 22:00; None if unknown."""
+    covered = intersection(day.home.coverage, day.evening).length / day.evening.length
+    sound = Duration(intersection(day.home.sound, day.evening).length / MINUTE)
+    return sound if covered >= MOST or (covered and sound.minutes) else None
+
+
 _IN_NIGHT = COUGHING, CRYING
 _LONGER = "a minute or more in ten"
+_LONGEST_QUIET = f"Longest quiet, {MORNING:02}\N{EN DASH}{EVENING:02}"
 _NIGHT = (
     ReportFigure(
-        "Times with half a minute of sound",
-        "Half minutes of sound",
+        "30 s of sound or more in the night",
+        "30 s of sound or more",
         lambda day: day.night_stretches,
+        is_often=True,
     ),
-    ReportFigure("Time with sound", "Time with sound", lambda day: day.night_sound),
+    ReportFigure("Time with sound in the night", "Time with sound", lambda day: day.night_sound),
 )
 _ACTIVITY = (
-    ReportFigure("Time with sound", "Time with sound", lambda day: day.sound),
+    ReportFigure(
+        "Time with sound",
+        "Time with sound",
+        lambda day: day.to_evening.sound,
+        late=_late_sound,
+        apart=lambda day: sound_near_television(day.to_evening).length / MINUTE,
+    ),
     ReportFigure(
         "First longer sounds",
         "First longer sounds",
@@ -169,17 +191,15 @@ _ACTIVITY = (
         sums=False,
         note=_LONGER,
     ),
-    ReportFigure(
-        "Longest quiet stretch, 07:00 to 22:00", "Longest quiet", lambda day: day.quiet, sums=False
-    ),
+    ReportFigure(_LONGEST_QUIET, _LONGEST_QUIET, lambda day: day.quiet, sums=False),
 )
 _BATHROOM_NOTE = f"Night is {NIGHT_HOURS}. A person, not the report, knows who used the bathroom."
-_NIGHT_PAUSES = "Times with sound are separated by at least ten quiet minutes."
+_NIGHT_PAUSES = "30 s of sound or more: how often there was as much; ten quiet minutes end a time."
 _NIGHT_NOTE = f"{NIGHT_HOURS}, counted on the day on which the night ends. {_NIGHT_PAUSES}"
 _ACTIVITY_NOTE = (
-    "Longer sounds: the first and the last ten minutes from 04:00 on with at least one minute of "
-    "sound. There may be shorter sounds before and after them. Quiet can mean rest, reading, a "
-    "nap, or nobody at home."
+    "Longer sounds: the first and the last ten minutes, from 04:00 to midnight, with at least one "
+    "minute of sound. There may be shorter sounds before and after them. Quiet can mean rest, "
+    "reading, a nap, or nobody at home."
 )
 
 
@@ -216,6 +236,7 @@ class ReportData:
     unread: int  # number of logs that could not be read completely
     networks: Sequence[str]  # network changes in these weeks, one line per microphone
     hidden: frozenset[str]  # classes that nobody is told of
+    has_zone: bool  # whether the logs name the zone of the home
 
     @property
     def home(self) -> str:
@@ -322,8 +343,8 @@ class ReportData:
         there = {0: "no day", 1: "only 1 day"}.get(number, f"only {number} days")
         return (
             f"Not compared with other days: of the {BASELINE_DAYS} days before, "
-            f"{there} could be used; {FEWEST} are needed that were mostly recorded, nights "
-            "included."
+            f"{there} could be used; {FEWEST} are needed on which the box "
+            "listened most of the time, nights included."
         )
 
 

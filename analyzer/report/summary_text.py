@@ -5,14 +5,28 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, DayMetrics
+from hearthlog.analyzer.activity.daily_metrics import HOUR, MOST, RISING, DayMetrics
 from hearthlog.analyzer.activity.day_anomaly import FEWEST
 from hearthlog.analyzer.activity.doubtful_sounds import DoubtfulSound, perhaps
-from hearthlog.analyzer.activity.values import Duration
-from hearthlog.analyzer.logs.local_time import local_time
+from hearthlog.analyzer.activity.values import Duration, rounded
+from hearthlog.analyzer.logs.local_time import at_hour, local_time
 from hearthlog.analyzer.logs.recorder_info import Trouble
-from hearthlog.analyzer.logs.spans import Spans, difference, intersection, joined, lengths
-from hearthlog.analyzer.report.headline import amount, states_missing_time, unlogged
+from hearthlog.analyzer.logs.spans import (
+    NONE,
+    Spans,
+    difference,
+    intersection,
+    joined,
+    rows_at,
+    single_span,
+    union,
+)
+from hearthlog.analyzer.report.headline import (
+    amount,
+    states_missing_time,
+    times_of_events,
+    unlogged,
+)
 from hearthlog.analyzer.report.report_data import (
     NIGHT_HOURS,
     TELEVISION_PAUSE,
@@ -33,13 +47,15 @@ from hearthlog.models.classes import (
     SHOWER,
     SILENCE,
     UNKNOWN,
+    WORRYING,
     class_name,
     in_words,
 )
 from hearthlog.schemas.errors import listed
 
 _MOST = 6  # kinds of gaps or troubles
-_MINUTE = HOUR // 60
+_MINUTE, _SECOND = HOUR // 60, HOUR // 3600
+_MOST_SECONDS = 90  # more are minutes
 _TIMES = 3
 _MOST_LABELS = 3  # of one doubtful time
 _BREAK = 5 * _MINUTE  # longest pause between doubtful sounds of one time
@@ -54,7 +70,7 @@ def summarize_day(data: ReportData, day: DayMetrics) -> Iterator[str]:
         yield _off_for_the_rest(data)
     else:
         is_partly = day.missing.length >= _MINUTE  # `not_recorded` says so
-        complete = unlogged([day]) or "The whole day was recorded."
+        complete = unlogged([day]) or "The box listened all day."
         yield f"{'' if is_partly else complete} {_loudest(day)}".strip()
     yield _television(day)
     if data.comparable:
@@ -70,7 +86,7 @@ def summarize_week(data: ReportData) -> Iterator[str]:
     days = [day for day in data.days if day.coverage.length]
     share = sum(day.coverage.length for day in days) / sum(day.span.length for day in data.days)
     logs = unlogged(data.days, with_day=True)
-    yield f"Recorded: {len(days)} of {len(data.days)} days, {percent(share)} of the time. {logs}"
+    yield f"Listened on {len(days)} of {len(data.days)} days, {percent(share)} of the time. {logs}"
     if not data.comparable:
         return
     if max(data.baseline_days.values()) < FEWEST:
@@ -128,17 +144,17 @@ def not_recorded(data: ReportData) -> Iterator[str]:
     if missing >= _MINUTE and not is_stated:
         text = Duration(missing / _MINUTE).text
         share = percent(missing / length)
-        yield f"Not recorded: {text} ({share}). The report knows nothing about that time."
+        yield f"Not listening: {text} ({share}). The report knows nothing about that time."
     for microphone, hours in data.uncovered.items():
         if hours * HOUR > missing + _MINUTE:  # another microphone covers this time
             text = Duration(hours * 60).text
-            yield f"The microphone {plain(microphone)} did not record for {text}."
+            yield f"The microphone {plain(microphone)} was not listening for {text}."
     unexplained = _unexplained(data)
     is_explained = missing - unexplained >= _MINUTE
     if unexplained >= _MINUTE and (is_explained or not is_stated):
         text = Duration(unexplained / _MINUTE).text
-        which = f"for {text} of the time not recorded" if is_explained else "then"
-        yield f"The recorder was off {which}, or its logs are not here."
+        which = f"for {text} of the time not listened to" if is_explained else "then"
+        yield f"The box was off {which}, or its logs are not here."
     for reason, same in _by_lasting(data.gaps, lambda gap: gap.text):
         yield f"{reason[:1].upper()}{reason[1:]}: {_when(data, same)}."
     if data.unread:
@@ -189,12 +205,12 @@ def _off_for_the_rest(data: ReportData) -> str:
         return ""
     day = data.days[0]
     rest = "Then" if day.before_logs or day.after_logs else "In the rest of the day"
-    return f"{rest} the recorder was off, or its logs are not here."
+    return f"{rest} the box was off, or its logs are not here."
 
 
 def _loudest(day: DayMetrics) -> str:
-    names = [name for name in day.home.classes if name != SILENCE]
-    lasting = ((minutes.minutes, name) for name in names if (minutes := day.minutes(name)))
+    names, before = [name for name in day.home.classes if name != SILENCE], day.to_evening
+    lasting = ((minutes.minutes, name) for name in names if (minutes := before.minutes(name)))
     most = [
         in_words(name).lower() for minutes, name in sorted(lasting, reverse=True) if minutes >= 1
     ]
@@ -233,22 +249,54 @@ def _steady(day: DayMetrics) -> str:
 
 
 def _still(day: DayMetrics) -> str:
-    """Return the time before the first and after the last lively ten minutes."""
+    """Return the time before the first and after the last longer sounds, and what was in it."""
     if day.first is None or day.last is None:
         return ""
-    first = f"until {day.first.text}" if day.first.minutes > _MORNING else ""
-    last = f"after {day.last.text}" if day.last.minutes < _MIDNIGHT else ""
-    times = listed([time for time in (first, last) if time], "and")
+    rising, (end,) = at_hour(day.day, RISING, day.zone), day.span.ends
+    first, last = int(day.active[0]), int(day.active[-1]) + 10 * _MINUTE
+    times, spans = [], [NONE]
+    if day.first.minutes > _MORNING:
+        times.append(f"from {RISING:02}:00 to {day.first.text}")
+        spans.append(single_span(rising, first))
+    if day.last.minutes < _MIDNIGHT:
+        times.append(f"after {day.last.text}")
+        spans.append(single_span(last, int(end)))
+    if not times:
+        return ""
     partly = day.span.length - day.coverage.length >= _MINUTE
-    recorded = ", as far as it was recorded" * partly
+    when = f"{listed(times, 'and')}{', as far as the box listened' * partly}"
     water = "" if SHOWER in day.home.classes else " or a shower's"
-    steady = f"steady sound, such as a fan's{water}, counts as quiet"
-    start, end = int(day.span.starts[0]), int(day.span.ends[0])
-    edges = np.array([start, day.active[0], day.active[-1] + 10 * _MINUTE, end])
-    short, _, late = lengths(day.home.sound, edges).tolist()
-    is_any = (first and short) or (last and late)
-    what = "Only short sounds" if is_any else "Nothing was labelled"
-    return f"{what} {times}{recorded}; {steady}." if times else ""
+    steady = f"Steady sound, such as a fan's{water}, counts as quiet."
+    longest = _longest_sound(day, union(*spans))
+    if not longest:
+        return f"Nothing was labelled {when}. {steady}"
+    short = "less than a minute of sound in each ten minutes"
+    return f"{_capital(when)}: {short}; the longest was {longest}. {steady}"
+
+
+def _longest_sound(day: DayMetrics, spans: Spans) -> str:
+    """Return the longest sound in some spans: `talking, 50 s at 19:17`; empty without one."""
+    found: list[tuple[int, int, str]] = []
+    for name in (each for each in day.home.classes if each != SILENCE):
+        unsure = day.home.unsure.get(name, NONE.starts)
+        words = "a sound not recognised" if name == UNKNOWN else in_words(name).lower()
+        for events in day.joined_events(name):
+            inside = intersection(events, spans)
+            doubts = np.isin(events.starts, unsure)[rows_at(events, inside.starts)].tolist()
+            found += [
+                (end - start, -start, f"perhaps {words}" if doubt else words)
+                for (start, end), doubt in zip(inside.pairs(), doubts, strict=True)
+            ]
+    if not found:
+        return ""
+    length, start, words = max(found)
+    seconds = max(1, rounded(length / _SECOND))
+    lasting = f"{seconds} s" if seconds < _MOST_SECONDS else Duration(length / _MINUTE).text
+    return f"{words}, {lasting} at {clock_text(-start, day.zone)}"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _changes(data: ReportData, day: DayMetrics) -> str:
@@ -257,7 +305,7 @@ def _changes(data: ReportData, day: DayMetrics) -> str:
         return judgement_text(judged)
     if data.baseline_days[day.day] < FEWEST:
         return too_few_text(data.baseline_days[day.day])
-    return "Too little was recorded to compare it with other days."
+    return "The box listened too little to compare the day with others."
 
 
 def _night(day: DayMetrics) -> str:
@@ -265,15 +313,17 @@ def _night(day: DayMetrics) -> str:
     for name in (FLUSHING_WATER, COUGHING):
         count = day.night_count(name)
         if count is not None:
-            parts.append(amount(name, count))
+            times = times_of_events(day, name, day.night_events(name)) * (name in WORRYING)
+            none = f"no {in_words(name).lower()} labelled"
+            parts.append(amount(name, count) + times if count.labelled else none)
     if day.night_sound is not None:
         parts.append(f"{day.night_sound.text} of sound in all")
     if not parts:
-        return "Too little of the night was recorded to say anything about it."
+        return "The box listened too little in the night to say anything about it."
     hours = day.night.length / HOUR
     partly = ""
     if day.night_hours < hours - _HALF:
-        partly = f" Only {day.night_hours:.1f} of its {hours:.0f} hours were recorded."
+        partly = f" Only {day.night_hours:.1f} of its {hours:.0f} hours were listened to."
     return f"In the night to {weekday(day.day)}, {NIGHT_HOURS}: {'; '.join(parts)}.{partly}"
 
 

@@ -18,6 +18,7 @@ from hearthlog.analyzer.logs.spans import (
     lengths,
     single_span,
 )
+from hearthlog.analyzer.report.report_data import sound_near_television
 from hearthlog.analyzer.report.wording import clock_text, days_in_short, short_day
 from hearthlog.models.classes import SILENCE, Colour, colour_on_paper, in_words
 from hearthlog.schemas.arrays import Bool, Float64, Int64
@@ -90,6 +91,8 @@ class HourBar(NamedTuple):
     width: float
     minutes: float
     usual: UsualRange | None
+    beside: float  # minutes of these in which something like a television sounded
+    has_room: bool  # whether its number has room on a phone
 
 
 class DayTimeline(NamedTuple):
@@ -156,12 +159,17 @@ class DayTimeline(NamedTuple):
 def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimeline:
     """Return the timeline of a day.
 
-    The lanes are of the given classes, on an axis that is the day; by default of all that can
-    occur, but silence, on that of `shown_span`.
+    The lanes are of the given classes, on an axis that is the day; by default of those that
+    were labelled, or were not listened for all the time, on that of `shown_span`; of a day without
+    sound, of all.
     """
     span = shown_span(day) if names is None else day.span
     if names is None:
-        names = [name for name in day.home.classes if name != SILENCE]
+        every = [_lane(day, span, name) for name in day.home.classes if name != SILENCE]
+        lanes = [lane for lane in every if not lane.empty or lane.gaps]
+        lanes = lanes if any(not lane.empty for lane in lanes) else every
+    else:
+        lanes = [_lane(day, span, name) for name in names]
     hours = _edges(day, span)
     clock = [local_time(int(time), day.zone).hour for time in hours[:-1]]
     lefts = _percent(span, hours)
@@ -170,7 +178,7 @@ def timeline_of(day: DayMetrics, names: Sequence[str] | None = None) -> DayTimel
         day,
         span,
         round(span.length / _step(day, span)),
-        [_lane(day, span, name) for name in names],
+        lanes,
         list(_blocks(span, intersection(day.missing, span))),
         list(_unlogged(day, span)),
         list(_runs(lefts, _empty_hours(day, hours))),
@@ -245,8 +253,19 @@ def hour_bars(day: DayMetrics, earlier: Sequence[DayMetrics]) -> list[HourBar]:
     if same:
         hours = np.array(same).T[rows]
         usual = [usual_range([Duration(float(n)) for n in hour]) for hour in hours]
-    columns = lefts[:-1].tolist(), np.diff(lefts).tolist(), day.sound_by_hour[rows].tolist(), usual
+    minutes = day.sound_by_hour[rows].tolist()
+    apart = (lengths(sound_near_television(day), edges) / MINUTE).tolist()
+    places = lefts[:-1].tolist(), np.diff(lefts).tolist()
+    columns = *places, minutes, usual, apart, _with_room(minutes)
     return [HourBar(*row) for row in zip(*columns, strict=True)]
+
+
+def _with_room(minutes: Sequence[float]) -> list[bool]:
+    """Return which hours have their number on a phone: of two side by side, the one with more."""
+    chosen = [False] * len(minutes)
+    for row in sorted(range(len(minutes)), key=lambda row: -minutes[row]):
+        chosen[row] = not any(chosen[max(row - 1, 0) : row + 2])
+    return chosen
 
 
 def _edges(day: DayMetrics, span: Spans) -> Int64:

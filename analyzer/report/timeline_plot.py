@@ -139,7 +139,10 @@ def _draw_hours(axes: Any, timeline: DayTimeline, bars: Sequence[HourBar]) -> No
     share = timeline.steps / 100
     for bar in bars:
         left, width = bar.left * share, bar.width * share
-        axes.bar(left, bar.minutes, width * 0.84, align="edge", color="#5b6b7c", zorder=2)
+        look = {"align": "edge", "color": "#5b6b7c", "linewidth": 0, "zorder": 2}
+        own = bar.minutes - bar.beside
+        axes.bar(left, own, width * 0.84, **look)
+        axes.bar(left, bar.beside, width * 0.84, bottom=own, alpha=_PALE, **look)
         usual = 0.0 if bar.usual is None else bar.usual.median
         if bar.minutes >= _NUMBERED:
             top, text = max(bar.minutes, usual) + 3, f"{bar.minutes:.0f}"
@@ -179,7 +182,7 @@ def _draw_legend(figure: Any, timelines: Sequence[DayTimeline]) -> None:
     if any(timeline.nights for timeline in timelines):
         entries.append(Patch(color=_NIGHT, label="night"))
     if any(timeline.has_gaps for timeline in timelines):
-        gap = Patch(facecolor="white", edgecolor=_HATCH, hatch="////", label="not recorded")
+        gap = Patch(facecolor="white", edgecolor=_HATCH, hatch="////", label="not listening")
         entries.append(gap)
     if any(timeline.has_unsure for timeline in timelines):
         entries.append(Patch(color=_HATCH, label="half as high: not sure"))

@@ -117,12 +117,13 @@ def times_in_words(
         for start in np.sort(starts)[:most].tolist()
     )
     more = len(starts) - shown.total()
-    texts = [text if n == 1 else f"{text} {_often(n)}" for text, n in shown.items()]
+    texts = [text if n == 1 else f"{text} {times_of(n)}" for text, n in shown.items()]
     return ", ".join(texts) + (f" and {more} more" if more else "")
 
 
-def _often(number: int) -> str:
-    return "twice" if number == 2 else f"{number} times"
+def times_of(number: int) -> str:
+    """Return how often something was: `never`, `once`, `twice`, `3 times`."""
+    return {0: "never", 1: "once", 2: "twice"}.get(number, f"{number} times")
 
 
 WEEK = 7.0  # days: a shorter return period counts as usual
@@ -151,8 +152,8 @@ def judgement_text(judged: DayAnomaly) -> str:
 def too_few_text(days: int) -> str:
     """Return a note on too few days for a judgement."""
     return (
-        f"How unusual the day was cannot be said yet: that takes {FEWEST} mostly recorded days in "
-        f"the four weeks before it, and there are {days}."
+        f"How unusual the day was cannot be said yet: that takes {FEWEST} days in the four "
+        f"weeks before it on which the box listened most of the time, and there are {days}."
     )
 
 

@@ -169,9 +169,7 @@ def _statements_of(
     for kind, text in page.paragraphs:
         yield from _paragraph(kind, text, day, truth)
     figures = {
-        (part.title, figure.title): figure
-        for part in day_sections(day.day)
-        for figure in part.figures
+        (part.title, figure.title): figure for part in day_sections() for figure in part.figures
     }
     for title, heads, cells in page.rows:
         if title == "What was heard":
@@ -189,9 +187,9 @@ def _paragraph(kind: str, text: str, day: DayMetrics, truth: TrueDay) -> Iterato
         yield from _summary(text, day, truth)
     elif text.startswith("The longest quiet stretch"):
         yield _quiet(text, truth)
-    elif text.startswith(("Coughing in the night", "Bouts of coughing in the night")):
+    elif text.startswith("Coughing in the night"):
         yield from _night_coughs(text, truth)
-    elif text.startswith("Listened for"):
+    elif text.startswith("Not once"):
         names = [n for n in day.home.classes if _mentions(text.partition(":")[2], n)]
         for name in names:
             yield judge_count(
@@ -208,23 +206,26 @@ def _sounds_of(day: DayMetrics) -> list[str]:
 
 
 def _mentions(text: str, name: str) -> bool:
-    words = {in_words(name), several_in_words(name).removeprefix("Bouts of ")}
+    words = {in_words(name), several_in_words(name)}
     return any(re.search(rf"\b{re.escape(each.lower())}\b", text.lower()) for each in words)
 
 
 def _count(truth: TrueDay, name: str) -> float:
-    value = truth.metrics.count(name)
+    value = truth.metrics.to_evening.count(name)
     return 0 if value is None else value.labelled
 
 
 def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
-    day, first, *rest = truth.metrics, *re.split(r"(?<=\.) ", text)
-    if ": " in first:  # of a part of the day, and not of its hours
-        first = ""
+    """Yield the statement on the hours of the day first, then those of counts and steady sound."""
+    day, sentences = truth.metrics, re.split(r"(?<=\.) ", text)
+    # Not of a part of the day, which has a colon.
+    first = next(
+        (s for s in sentences if re.search(r"was quiet|had sound", s) and ": " not in s), ""
+    )
     hours, modest = day.sound_by_hour, is_modest(first)
     lively = hours >= LIVELY_MINUTES
-    others, _, steady = first.partition("steady sound")
-    but, _, television = others.partition("something like a television")
+    steady = next((each for each in sentences if each.startswith("Steady sound from")), "")
+    but, _, television = first.partition("something like a television")
     if _RUN.search(first):
         has_sound, may_have = np.zeros(len(hours), bool), np.zeros(len(hours), bool)
         for start, end in _RUN.findall(but):
@@ -251,8 +252,9 @@ def _headline(text: str, truth: TrueDay) -> Iterator[Statement]:
         yield judge(
             REPORT, first, f"{lively.sum()} hours with sound", right=not lively.any(), modest=modest
         )
-    for sentence in rest:
-        yield from _counts_in(REPORT, sentence, truth)
+    for sentence in sentences:
+        if sentence not in {first, steady}:
+            yield from _counts_in(REPORT, sentence, truth)
 
 
 def _steady_sounds(
@@ -293,8 +295,9 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
             continue
         known = {in_words(name).lower(), several_in_words(name).lower()}
         words = f"(?:{'|'.join(map(re.escape, sorted(known)))})"
-        after_number = rf"(?:bouts? of |times of )?{words}|by day|after|in the night"
+        after_number = rf"(?:times of )?{words}|by day|after|in the night"
         bare = re.sub(r"\([^)]*\)", "", part).lower()
+        at_night = re.search(r"\((perhaps )?(\d+) at night(?:, perhaps (\d+) more)?\)", part)
         match = re.search(rf"{words} ({NUMBER})", bare) or re.search(
             rf"({NUMBER})(?: to ({NUMBER}))? (?={after_number})", bare
         )
@@ -303,10 +306,11 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
         low = read_number(match[1])
         high = read_number(match[2]) if match.lastindex == 2 else low
         where = sentence if sentence.startswith("In the night") else part
-        span = next((own for when, own in parts.items() if when in where), day.span)
+        where = where.replace(at_night[0], "") if at_night else where
+        span = next((own for when, own in parts.items() if when in where), day.to_evening.span)
         true = day.count_in(name, span).labelled
-        if "perhaps" in part:
-            more = re.search(rf"perhaps ({NUMBER}) more", part)
+        if "perhaps" in bare:
+            more = re.search(rf"perhaps ({NUMBER}) more", bare)
             least, most = (low, low + read_number(more[1])) if more else (0, low)
             right = least <= true <= most or is_close(least, true) or is_close(most, true)
             yield judge(surface, part, f"{true:g}", right=right, modest=modest)
@@ -314,16 +318,23 @@ def _counts_in(surface: str, sentence: str, truth: TrueDay) -> Iterator[Statemen
             yield judge_count(surface, part, (low, high), true, modest=modest)
         if clocks := _CLOCK.findall("".join(re.findall(r"\([^)]*\)", part))):
             yield judge_times(surface, part, name, clocks, truth, modest=modest)
+        if at_night:
+            perhaps, stated, more = at_night.groups(default="")
+            sure = 0 if perhaps else int(stated)
+            most, true = int(stated) + int(more or 0), day.count_in(name, day.night).labelled
+            right = sure <= true <= most or is_close(sure, true) or is_close(most, true)
+            text = f"{in_words(name)} {at_night[0]}"
+            yield judge(surface, text, f"{true:g}", right=right, modest=modest)
 
 
 def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
     true, modest = truth.metrics, is_modest(text)
     if match := re.search(r"Most of the sound[^:]*: (.*)\.", text):
         names = [name for name in day.home.classes if name != SILENCE]
-        lasting = sorted(names, key=lambda name: -_counted_minutes(true, name))
+        lasting = sorted(names, key=lambda name: -_counted_minutes(true.to_evening, name))
         stated = [name for name in names if _mentions(match[1], name)]
         most = lasting[: len(stated)]
-        shown = ", ".join(f"{in_words(n)} {_counted_minutes(true, n):.0f}" for n in most)
+        shown = ", ".join(f"{in_words(n)} {_counted_minutes(true.to_evening, n):.0f}" for n in most)
         yield judge(REPORT, text, shown, right={*stated} == {*most}, modest=modest)
     elif "It was quiet." in text:
         yield judge(REPORT, text, f"{_sound(true):.1f} min", right=_sound(true) <= 2, modest=modest)
@@ -333,10 +344,10 @@ def _summary(text: str, day: DayMetrics, truth: TrueDay) -> Iterator[Statement]:
         yield from _counts_in(REPORT, text, truth)
         if (stated := read_minutes(text)) is not None and true.night_sound is not None:
             yield judge_length(REPORT, text, stated, true.night_sound.minutes, modest=modest)
-    elif match := re.search(r"Only short sounds|Nothing was labelled", text):
-        before = re.search(r"until (\d\d:\d\d)", text)
-        after = re.search(r"after (\d\d:\d\d)", text)
-        spans = [(int(true.span.starts[0]), time_at(true, before[1]))] if before else []
+    elif match := re.search(r"[Ll]ess than a minute of sound|Nothing was labelled", text):
+        before = re.search(r"rom (\d\d:\d\d) to (\d\d:\d\d)", text)
+        after = re.search(r"[Aa]fter (\d\d:\d\d)", text)
+        spans = [(time_at(true, before[1]), time_at(true, before[2]))] if before else []
         spans += [(time_at(true, after[1]) + MINUTE, int(true.span.ends[0]))] if after else []
         most = max(_busiest(true.home.sound, start, end) for start, end in spans)
         yield judge(
@@ -414,7 +425,7 @@ def _sound_counts(
         where = f"{cells[0]}: {when}"
         yield judge_times(REPORT, where, name, clocks, truth, modest=is_modest(where))
     if (minutes := read_minutes(lasting.partition(" | ")[0])) is not None:
-        value = minutes_figure(name).value(with_night)
+        value = minutes_figure(name).value(truth.metrics)
         true = 0 if value is None else value.middle
         where = f"{cells[0]}: {lasting}"
         yield judge_length(REPORT, where, minutes, true, modest=is_modest(where))
@@ -425,6 +436,8 @@ def _figure(
 ) -> Iterator[Statement]:
     text, shown = f"{title}, {cells[0]}: {cells[1]}", cells[1].partition(" | ")[0]
     modest = is_modest(heads[1] + cells[0] + re.sub(r"\(\d+ labelled\)", "", cells[1]))
+    shown = shown or cells[-1].partition(" | ")[0]  # a time after 22:00
+    shown = "0" if shown == "never" else shown
     middle = getattr(value, "middle", 0)
     if _CLOCK.fullmatch(shown):
         hours, minutes = map(int, shown.split(":"))
@@ -442,7 +455,7 @@ def _assessed(
     item = next((each for each in ASSESSED_ITEMS if each.topic == cells[0]), None)
     if item is None:
         return
-    values = [item.value(day.metrics) for day in days]
+    values = [item.value(day.metrics.to_evening) for day in days]
     true = sum(value.middle for value in values if value is not None)
     text = f"interRAI, {cells[0]}: {cells[2]}"
     modest = is_modest(heads[2] + re.sub(r"\(\d+ labelled\)", "", cells[2]))
