@@ -161,10 +161,10 @@ def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path):
     write_day(tmp_path / "logs", DAY, [*coughs, *rings])
     page = page_of(tmp_path / "logs", tmp_path)
     text = re.sub(r"\s+", " ", re.sub("<[^>]*>", " ", page))
-    assert "Perhaps 1 bout of coughing in the night (01:30); 2 by day, perhaps 2 more." in text
+    assert "Coughing twice, perhaps 3 more (perhaps 1 at night)." in text
     assert re.search(r"Coughing 1\? 2 \(\+2\?\) 0 .*Telephone ringing 0 1 0 15:00", text)
     assert "16:00?" not in text, "a telephone that may be something else is no count and no time"
-    assert "A question mark, as in 3? or in 4 (+3?), is at those that the model is not" in text
+    assert text.count("? = perhaps: the model is not sure of these") == 1
 
 
 def test_of_several_times_those_that_are_not_sure_have_a_question_mark(tmp_path):
@@ -173,7 +173,7 @@ def test_of_several_times_those_that_are_not_sure_have_a_question_mark(tmp_path)
     write_day(tmp_path / "logs", DAY, [])
     text = text_of(page_of(tmp_path / "logs", tmp_path))
     assert (
-        "1 bout of coughing in the night, perhaps 1 more (Saturday 23:30, Saturday 23:50?)." in text
+        "Coughing once in the night, perhaps 1 more (Saturday 23:30, Saturday 23:50?)." in text
     )
     assert "Coughing 1 (+1?) 0 0 Saturday 23:30, Saturday 23:50?" in text
 
@@ -281,9 +281,9 @@ def test_what_is_missing_of_a_day_is_stated_once_and_why_below(tmp_path):
     text = text_beside_picture(page_of(tmp_path, tmp_path))
     assert "Sunday from 10:00 to 11:00: talking. There are logs only from 10:00 to 11:00." in text
     for again in (
-        "Recorded:",
-        "ot recorded",
-        "recorder was off",
+        "ot listening",
+        "not listen",
+        "box was off",
         "knows nothing",
         "Most of the sound",
     ):
@@ -294,10 +294,10 @@ def test_the_reason_of_a_gap_is_below_the_headline_that_counts_its_hours(tmp_pat
     gap = (at("10:00"), 2 * HOUR, "silent")
     write_day(tmp_path, DAY, hours=[0, *range(8, 14), 23], gaps=[gap])
     text = text_beside_picture(page_of(tmp_path, tmp_path))
-    assert "In the 6 recorded hours of Sunday: nothing but quiet. The other 18 hours were" in text
-    assert "The recorder was off for 16 h 00 min of the time not recorded, or its logs" in text
+    assert "In the 6 hours that the box listened on Sunday: nothing but quiet. The box did not" in text
+    assert "The box was off for 16 h 00 min of the time not listened to, or its logs" in text
     assert "2 h 00 min, once (10:00 to 12:00)" in text
-    assert "Not recorded:" not in text
+    assert "Not listening:" not in text
 
 
 # What nobody listened to
@@ -316,14 +316,14 @@ def test_of_a_day_that_was_hardly_heard_nothing_is_said_not_to_have_been(tmp_pat
     rows, text = rows_of(page), text_of(page)
     assert rows["Coughing"] == ["1", "12:05", "under 1 min"]
     longer = ("First longer sounds a minute or more in ten", "Last longer sounds a minute")
-    for title in ("Longest quiet stretch, 07:00 to 22:00", *longer, "Behaviour: shouting"):
+    for title in ("Longest quiet, 07\N{EN DASH}22", *longer, "Behaviour: shouting"):
         assert title not in rows
     assert "Shouting" not in rows
-    assert "Too little was recorded to tell whether there was any of these: crying, shout" in text
-    assert text.count("Too little was recorded to tell anything.") == 1, "of the night"
+    assert "The box listened too little to tell whether there was any of these: crying, shout" in text
+    assert "The box listened too little to tell more." in text
     assert "was quiet" not in text
     assert (
-        "Sunday from 12:00 to 13:00: talking. 1 bout of coughing by day (12:05). There are "
+        "Coughing once by day (12:05). Sunday from 12:00 to 13:00: talking. There are "
         "logs only from 12:00 to 13:00."
     ) in text
 
@@ -356,7 +356,7 @@ def test_a_sum_of_days_of_which_most_are_not_known_is_not_0(tmp_path):
         write_day(tmp_path / "logs", DAY - timedelta(days=ago), hours=hours)
     page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
     rows = rows_of(page)
-    assert rows["Recorded"][:7] == ["92 %", "100 %", "100 %", "12 %", "4 %", "4 %", "4 %"], (
+    assert rows["Listened"][:7] == ["92 %", "100 %", "100 %", "12 %", "4 %", "4 %", "4 %"], (
         "each with the evening before"
     )
     assert {cells[-1] for cells in rows.values()} & {"0", "0 min"} == set()
@@ -439,7 +439,7 @@ def test_what_no_model_listens_for_is_not_said_to_be_absent_though_a_person_mark
     write_marks(logs[0], [Mark("mic", start + 10**9, start + 61 * 10**9, "flushing_water")])
     assert look(tmp_path / "logs").count("flushing_water") is None
     page = page_of(tmp_path / "logs", tmp_path)
-    assert "toilet flush" not in re.search("never counted: coughing[^<]*", page)[0]
+    assert "toilet flush" not in re.search("Not once: coughing[^<]*", page)[0]
     assert "does not know these sounds" in page
     assert "toilet flush" in re.search("says nothing about them: [^.]*", page)[0]
 
@@ -480,8 +480,7 @@ def test_the_headline_of_a_quiet_day_names_its_coughs(tmp_path):
     coughs = [(at(t), 2, "coughing", 0.9) for t in ("06:13", "15:26", "15:30")]
     write_day(tmp_path / "logs", DAY, [*coughs, (at("16:00"), 5, "yelling", 0.9)])
     assert headline(tmp_path / "logs", tmp_path) == (
-        "Sunday was quiet. 1 bout of coughing in the night (06:13); 2 by day (15:26, 15:30). "
-        "Shouting once by day (16:00)."
+        "Coughing 3 times (1 at night). Shouting once by day (16:00). Sunday was quiet."
     )
 
 
@@ -528,10 +527,10 @@ def test_the_headline_of_a_quiet_day_names_a_television_that_makes_its_hours_liv
 @pytest.mark.parametrize(
     ("hours", "text"),
     [
-        ([0, *range(6, 24)], "Sunday was quiet (19 of 24 hours recorded)."),
+        ([0, *range(6, 24)], "Sunday was quiet (listened to 19 of 24 hours)."),
         (range(5, 24), "Sunday from 05:00 was quiet."),
         (range(5, 23), "Sunday from 05:00 to 23:00 was quiet."),
-        ([0, 1, *range(4, 20)], "Sunday until 20:00 was quiet (18 of 20 hours recorded)."),
+        ([0, 1, *range(4, 20)], "Sunday until 20:00 was quiet (listened to 18 of 20 hours)."),
         (
             range(6, 18),
             (
@@ -542,8 +541,8 @@ def test_the_headline_of_a_quiet_day_names_a_television_that_makes_its_hours_liv
         (
             [*range(8), *range(13, 24)],
             (
-                "In the 19 recorded hours of Sunday: nothing but quiet. The other 5 hours were not "
-                "recorded."
+                "In the 19 hours that the box listened on Sunday: nothing but quiet. The box did "
+                "not listen in the other 5 hours."
             ),
         ),
     ],
@@ -567,7 +566,7 @@ _CLATTER = (at("23:20"), 40, "objects_activity", 0.9)
         ),
         ([22, 23], [(at("22:10"), 20, "speech", 0.9)], "from 22:00 to 24:00: under 1 min of sound"),
         ([22, 23], [(at("22:10"), 240, "unknown", 0.4)], "from 22:00 to 24:00: 4 min of sound."),
-        ([3, 22], [_TALK], "In the recorded 2 h 00 min of Sunday: talking. There are logs only"),
+        ([3, 22], [_TALK], "In the 2 h 00 min that the box listened on Sunday: talking. There are logs"),
     ],
 )
 def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
@@ -583,7 +582,7 @@ def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
         (range(10), 0, "from 00:00 to 10:00: nothing but quiet. There are logs only up to 10:00."),
         (range(8, 10), 0, "There are logs only from 08:00 to 10:00."),
         (range(20), 0, "Sunday until 20:00 was quiet."),
-        ([*range(8), 9], 90, "logs only up to 10:00. 1 h 00 min of the rest were not recorded."),
+        ([*range(8), 9], 90, "logs only up to 10:00. In between, it did not listen for 1 h 00 min."),
     ],
 )
 def test_hours_without_logs_at_the_ends_are_not_called_not_recorded(tmp_path, hours, hatched, text):
@@ -612,7 +611,7 @@ def test_the_days_of_a_week_before_the_first_log_and_after_the_last_are_a_row_ea
     assert 'class="gap"' not in page
     assert 'class="alert"' not in page
     text = text_of(page)
-    assert "Both of the two recorded days" in text
+    assert "Both of the two days listened to" in text
     assert "there are no logs of the other five days." in text
     assert "There are logs only from Thu 26 Feb to Fri 27 Feb." in text
 
@@ -630,7 +629,8 @@ def test_a_minute_of_a_day_is_no_hour_and_leaves_the_rest_of_the_day(tmp_path):
     rest += [(at(hour), HOUR, "gone") for hour in ("00:00", "23:00")]
     write_day(tmp_path / "logs", DAY, hours=[0, 10, 23], gaps=rest)
     assert headline(tmp_path / "logs", tmp_path) == (
-        "Sunday from 10:25 to 10:35: nothing but quiet. The rest of the day was not recorded."
+        "Sunday from 10:25 to 10:35: nothing but quiet. The box did not listen in the rest of the "
+        "day."
     )
 
 
@@ -650,15 +650,15 @@ def test_a_week_has_a_headline_of_its_days(tmp_path):
         write_day(tmp_path / "logs", DAY - timedelta(days=ago), coughs, hours=hours)
     first = DAY - timedelta(days=6)
     assert headline(tmp_path / "logs", tmp_path, first=first, days=7) == (
-        "All of the five recorded days were quiet; of the other two days there is too little. "
-        "18 bouts of coughing on 4 days; most on Mon 23 Feb: 6."
+        "Coughing 18 times on 4 days; most on Mon 23 Feb: 6. "
+        "All of the five days listened to were quiet; of the other two days there is too little."
     )
 
 
 def test_a_week_of_which_one_day_was_recorded_is_headed_by_that_day(tmp_path):
     write_day(tmp_path / "logs", DAY)
     assert headline(tmp_path / "logs", tmp_path, first=DAY - timedelta(days=6), days=7) == (
-        "Sunday was quiet; there are no logs of the other six days."
+        "Only Sunday was listened to: it was quiet."
     )
 
 
@@ -669,14 +669,15 @@ def test_what_the_night_has_of_the_evening_before_is_named_so_that_counts_add_up
     coughs = [(at(time), 2, "coughing", 0.9) for time in times]
     write_day(tmp_path / "logs", DAY, coughs)
     page = page_of(tmp_path / "logs", tmp_path)
-    assert "4 bouts of coughing in the night (1 of them on Saturday); 1 by day (14:00)." in page
+    assert "Coughing 5 times (4 at night)." in page
+    assert ": coughing 4 times (1 of them on Saturday); under 1 min of sound" in page
     times = "Saturday 23:28, 01:51, 02:16, 06:01, 14:00"
     assert rows_of(page)["Coughing"] == ["4", "1", "0", times, "under 1 min"]
     other = tmp_path / "other"
     other.mkdir()
     write_day(other / "logs", DAY - timedelta(days=1), before)
     write_day(other / "logs", DAY, coughs[:1])
-    assert "in the night (Saturday 23:28, 01:51)." in headline(other / "logs", other)
+    assert "Coughing twice in the night (Saturday 23:28, 01:51)." in headline(other / "logs", other)
 
 
 def test_how_long_a_sound_lasted_is_apart_from_a_television(tmp_path):
@@ -698,7 +699,7 @@ def test_a_name_that_nobody_gave_is_not_shown(tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     write_day(other / "logs", DAY, node="anna", microphone="kitchen")
-    assert "Home: anna. Microphone: kitchen. Times" in page_of(other / "logs", other)
+    assert "Home: anna. Microphone: kitchen. </p>" in page_of(other / "logs", other)
 
 
 def test_talking_and_music_beside_a_television_are_in_no_count_no_length_and_no_sure_mark(tmp_path):
@@ -757,24 +758,34 @@ def test_marks_of_which_the_model_is_not_sure_are_half_as_high(tmp_path):
 def test_sounds_of_one_minute_are_named_once_with_their_number(tmp_path):
     coughs = [(at(time), 2, "coughing", 0.9) for time in ("23:04:01", "23:04:40", "23:37")]
     write_day(tmp_path / "logs", DAY, coughs)
-    assert headline(tmp_path / "logs", tmp_path).endswith(
-        "3 bouts of coughing after 22:00 (23:04 twice, 23:37)."
+    assert headline(tmp_path / "logs", tmp_path).startswith(
+        "Coughing 3 times after 22:00 (23:04 twice, 23:37)."
     )
 
 
 def test_the_first_sentence_of_a_headline_is_a_part_and_not_cut_at_a_full_stop(tmp_path):
     write_day(tmp_path / "logs", DAY, [(at("12:05"), 2, "coughing", 0.9)])
     data, _ = read_report_data(find_home_logs([tmp_path / "logs"]), Period(DAY, 1, UTC))
-    assert day_headline(data.days[0]) == ("Sunday was quiet.", "1 bout of coughing by day (12:05).")
+    assert day_headline(data.days[0]) == ("Coughing once by day (12:05).", "Sunday was quiet.")
     page = page_of(tmp_path / "logs", tmp_path)
-    assert '<p class="headline">Sunday was quiet. <br><span class="second">1 bout' in page
+    assert '<p class="headline">Coughing once by day (12:05). <br><span class="second">Sunday' in page
 
 
 @pytest.mark.parametrize(
     ("sounds", "text"),
     [
-        ([], "Nothing was labelled until 08:00"),
-        ([(at("06:00"), 3, "music", 0.9)], "Only short sounds until 08:00"),
+        ([], "Nothing was labelled from 04:00 to 08:00 and after 08:09. Steady"),
+        (
+            [(at("06:00"), 3, "music", 0.9), (at("06:04"), 2, "coughing", 0.5)],
+            (
+                "From 04:00 to 08:00 and after 08:09: less than a minute of sound in each ten "
+                "minutes; the longest was music, 3 s at 06:00."
+            ),
+        ),
+        (
+            [(at("02:00"), 900, "music", 0.9), (at("07:17"), 50, "speech", 0.5)],
+            "the longest was perhaps talking, 50 s at 07:17. Steady",
+        ),
     ],
 )
 def test_short_sounds_before_the_first_lively_minutes_are_not_denied(tmp_path, sounds, text):
@@ -789,30 +800,31 @@ def test_short_sounds_before_the_first_lively_minutes_are_not_denied(tmp_path, s
 def test_a_shower_that_the_model_does_not_know_counts_as_quiet(tmp_path, classes, steady):
     write_day(tmp_path / "logs", DAY, [(at("08:00"), 300, "music", 0.9)], classes=classes)
     text = html.unescape(text_of(page_of(tmp_path / "logs", tmp_path)))
-    assert f"steady sound, such as {steady}, counts as quiet" in text
+    assert f"Steady sound, such as {steady}, counts as quiet" in text
 
 
 @pytest.mark.parametrize(
     ("steady", "words"),
     [
-        ([(at("07:17"), 420, 14)], "but for steady sound from 07:17 to 07:24"),
+        ([(at("07:17"), 420, 14)], "Steady sound from 07:17 to 07:24."),
         ([(at("07:17"), 420, 5)], ""),
         ([(at("07:17"), 120, 14)], ""),
         ([(at("08:00"), 10 * HOUR, 14)], ""),  # a street by day is no sound of its own
         (
             [(at("03:00"), 360, 14), (at("11:30"), 360, 14)],
-            "but for steady sound from 03:00 to 03:06 and 11:30 to 11:36",
+            "Steady sound from 03:00 to 03:06 and 11:30 to 11:36.",
         ),
         (
             [(at(f"{hour:02}:00"), 180, 14) for hour in (3, 9, 11)],
-            "but for steady sound at three times",
+            "Steady sound at three times.",
         ),
     ],
 )
 def test_a_quiet_day_names_steady_sound_that_no_label_names(tmp_path, steady, words):
     write_day(tmp_path / "logs", DAY, [(at("07:19"), 3, "coughing", 0.9)], steady=steady)
     text = text_of(page_of(tmp_path / "logs", tmp_path))
-    assert f"Sunday was quiet {words}".strip() + "." in text
+    assert f"Coughing once by day (07:19). Sunday was quiet. {words}".strip() in text
+    assert ("Steady sound from" in text or "Steady sound at" in text) == bool(words)
     assert ("such as water, a fan or a machine, was louder" in text) == bool(words)
 
 
@@ -827,14 +839,14 @@ def test_a_week_of_one_recorded_day_has_the_sentence_of_that_day(tmp_path):
     write_day(tmp_path / "logs", DAY, [(at("19:20"), 600, "objects_activity", 0.9)])
     week = {"first": DAY - timedelta(days=6), "days": 7}
     assert headline(tmp_path / "logs", tmp_path, **week).startswith(
-        "Sunday was quiet but for 19:00 to 20:00; there are no logs of the other six days."
+        "Only Sunday was listened to: it was quiet but for 19:00 to 20:00."
     )
     write_day(tmp_path / "logs", DAY - timedelta(days=1))
     write_day(tmp_path / "logs", DAY - timedelta(days=2), hours=[12])
     other = tmp_path / "other"
     other.mkdir()
     assert headline(tmp_path / "logs", other, **week).startswith(
-        "Both of the two recorded days were quiet but for a few hours; of the other five days"
+        "Both of the two days listened to were quiet but for a few hours; of the other five days"
     )
 
 
@@ -842,7 +854,7 @@ def test_what_to_set_and_which_commands_to_use_is_at_the_end_for_whoever_set_it_
     write_day(tmp_path / "logs", DAY)
     page = page_of(tmp_path / "logs", tmp_path)
     own, _, setup = page.partition("<h2>For whoever set this up</h2>")
-    assert "Times are UTC.</p>" in own
+    assert "<small>Times are UTC, perhaps not local time.</small></h1>" in own
     assert "says nothing about them: toilet flush, shower and water tap.</p>" in own
     assert "<code>" not in own
     assert "set <code>timezone</code>" in setup
@@ -867,18 +879,18 @@ def test_the_first_and_the_last_longer_sounds_are_not_called_the_first_and_the_l
     for days in (1, 7):
         page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=days - 1), days)
         rows = rows_of(page)
-        assert rows["First longer sounds a minute or more in ten"] == ["12:00"]
-        assert rows["Last longer sounds a minute or more in ten"] == ["19:09"]
+        after = [""] * (days == 1)
+        assert rows["First longer sounds a minute or more in ten"] == ["12:00", *after]
+        assert rows["Last longer sounds a minute or more in ten"] == ["19:09", *after]
         assert "There may be shorter sounds before and after them." in text_of(page)
 
 
 def test_what_a_day_says_of_its_night_names_the_morning_it_ends_on(tmp_path):
     write_day(tmp_path / "logs", DAY, [(at("03:00"), 2, "coughing", 0.9)])
     page = page_of(tmp_path / "logs", tmp_path)
-    assert "<h2>Night to Sunday, 22:00 to 07:00</h2>" in page
     (heads,) = re.findall(r"<tr><th scope=.col.>Sound.*?</tr>", page)
     assert "Night to Sunday, 22\N{EN DASH}07" in re.sub("<.*?>", "", heads)
-    assert "In the night to Sunday, 22:00 to 07:00: 1 bout of coughing" in page
+    assert "In the night to Sunday, 22:00 to 07:00: coughing once (03:00);" in page
     assert not re.search(r">Night[< ](?!to Sunday)", page), "no other night"
 
 
@@ -889,7 +901,7 @@ def test_times_of_sounds_are_those_at_which_they_began(tmp_path):
     page = page_of(tmp_path / "logs", tmp_path)
     assert rows_of(page)["Household sounds"][3] == "first 08:00, last 13:00"
     assert rows_of(page)["Coughing"][3] == "16:00"
-    assert "1 bout of coughing by day (16:00)." in page
+    assert "Coughing once by day (16:00)." in page
     assert "The time of a sound is that of its beginning." in page
 
 
@@ -925,7 +937,7 @@ def test_the_picture_has_a_title_and_tells_in_words_what_it_shows(tmp_path):
     assert page.count('role="img"') == 1
     assert 'aria-label="The sounds of Sunday, 1 March 2026"' in page
     assert (
-        ">Coughing 2. There are logs only from 00:00 to 21:00. Not recorded: 18:00 to 20:00.</desc>"
+        ">Coughing 2. There are logs only from 00:00 to 21:00. Not listening: 18:00 to 20:00.</desc>"
         in page
     )
     assert page.count('aria-hidden="true"') == 1, "its words and strips are not read one by one"
@@ -1046,7 +1058,6 @@ def test_a_page_needs_nothing_but_itself(flat_page):
     assert "@import" not in flat_page
     assert outline.headings == [
         "What was heard",
-        "Night to Sunday, 22:00 to 07:00",
         "Quiet and activity",
         "For the interRAI Home Care assessment",
         "How to read this",
@@ -1060,12 +1071,11 @@ def test_a_page_says_what_was_not_as_usual_and_what_was_not_heard(flat_page):
     assert re.search(
         r"Coughing 40 more often usually \d+ \(\d+ to \d+\) 0 .* first 01:00, last 04:15", text
     )
-    assert "How unusual the day was cannot be said yet: that takes 14 mostly recorded days" in text
-    assert "Not recorded: 50 min (3 %)" in text
-    assert " Recorded: " not in text, "it is missing once"
+    assert "How unusual the day was cannot be said yet: that takes 14 days in the four" in text
+    assert text.count("Not listening: 50 min (3 %)") == 1, "it is missing once"
     assert "The microphone went silent: 50 min, once (14:10 to 15:00)" in text
-    assert "The microphone bathroom did not record for 10 h 00 min" in text
-    assert "Nothing was recorded" not in text, "the gap says why"
+    assert "The microphone bathroom was not listening for 10 h 00 min" in text
+    assert "The box was off" not in text, "the gap says why"
     assert "living room: the model is gone: 30 min, once (14:10 to 14:40)" in text
     assert re.search(r"Toilet flush 1 usually .* 02:00 under 1 min", text)
     assert re.search(r"Shower .* 07:30 5 min", text)
@@ -1112,9 +1122,9 @@ def test_a_week_of_one_logged_day_has_one_table_of_sounds_without_the_day(tmp_pa
     page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
     rows = rows_of(page)
     assert rows["Sound"] == ["How often", "How long"]
-    assert rows["Recorded"] == ["92 %", ""]
+    assert "Listened" not in rows, "the summary says how much of the week"
     assert (rows["Talking"], rows["Coughing"]) == (["1", "2 min"], ["1", "under 1 min"])
-    assert page.count('scope="col">Sun 1<') == 2, "of the night, and of quiet and activity"
+    assert page.count('scope="col">Sun 1<') == 1, "of quiet and activity, with the night"
 
 
 def test_sounds_of_less_than_a_minute_a_day_have_no_row_of_lengths_in_a_week(tmp_path):
@@ -1125,8 +1135,8 @@ def test_sounds_of_less_than_a_minute_a_day_have_no_row_of_lengths_in_a_week(tmp
     page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=6), 7)
     often, _, long = page.partition("<h2>How long it was heard</h2>")
     long = long.partition("<h2>")[0]
-    assert "Recorded" in often, "once"
-    assert "Recorded" not in long
+    assert "Listened" in often, "once"
+    assert "Listened" not in long
     assert "Coughing" not in long
     assert "<p>Under a minute a day: coughing.</p>" in long
     assert rows_of(long)["Talking"] == ["2 min", "2 min", "3 min"]
@@ -1218,8 +1228,8 @@ def test_a_damaged_log_is_not_heard_and_the_command_says_so(hearthlog, tmp_path)
     assert done.returncode == 3
     assert logs[10].name in done.stderr
     text = text_of((tmp_path / "day.html").read_text())
-    assert "Not recorded: 1 h 00 min (4 %)." in text
-    assert "The recorder was off then, or its logs are not here." in text
+    assert "Not listening: 1 h 00 min (4 %)." in text
+    assert "The box was off then, or its logs are not here." in text
     assert "1 log could not be read, or only in part." in text
 
 
@@ -1281,8 +1291,7 @@ def test_the_headline_tells_night_day_and_evening_apart_with_the_times_of_rare_s
     write_day(tmp_path, DAY, [(at(time), 2, "coughing", 0.9) for time in times.split()])
     page = page_of(tmp_path, tmp_path)
     assert text_of(page).count(
-        "2 bouts of coughing in the night (02:10, 06:13); 1 by day (12:00); 2 after 22:00 "
-        "(22:30, 23:15)."
+        "Coughing 3 times (2 at night); twice after 22:00 (22:30, 23:15)."
     )
 
 

@@ -197,7 +197,7 @@ def test_on_a_phone_a_week_has_its_days_once_above_columns_of_figures(browser, t
     names = boxes(browser, "table.wide tbody th")
     assert {round(width) for _, _, width, _ in names} == {PHONE[0] - 32}, "above its figures"
     text = browser.evaluate("document.body.textContent")
-    assert "A dash: not recorded, or too little of it." in text
+    assert "A dash: the box did not listen, or too little." in text
 
 
 def test_a_phone_has_a_block_for_each_class_of_a_day_without_parts_in_which_there_was_none(
@@ -228,18 +228,63 @@ def test_no_table_of_a_printed_week_is_broken(browser, tmp_path):
         browser.call("Emulation.setEmulatedMedia", media="")
 
 
-def test_a_phone_shows_twelve_lanes_and_those_that_were_heard(browser, tmp_path):
+def test_a_phone_shows_at_most_twelve_lanes(browser, tmp_path):
     classes = [*GENERAL, *(f"thing_{number}" for number in range(9))]
-    write_day(tmp_path / "logs", DAY, [(at("10:00"), 5, "thing_8", 0.9)], classes=classes)
+    names = [name for name in classes if name != "silence"]
+    events = [(at("10:00") + 60 * n, 5, name, 0.9) for n, name in enumerate(names)]
+    write_day(tmp_path / "logs", DAY, events, classes=classes)
     address = report_of(tmp_path / "logs", tmp_path)
     counts = []
     for width, height in (PHONE, SIZES[0]):
         set_size(browser, width, height)
         browser.open(address)
         names = [text for text, *_ in boxes(browser, ".day .row:not(.axis, .bars) .name")]
-        assert "Thing 8" in names
         counts.append(len(names))
     assert counts == [12, 17]
+
+
+def test_only_sounds_that_were_heard_or_could_not_be_have_a_lane(browser, tmp_path):
+    events = [(at("10:00"), 5, "coughing", 0.9), (at("12:00"), 5, "speech", 0.9)]
+    write_day(tmp_path / "logs", DAY, events)
+    browser.open(report_of(tmp_path / "logs", tmp_path))
+    lanes = ".day .row:not(.axis, .bars) .name"
+    assert [text for text, *_ in boxes(browser, lanes)] == ["Coughing", "Talking"]
+    bath = {"classes": ["shower", "silence"], "microphone": "bath", "node": "bath"}
+    write_day(tmp_path / "logs", DAY, hours=range(8), **bath)
+    browser.open(report_of(tmp_path / "logs", tmp_path))
+    assert [text for text, *_ in boxes(browser, lanes)] == ["Coughing", "Talking", "Shower"]
+
+
+def test_on_a_phone_no_number_of_minutes_touches_another_or_leaves_its_frame(browser, tmp_path):
+    write_day(tmp_path / "logs", DAY, _TELEVISION)
+    set_size(browser, *PHONE, mobile=True)
+    browser.open(report_of(tmp_path / "logs", tmp_path))
+    numbers = boxes(browser, ".bars b")
+    assert numbers
+    assert all(a + w < b for (_, a, w, _), (_, b, *_) in pairwise(numbers))
+    top = "Math.min(...[...document.querySelectorAll('.bars b')].filter(e => e.checkVisibility())"
+    top += ".map(e => e.getBoundingClientRect().top))"
+    frame = "document.querySelector('.bars .strip').getBoundingClientRect().top"
+    assert browser.evaluate(f"{top} - {frame}") >= 0
+    set_size(browser, *SIZES[0])
+    assert len(boxes(browser, ".bars b")) > len(numbers)
+
+
+def test_the_minutes_of_sound_beside_a_television_are_pale_on_those_that_are_not(browser, tmp_path):
+    other = [(at("19:10"), 600, "objects_activity", 0.9), (at("12:00"), 1200, "music", 0.9)]
+    talking = [row for row in _TELEVISION if at("19:30") <= row[0] < at("20:00")]
+    write_day(tmp_path / "logs", DAY, [*other, *talking])
+    set_size(browser, *SIZES[0])
+    browser.open(report_of(tmp_path / "logs", tmp_path))
+    heights = "[...document.querySelectorAll('%s')].map(e => e.getBBox().height)"
+    solid, pale = (
+        json.loads(browser.evaluate(f"JSON.stringify({heights % selector})"))
+        for selector in (".bar:not(.pale)", ".bar.pale")
+    )
+    assert solid[0] == pytest.approx(20, abs=0.2)
+    assert len(pale) == 1, "the hour of the television"
+    assert pale[0] >= 22.4
+    assert sum(solid[1:]) + pale[0] == pytest.approx(32.5, abs=0.2)
 
 
 @pytest.mark.parametrize("width", [390, 1366])
@@ -272,7 +317,7 @@ def test_what_sounded_beside_a_television_is_pale_and_the_table_says_so(browser,
     text = browser.evaluate("document.body.textContent")
     assert "pale: beside a television, not counted" in text
     assert "1 beside a television" in text
-    assert "1 bout of coughing by day (16:00)." in text
+    assert "Coughing once by day (16:00)." in text
 
 
 @pytest.fixture(scope="module")
@@ -404,7 +449,7 @@ def test_keys_and_swatches_have_the_colours_of_the_marks_by_day_and_by_night(
         browser.open(address)
         image = pixels(browser.picture())
         paper = image[2, 2]
-        lane, household = ".row:nth-child(%d) g%s .long", 8
+        lane, household = ".row:nth-child(%d) g%s .long", 3
         swatches = ".row:nth-child(%d) .swatch"
         for row in (1, household):
             mark = colour_at(browser, image, lane % (row, ":not(.pale, .low)"))

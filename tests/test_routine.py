@@ -195,7 +195,7 @@ def test_one_figure_far_from_usual_is_told_of_a_day_that_is_as_usual_on_the_whol
     found = judged(month(lambda rng: sorted([*usual_day(rng), *far])))
     text = judgement_text(replace(found, once_in=2.0))
     assert text.startswith("On the whole as usual, compared with 27 earlier days, but: ")
-    assert "bouts of coughing in the night 2" in text
+    assert "times of coughing in the night 2" in text
 
 
 def test_hours_are_those_of_the_clock_on_days_that_it_is_changed():
@@ -328,7 +328,7 @@ def test_an_alert_tells_of_an_unusual_day_in_the_morning_after_it(logs):
     (ring,), _ = notifications(rule("unusual_day", "day", once_in=100), recorded, start, end, UTC)
     assert ring.time == start + (19 * 24 + 8) * HOUR * NANOSECONDS
     assert ring.text.startswith("Fri 20 Feb and the night after it, ")
-    assert "bouts of coughing in the night 3" in ring.text
+    assert "times of coughing in the night 3" in ring.text
     assert "no household sounds from 11:" in ring.text
 
 

@@ -170,7 +170,7 @@ def week_page(data: ReportData) -> str:
         partly=_partly_covered(shown.logged_days[0]) if len(shown.logged_days) == 1 else [],
         parts=[
             PageSection(section, _week(data, section.figures, has_share=_is_partly(data, section)))
-            for section in week_sections(data.classes)
+            for section in week_sections(data.classes, len(data.logged_days))
         ],
     )
 
@@ -200,7 +200,6 @@ def _page(data: ReportData, shown: ReportData, picture: PagePicture, **parts: An
     absent = [name for name in names if _has_count(shown, name) and not _occurs(shown, name)]
     uncertain = [name for name in names if not _has_count(shown, name)]
     everywhere = [name for name in names if name not in ON_TELEVISION]
-    is_utc = str(data.zone) in {"Etc/UTC", "UTC"}
     return fill_page(
         data=data,
         picture=picture,
@@ -217,8 +216,7 @@ def _page(data: ReportData, shown: ReportData, picture: PagePicture, **parts: An
         dash=_NOTHING,
         unsure=_is_unsure(it for _, it, _ in parts["overview"]),
         has_dash=len(data.days) > 1 and _has_dash(parts),
-        is_utc=is_utc,
-        zone_is_unset=is_utc and not data.has_zone,
+        is_utc=str(data.zone) in {"Etc/UTC", "UTC"},
         scenarios=[(plain(name), _scenario(data, name)) for name in data.scenarios],
         days_before=BASELINE_DAYS,
         interrai=_interrai(data, [day.to_evening for day in days]),
@@ -299,7 +297,7 @@ def _late_cell(cell: Cell, day: DayMetrics, name: str) -> Cell:
     beside = f"{uncounted} {_BESIDE}" if uncounted else ""
     notes = _times(day, name, day.evening), beside, cell.note
     kind = "count" if uncounted else cell.kind
-    return cell._replace(note=", ".join(filter(None, notes)), kind=kind)
+    return cell._replace(note="; ".join(filter(None, notes)), kind=kind)
 
 
 def _beside(day: DayMetrics, name: str) -> str:
@@ -492,9 +490,10 @@ def _week(data: ReportData, figures: Sequence[ReportFigure], *, has_share: bool)
     for figure in figures:
         values = [figure.value(day) if day.coverage.length else None for day in days]
         colour = colour_on_paper(figure.name) if figure.name else None
+        title = figure.title if len(days) == 1 else figure.short
         rows.append(
             [
-                Cell(figure.short, colour=colour, note=_notes(data, figure)),
+                Cell(title, colour=colour, note=_notes(data, figure)),
                 *(
                     Cell(_short(value, is_often=figure.is_often and len(days) == 1))
                     for value in values

@@ -1,6 +1,6 @@
 """Report of a home: from logs to a page and a picture."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import date, timedelta, tzinfo
@@ -36,7 +36,7 @@ from hearthlog.analyzer.activity.values import BASELINE_DAYS
 from hearthlog.analyzer.logs.home_logs import HomeLog, HomeLogs, check_day, network_changes
 from hearthlog.analyzer.logs.labelling import Labelling
 from hearthlog.analyzer.logs.layers import latest_records
-from hearthlog.analyzer.logs.local_time import TIMEZONE, day_span, midnight
+from hearthlog.analyzer.logs.local_time import day_span, midnight
 from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import (
     EVENT_PAUSE,
@@ -162,7 +162,6 @@ def read_report_data(
         unread=len(home.losses),
         networks=network_changes(logs.between(since, close[1]), zone),
         hidden=home.hidden,
-        has_zone=bool(_latest_record(logs, close).get(TIMEZONE)),
     )
     return data, home.losses
 
@@ -186,12 +185,8 @@ def _logged(logs: HomeLogs, coverage: Spans) -> tuple[int, int]:
 
 def _model(logs: HomeLogs, close: tuple[int, int]) -> str:
     """Return the SHA-256 of the model of the last log of the period."""
-    return _latest_record(logs, close).get("model_sha256", "")
-
-
-def _latest_record(logs: HomeLogs, close: tuple[int, int]) -> Mapping[str, str]:
-    """Return the record of the last log of the period."""
-    return next(latest_records(entry.path for entry in logs.between(*close)), {})
+    records = latest_records(entry.path for entry in logs.between(*close))
+    return next(records, {}).get("model_sha256", "")
 
 
 def _doubts(

@@ -92,12 +92,29 @@ def day_sections() -> list[FigureSection]:
     return [FigureSection("Quiet and activity", [sound, *_NIGHT, *edges], note)]
 
 
-def week_sections(classes: Sequence[str]) -> list[FigureSection]:
-    """Return the tables of a week for the classes of a home's model."""
-    coughing = [_at_night(n, several_in_words(n), in_words(n)) for n in _IN_NIGHT if n in classes]
+def week_sections(classes: Sequence[str], logged: int) -> list[FigureSection]:
+    """Return the tables of a week for the classes of a home's model.
+
+    Of a week with a single logged day, that of the night is part of that of the activity.
+    """
+    night = [
+        *(
+            _at_night(n, f"{in_words(n)} in the night", in_words(n))
+            for n in _IN_NIGHT
+            if n in classes
+        ),
+        *_NIGHT,
+    ]
+    bathroom = FigureSection("Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE)
+    if logged == 1:
+        sound, *edges = _ACTIVITY
+        together = FigureSection(
+            "Quiet and activity", [sound, *night, *edges], f"{_NIGHT_NOTE} {_ACTIVITY_NOTE}"
+        )
+        return [section for section in (bathroom, together) if section.figures]
     found = [
-        FigureSection("Bathroom", list(_bathroom(classes)), _BATHROOM_NOTE),
-        FigureSection("Night", [*coughing, *_NIGHT], _NIGHT_NOTE),
+        bathroom,
+        FigureSection("Night", night, _NIGHT_NOTE),
         FigureSection("Quiet and activity", _ACTIVITY, _ACTIVITY_NOTE),
     ]
     return [section for section in found if section.figures]
@@ -161,13 +178,13 @@ _IN_NIGHT = COUGHING, CRYING
 _LONGER = "a minute or more in ten"
 _LONGEST_QUIET = f"Longest quiet, {MORNING:02}\N{EN DASH}{EVENING:02}"
 _NIGHT = (
+    ReportFigure("Time with sound in the night", "Time with sound", lambda day: day.night_sound),
     ReportFigure(
         "30 s of sound or more in the night",
         "30 s of sound or more",
         lambda day: day.night_stretches,
         is_often=True,
     ),
-    ReportFigure("Time with sound in the night", "Time with sound", lambda day: day.night_sound),
 )
 _ACTIVITY = (
     ReportFigure(
@@ -195,7 +212,9 @@ _ACTIVITY = (
 )
 _BATHROOM_NOTE = f"Night is {NIGHT_HOURS}. A person, not the report, knows who used the bathroom."
 _NIGHT_PAUSES = "30 s of sound or more: how often there was as much; ten quiet minutes end a time."
-_NIGHT_NOTE = f"{NIGHT_HOURS}, counted on the day on which the night ends. {_NIGHT_PAUSES}"
+_NIGHT_NOTE = (
+    f"The night is {NIGHT_HOURS}, counted on the day on which the night ends. {_NIGHT_PAUSES}"
+)
 _ACTIVITY_NOTE = (
     "Longer sounds: the first and the last ten minutes, from 04:00 to midnight, with at least one "
     "minute of sound. There may be shorter sounds before and after them. Quiet can mean rest, "
@@ -236,7 +255,6 @@ class ReportData:
     unread: int  # number of logs that could not be read completely
     networks: Sequence[str]  # network changes in these weeks, one line per microphone
     hidden: frozenset[str]  # classes that nobody is told of
-    has_zone: bool  # whether the logs name the zone of the home
 
     @property
     def home(self) -> str:

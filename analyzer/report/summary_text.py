@@ -14,6 +14,7 @@ from hearthlog.analyzer.logs.recorder_info import Trouble
 from hearthlog.analyzer.logs.spans import (
     NONE,
     Spans,
+    cut,
     difference,
     intersection,
     joined,
@@ -284,7 +285,7 @@ def _longest_sound(day: DayMetrics, spans: Spans) -> str:
             inside = intersection(events, spans)
             doubts = np.isin(events.starts, unsure)[rows_at(events, inside.starts)].tolist()
             found += [
-                (end - start, -start, f"perhaps {words}" if doubt else words)
+                (cut(day.home.spans[name], start, end).length, -start, "perhaps " * doubt + words)
                 for (start, end), doubt in zip(inside.pairs(), doubts, strict=True)
             ]
     if not found:
