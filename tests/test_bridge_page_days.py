@@ -793,6 +793,32 @@ def test_the_night_and_the_day_have_the_counts_that_the_report_of_the_day_has(tm
     assert (total.counted, total.unsure) == (4, 1), "as info has it"
 
 
+def test_what_is_beside_a_television_is_of_the_same_hours_in_the_day_the_week_and_info(tmp_path):
+    monday, logs = date(2026, 3, 2), tmp_path / "logs"
+    talking = [(at("21:00") + 30 * n, 15, "speech", 0.9) for n in range(240)]
+    write_day(logs, monday, talking, classes=[*GENERAL, "unknown"])
+    past = PastDays(RecorderAddress(logs, "home", UTC)).read(monday, frozenset())
+    home = HomeDay([*past.state.microphones.values()], past.moment, UTC, is_past=True)
+    (lane,) = (each for each in picture_of(home)["rooms"][0]["lanes"] if each["label"] == "speech")
+    assert lane["uncounted"] == 120, "until 22:00, on the page"
+    assert read_day_sounds(find_home_logs([logs]), monday, UTC).totals["speech"].television == 120
+    rows = []
+    for days in (1, 7):
+        output = tmp_path / f"{days}.html"
+        make_report(find_home_logs([logs]), Period(monday, days, UTC), output)
+        text = output.read_text().replace("\N{NO-BREAK SPACE}", " ")
+        each = re.findall(r"<tr>.*?</tr>", text)
+        rows.append([" ".join(re.sub("<[^>]*>", " ", row).split()) for row in each])
+    day, week = rows
+    beside = "30 min beside a television"
+    assert f"Talking 120 beside a television 0 0 0 120 beside a television 0 min {beside}" in day
+    assert f"Talking 0 120 beside a television 0 min {beside}" in week
+    assert "Time with sound 30 min 30 min of it beside a television 30 min" in day
+    assert "Time with sound 30 min of it beside a television 30 min" in week
+    assert "Last longer sounds a minute or more in ten 22:59" in day
+    assert "Last longer sounds a minute or more in ten 22:59" in week
+
+
 @pytest.mark.parametrize("text", ["2001-01-01", "", "../../etc/passwd", "9999-12-31", "%00", "x"])
 def test_a_day_without_logs_is_one_line(lived, text):
     status, answer = got(lived, f"/day?{text}")

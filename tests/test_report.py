@@ -172,9 +172,7 @@ def test_of_several_times_those_that_are_not_sure_have_a_question_mark(tmp_path)
     write_day(tmp_path / "logs", DAY - timedelta(days=1), nights)
     write_day(tmp_path / "logs", DAY, [])
     text = text_of(page_of(tmp_path / "logs", tmp_path))
-    assert (
-        "Coughing once in the night, perhaps 1 more (Saturday 23:30, Saturday 23:50?)." in text
-    )
+    assert "Coughing once in the night, perhaps 1 more (Saturday 23:30, Saturday 23:50?)." in text
     assert "Coughing 1 (+1?) 0 0 Saturday 23:30, Saturday 23:50?" in text
 
 
@@ -294,7 +292,9 @@ def test_the_reason_of_a_gap_is_below_the_headline_that_counts_its_hours(tmp_pat
     gap = (at("10:00"), 2 * HOUR, "silent")
     write_day(tmp_path, DAY, hours=[0, *range(8, 14), 23], gaps=[gap])
     text = text_beside_picture(page_of(tmp_path, tmp_path))
-    assert "In the 6 hours that the box listened on Sunday: nothing but quiet. The box did not" in text
+    assert (
+        "In the 6 hours that the box listened on Sunday: nothing but quiet. The box did not" in text
+    )
     assert "The box was off for 16 h 00 min of the time not listened to, or its logs" in text
     assert "2 h 00 min, once (10:00 to 12:00)" in text
     assert "Not listening:" not in text
@@ -319,7 +319,9 @@ def test_of_a_day_that_was_hardly_heard_nothing_is_said_not_to_have_been(tmp_pat
     for title in ("Longest quiet, 07\N{EN DASH}22", *longer, "Behaviour: shouting"):
         assert title not in rows
     assert "Shouting" not in rows
-    assert "The box listened too little to tell whether there was any of these: crying, shout" in text
+    assert (
+        "The box listened too little to tell whether there was any of these: crying, shout" in text
+    )
     assert "The box listened too little to tell more." in text
     assert "was quiet" not in text
     assert (
@@ -566,7 +568,11 @@ _CLATTER = (at("23:20"), 40, "objects_activity", 0.9)
         ),
         ([22, 23], [(at("22:10"), 20, "speech", 0.9)], "from 22:00 to 24:00: under 1 min of sound"),
         ([22, 23], [(at("22:10"), 240, "unknown", 0.4)], "from 22:00 to 24:00: 4 min of sound."),
-        ([3, 22], [_TALK], "In the 2 h 00 min that the box listened on Sunday: talking. There are logs"),
+        (
+            [3, 22],
+            [_TALK],
+            "In the 2 h 00 min that the box listened on Sunday: talking. There are logs",
+        ),
     ],
 )
 def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
@@ -582,7 +588,11 @@ def test_the_headline_of_a_partly_recorded_day_says_when_and_what_was_labelled(
         (range(10), 0, "from 00:00 to 10:00: nothing but quiet. There are logs only up to 10:00."),
         (range(8, 10), 0, "There are logs only from 08:00 to 10:00."),
         (range(20), 0, "Sunday until 20:00 was quiet."),
-        ([*range(8), 9], 90, "logs only up to 10:00. In between, it did not listen for 1 h 00 min."),
+        (
+            [*range(8), 9],
+            90,
+            "logs only up to 10:00. In between, it did not listen for 1 h 00 min.",
+        ),
     ],
 )
 def test_hours_without_logs_at_the_ends_are_not_called_not_recorded(tmp_path, hours, hatched, text):
@@ -768,7 +778,9 @@ def test_the_first_sentence_of_a_headline_is_a_part_and_not_cut_at_a_full_stop(t
     data, _ = read_report_data(find_home_logs([tmp_path / "logs"]), Period(DAY, 1, UTC))
     assert day_headline(data.days[0]) == ("Coughing once by day (12:05).", "Sunday was quiet.")
     page = page_of(tmp_path / "logs", tmp_path)
-    assert '<p class="headline">Coughing once by day (12:05). <br><span class="second">Sunday' in page
+    assert (
+        '<p class="headline">Coughing once by day (12:05). <br><span class="second">Sunday' in page
+    )
 
 
 @pytest.mark.parametrize(
@@ -937,8 +949,8 @@ def test_the_picture_has_a_title_and_tells_in_words_what_it_shows(tmp_path):
     assert page.count('role="img"') == 1
     assert 'aria-label="The sounds of Sunday, 1 March 2026"' in page
     assert (
-        ">Coughing 2. There are logs only from 00:00 to 21:00. Not listening: 18:00 to 20:00.</desc>"
-        in page
+        ">Coughing 2. There are logs only from 00:00 to 21:00. "
+        "Not listening: 18:00 to 20:00.</desc>" in page
     )
     assert page.count('aria-hidden="true"') == 1, "its words and strips are not read one by one"
 
@@ -1290,9 +1302,7 @@ def test_the_headline_tells_night_day_and_evening_apart_with_the_times_of_rare_s
     times = "02:10 06:13 12:00 22:30 23:15"
     write_day(tmp_path, DAY, [(at(time), 2, "coughing", 0.9) for time in times.split()])
     page = page_of(tmp_path, tmp_path)
-    assert text_of(page).count(
-        "Coughing 3 times (2 at night); twice after 22:00 (22:30, 23:15)."
-    )
+    assert text_of(page).count("Coughing 3 times (2 at night); twice after 22:00 (22:30, 23:15).")
 
 
 # What needs a look
