@@ -76,9 +76,9 @@ def rows_of(page):
     return found
 
 
-def page_of(root, tmp_path, first=DAY, days=1) -> str:
+def page_of(root, tmp_path, first=DAY, days=1, draw=None) -> str:
     output = tmp_path / f"page-{first}-{days}.html"
-    make_report(find_home_logs([root]), Period(first, days, UTC), output, draw=save_timelines)
+    make_report(find_home_logs([root]), Period(first, days, UTC), output, draw=draw)
     return output.read_text()
 
 
@@ -987,7 +987,7 @@ def test_sounds_two_minutes_apart_are_two_marks_on_an_evening_and_stripes_on_a_d
 def test_the_png_of_an_evening_is_as_wide_as_its_hours(tmp_path):
     events = [(at("18:00"), HOUR, "objects_activity", 1.0), (at("20:00"), HOUR, "crying", 1.0)]
     write_day(tmp_path / "logs", DAY, events, hours=[18, 19, 20])
-    page_of(tmp_path / "logs", tmp_path)
+    page_of(tmp_path / "logs", tmp_path, draw=save_timelines)
     with Image.open(next(tmp_path.glob("*.png"))) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     lefts = {
@@ -1176,7 +1176,7 @@ def test_the_picture_draws_half_as_high_what_is_not_sure_and_pale_what_is_beside
     talking = [(at("20:00") + 60 * n, 55, "speech", 0.9) for n in range(120)]
     events = [(at("06:00"), HOUR, "crying", 1.0), (at("12:00"), HOUR, "yelling", 0.5), *talking]
     write_day(tmp_path / "logs", DAY, events)
-    page_of(tmp_path / "logs", tmp_path)
+    page_of(tmp_path / "logs", tmp_path, draw=save_timelines)
     with Image.open(next(tmp_path.glob("*.png"))) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     found = {
@@ -1191,7 +1191,7 @@ def test_the_picture_draws_half_as_high_what_is_not_sure_and_pale_what_is_beside
 def test_the_picture_has_the_colours_of_the_classes_where_they_were_heard(tmp_path):
     events = [(at("06:00"), HOUR, "objects_activity", 1.0), (at("18:00"), HOUR, "crying", 1.0)]
     write_day(tmp_path / "logs", DAY, events, gaps=[(at("12:00"), HOUR, "gone")])
-    page_of(tmp_path / "logs", tmp_path)
+    page_of(tmp_path / "logs", tmp_path, draw=save_timelines)
     with Image.open(next(tmp_path.glob("*.png"))) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     places = {}
