@@ -29,7 +29,7 @@ from hearthlog.analyzer.logs.spans import (
     intersection,
     lengths,
     rows_at,
-    union,
+    single_span,
 )
 from hearthlog.models.classes import SILENCE, UNKNOWN
 from hearthlog.schemas.frames import NANOSECONDS
@@ -130,28 +130,39 @@ def _events_of(
 
 
 class DaySounds(NamedTuple):
-    """Sounds of the 24 hours to 22:00 of a day, as a report counts them."""
+    """Sounds of a day, or of another span, as a report counts them."""
 
     day: date
     span: tuple[int, int]  # in nanoseconds of UTC
     totals: Mapping[str, EventTotal]  # of classes that occurred
     minutes: Mapping[str, float]  # counted, of classes that have any
-    uncounted: float  # minutes while something like a television sounded, of all classes together
+    uncounted: Mapping[str, float]  # minutes beside something like a television, likewise
 
 
 def sounds_of_day(day: DayMetrics) -> DaySounds:
     """Return the sounds of the 24 hours to 22:00 of a day."""
-    day = day.to_evening
+    return _sounds_of_span(day.to_evening)
+
+
+def sounds_between(
+    metrics: HomeMetrics, day: date, zone: tzinfo, start: int, end: int
+) -> DaySounds:
+    """Return the sounds of a span, in nanoseconds of UTC, that belongs to a day."""
+    own = day_of(metrics, day, zone)
+    return _sounds_of_span(replace(own, home=metrics, span=single_span(start, end)))
+
+
+def _sounds_of_span(day: DayMetrics) -> DaySounds:
     start, end = int(day.span.starts[0]), int(day.span.ends[0])
     names = [name for name in day.home.classes if name != SILENCE]
     minutes = {name: day.spans_of(name).length / MINUTE for name in names}
-    apart = union(*(day.uncounted_spans(name) for name in names))
+    apart = {name: day.uncounted_minutes(name) for name in names}
     return DaySounds(
         day.day,
         (start, end),
         event_totals(day.home, start, end),
         {name: length for name, length in minutes.items() if length},
-        apart.length / MINUTE,
+        {name: length for name, length in apart.items() if length},
     )
 
 

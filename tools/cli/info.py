@@ -60,7 +60,7 @@ def info(
     from hearthlog.analyzer.logs.summary import summarise
     from hearthlog.models.registry import is_starter
     from hearthlog.schemas.logs.files import find_logs
-    from hearthlog.tools.cli.info_summary import Overview, day_lines, next_step
+    from hearthlog.tools.cli.info_summary import Overview, next_step
 
     with share_done("reading logs") as progress:
         summary = summarise(_each(find_logs(path), progress))
@@ -75,32 +75,27 @@ def info(
     zone, hidden = _zone_and_hidden(logs)
     sounds = _last_day(summary, logs, zone)
     if as_json:
-        counts = None
-        if sounds is not None:
-            totals = {name: total._asdict() for name, total in sounds.totals.items()}
-            counts = {"date": sounds.day.isoformat(), "counts": totals}
         more = {
             "scenarios": [one._asdict() for one in scenarios],
             "checked": None if accuracy is None else accuracy.as_json(),
             "next": following,
-            "day": counts,
+            "day": None if sounds is None else _day_json(sounds),
         }
         print(json.dumps(_as_json(summary) | more, indent=2))
     else:
         start = min((entry.start for entry in logs.between()), default=None)
-        overview = Overview(summary, zone, hidden, start, sounds)
-        print_lines(overview.lines(following))
-        _print_amounts(overview)
-        if sounds is not None:
-            print_lines(day_lines(sounds.day, sounds.totals))
+        overview = Overview(summary, zone, hidden, start)
+        print_lines(overview.lines())
+        _print_sounds(overview, sounds, verbose=verbose)
         print_lines(_stream_lines(summary))
         print_lines(_model_lines(summary, path, logs, scenarios))
-        print_lines(() if accuracy is None else accuracy.lines())
+        print_lines(_checked_lines(accuracy, following))
         print_lines(first_of("gap", [_gap_text(gap, overview) for gap in summary.gaps]))
+        print_lines([] if following is None else [f"Next: {following}"])
         if verbose or not summary.streams:
             _print_files(summary)
         else:
-            print("more about the files and their topics: --verbose")
+            print("More, also of all the time and of the files: --verbose")
     if summary.unfinished or summary.damaged or summary.gaps:
         raise typer.Exit(3)
 
@@ -274,20 +269,46 @@ def _zone_and_hidden(logs: "HomeLogs") -> "tuple[tzinfo, frozenset[str]]":
 _BAR_WIDTH = 24
 
 
-def _print_amounts(overview: "Overview") -> None:
-    """Print a bar for each class, by microphone."""
-    for microphone, amounts in overview.bars():
+def _day_json(sounds: "DaySounds") -> dict[str, Any]:
+    return {
+        "date": sounds.day.isoformat(),
+        "counts": {name: total._asdict() for name, total in sounds.totals.items()},
+        "minutes": dict(sounds.minutes),
+        "television_minutes": dict(sounds.uncounted),
+    }
+
+
+def _checked_lines(accuracy: "Accuracy | None", following: str | None) -> Iterator[str]:
+    """Yield how many labels are right; nothing if nobody knows, and the next step is to see."""
+    from hearthlog.tools.cli.info_summary import TO_REVIEW
+
+    if accuracy is not None and (accuracy.is_known or TO_REVIEW not in (following or "")):
+        yield from accuracy.lines()
+
+
+def _print_sounds(overview: "Overview", sounds: "DaySounds | None", *, verbose: bool) -> None:
+    """Print the table of a day, and bars of all time: of scenarios, and of what is in no table."""
+    from hearthlog.tools.cli.tables import day_title, print_sounds, sound_rows
+
+    if sounds is not None:
+        print(f"\n{day_title(sounds.day)}, as labelled")
+        print_sounds(sound_rows(sounds), bars=True)
+    for microphone, amounts in overview.bars(microphones=verbose or sounds is None):
         width = max((len(one.time) for one in amounts), default=0)
         name = max((len(one.words) for one in amounts), default=0)
         what = "time labelled as each sound, sure or not, also by a television"
-        print(printable(f"{microphone}: {what}"))
+        print()
+        print(printable(f"Microphone {microphone}: {what}"))
         for one in amounts:
             bar = long_bar(one.share, _BAR_WIDTH)
             print(printable(f"  {one.words:{name}}  {bar:{_BAR_WIDTH}}  {one.time:>{width}}"))
-    print_lines(overview.doubts())
+    print_lines(overview.doubts() if verbose else ())
+    if overview.has_streams:
+        print()
 
 
 def _print_files(summary: "LogSummary") -> None:
+    print()
     print_lines(_lines(summary))
     topics = [
         (
@@ -338,7 +359,7 @@ def _stream_lines(summary: "LogSummary") -> Iterator[str]:
         model = f"{stream['model']} ({stream['model_sha256'][:12]})" if stream["model"] else "none"
         device = stream["device"] or "no microphone"
         yield (
-            f"{stream['microphone']}: {device}, features {stream['feature_set']}, model "
+            f"Microphone {stream['microphone']}: {device}, features {stream['feature_set']}, model "
             f"{model}{', a starter model, not trained on this home' * stream['starter']}"
         )
 

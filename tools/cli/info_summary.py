@@ -2,8 +2,8 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from datetime import date, tzinfo
+from collections.abc import Collection, Iterator, Sequence
+from datetime import tzinfo
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,11 +16,9 @@ from hearthlog.analyzer.activity.checked_minutes import (
     read_reviewed_labels,
 )
 from hearthlog.analyzer.activity.event_counts import FEWEST
-from hearthlog.analyzer.activity.home_events import DaySounds, EventTotal
-from hearthlog.analyzer.activity.values import Duration
 from hearthlog.analyzer.logs.hidden_classes import common_names_of
 from hearthlog.analyzer.logs.home_logs import HomeLogs
-from hearthlog.analyzer.logs.local_time import EVENING, local_time
+from hearthlog.analyzer.logs.local_time import local_time
 from hearthlog.analyzer.logs.summary import LogSummary
 from hearthlog.models.classes import ON_TELEVISION, SILENCE, UNKNOWN, class_name, in_words, ordered
 from hearthlog.models.starter import GENERAL
@@ -29,13 +27,11 @@ from hearthlog.schemas.frames import FRAME_SECONDS, NANOSECONDS
 from hearthlog.schemas.logs.files import REVIEW_LAYER, log_name
 from hearthlog.schemas.messages.topics import LIVE, REVIEW, is_scenario, topic
 from hearthlog.tools.cli.options import models_folder
+from hearthlog.tools.cli.tables import length_text
 from hearthlog.tools.cli.terminal import JUDGED_BY, number
 
 _DAY = 86_400  # seconds
-_NO_SOUNDS = {SILENCE, UNKNOWN}
-_HOUR = 60  # minutes
-_MOST_NAMED = 3  # classes in the line of what was labelled most
-_LEAST_NAMED = 1.0  # minutes while something like a television sounded
+TO_REVIEW = "to know how many labels are right in this home, review ten spans"
 
 
 class ClassAmount(NamedTuple):
@@ -47,7 +43,7 @@ class ClassAmount(NamedTuple):
 
 
 class Overview:
-    """What people want to know of logs: whose they are, what was heard, and whether all is well.
+    """What people want to know of logs: whether all is well, whose they are, what was labelled.
 
     Parameters
     ----------
@@ -55,8 +51,6 @@ class Overview:
         Classes that no output shows.
     start : int or None
         When the first log begins, in nanoseconds of UTC: its first message may be later.
-    sounds : DaySounds or None
-        Of the last complete day.
     """
 
     def __init__(
@@ -65,30 +59,35 @@ class Overview:
         zone: tzinfo,
         hidden: Collection[str] = (),
         start: int | None = None,
-        sounds: DaySounds | None = None,
     ) -> None:
         self._summary, self._zone, self._hidden = summary, zone, hidden
-        self._start, self._sounds = start, sounds
+        self._start = start
         labels = {name for seconds in summary.segment_seconds.values() for name in seconds}
         logs = [path for path in summary.files if path not in summary.layers]
         self._common = common_names_of(logs[-1], labels) if logs else {}
 
-    def lines(self, following: str | None) -> Iterator[str]:
-        """Yield three lines: what this is; what was heard; whether all is well, the next step."""
+    @property
+    def has_streams(self) -> bool:
+        """Whether a recorder wrote some of the logs."""
+        return bool(self._summary.streams)
+
+    def lines(self) -> Iterator[str]:
+        """Yield three lines: whether all is well; what this is; how much was listened to."""
+        yield self._trouble() or "All is well"
         yield self._what()
         if self._microphones():
-            yield self._activity()
-        state = self._trouble() or "All is well"
-        yield f"{state}{f'; next: {following}' * (following is not None)}"
+            yield self._coverage()
 
-    def bars(self) -> Iterator[tuple[str, list[ClassAmount]]]:
-        """Yield the amounts of each class by microphone; silence has no bar."""
+    def bars(self, *, microphones: bool) -> Iterator[tuple[str, list[ClassAmount]]]:
+        """Yield the amounts of each class by scenario, and by microphone; silence has no bar."""
         of_scenarios = {
             name: self._in_common(each)
             for name, each in self._summary.segment_seconds.items()
             if _scenario(name)
         }
-        for microphone, seconds in (self._segments() | of_scenarios).items():
+        for microphone, seconds in (
+            (self._segments() if microphones else {}) | of_scenarios
+        ).items():
             sounds = [name for name in seconds if class_name(name) != SILENCE]
             longest = max((seconds[name] for name in sounds), default=0.0)
             yield (
@@ -96,7 +95,7 @@ class Overview:
                 [
                     ClassAmount(
                         in_words(name),
-                        _minutes(seconds[name] / 60),
+                        length_text(seconds[name] / 60),
                         seconds[name] / longest if name in sounds and longest else 0.0,
                     )
                     for name in ordered(seconds)
@@ -105,12 +104,15 @@ class Overview:
             )
 
     def doubts(self) -> Iterator[str]:
-        """Yield how much of the labels is in doubt, by microphone."""
+        """Yield how much of the labels of each microphone another class may equal."""
         for microphone, seconds in self._segments().items():
             unsure = self._summary.unsure.get(microphone, Counter())
             if seconds:
-                minutes = _minutes(unsure["seconds"] / 60)
-                yield f"{microphone} is unsure of {minutes} of these"
+                length = length_text(unsure["seconds"] / 60)
+                yield (
+                    f"Microphone {microphone}: {length} of these labels have less than half of the "
+                    "probability: another sound may be likelier"
+                )
 
     def local(self, time: int) -> str:
         """Format a time (ns of UTC) in the zone of the home."""
@@ -142,7 +144,7 @@ class Overview:
         first, last = self._summary.span
         return min(first, self._start), last
 
-    def _activity(self) -> str:
+    def _coverage(self) -> str:
         first, last = self._span() or (0, 0)
         span = (last - first) / NANOSECONDS
         # Two recorders may have microphones of one name.
@@ -150,33 +152,7 @@ class Overview:
         hours = listed([f"{name} {_hours(listened[name])}" for name in sorted(listened)], "and")
         if len(listened) == 1 or len(set(map(_hours, listened.values()))) == 1:
             hours = _hours(next(iter(listened.values())))
-        text = f"Listened: {hours} of {_hours(span)}"
-        sounds = self._sounds
-        if sounds is None:
-            total: Counter[str] = Counter()
-            for seconds in self._segments().values():
-                total.update(seconds)
-            most = self._most({name: own / 60 for name, own in total.items()})
-            return f"{text}; labelled most, a television included: {most}" if most else text
-        parts = [most] if (most := self._most(sounds.minutes)) else []
-        if sounds.uncounted >= _LEAST_NAMED:
-            apart = _minutes(sounds.uncounted)
-            parts.append(f"beside something like a television, not counted: {apart}")
-        is_all = sounds.span[0] <= first and last <= sounds.span[1]
-        when = "" if is_all else f" in the 24 hours to {EVENING}:00 of {sounds.day:%A}"
-        return f"{text}; labelled most{when}: {'; '.join(parts)}" if parts else text
-
-    def _most(self, minutes: Mapping[str, float]) -> str:
-        """Return the sounds that lasted longest."""
-        names = [name for name, _ in Counter(minutes).most_common()]
-        return listed(
-            [
-                f"{in_words(name).lower()} {_minutes(minutes[name])}"
-                for name in names
-                if class_name(name) not in {*_NO_SOUNDS, *self._hidden}
-            ][:_MOST_NAMED],
-            "and",
-        )
+        return f"Listened: {hours} of {_hours(span)}"
 
     def _trouble(self) -> str:
         summary = self._summary
@@ -235,30 +211,7 @@ def zone_name(zone: tzinfo) -> str:
 def _hours(seconds: float) -> str:
     if seconds >= 2 * _DAY:
         return f"{seconds / _DAY:.1f} days"
-    return f"{seconds / 3600:.1f} h" if seconds >= 2 * 3600 else _minutes(seconds / 60)
-
-
-def _minutes(minutes: float) -> str:
-    if minutes < 1:
-        return f"{60 * minutes:.0f} s" if not minutes or round(60 * minutes) else "under 1 s"
-    return f"{minutes:.0f} min" if round(minutes) < _HOUR else Duration.show(minutes)
-
-
-def day_lines(day: date, totals: Mapping[str, EventTotal]) -> Iterator[str]:
-    """Yield how often each sound occurred to 22:00 of a day, and what is left out."""
-    parts, apart = [], []
-    for name, (counted, television, unsure) in totals.items():
-        if name == UNKNOWN:
-            continue  # is no sound that is counted
-        word, sure = in_words(name).lower(), counted - unsure
-        more = f" (+{unsure}?)" if sure and unsure else f"{unsure}?" if unsure else ""
-        parts.append(f"{word} {sure or ('' if unsure else 'none')}{more}")
-        apart += [f"{word} {television}"] * bool(television)
-    note = "; of those with ? the model is not sure" * any(one.unsure for one in totals.values())
-    counts = listed(parts, "and")
-    yield f"Labelled in the 24 hours to {EVENING}:00 of {day:%A, %Y-%m-%d}: {counts}{note}"
-    if apart:
-        yield f"and beside a television, not counted: {listed(apart, 'and')}"
+    return f"{seconds / 3600:.1f} h" if seconds >= 2 * 3600 else length_text(seconds / 60)
 
 
 def next_step(summary: LogSummary, path: Path) -> str | None:
@@ -280,7 +233,7 @@ def next_step(summary: LogSummary, path: Path) -> str | None:
         return (
             f"train a model on the marks of this home ({JUDGED_BY}): hearthlog train --home {place}"
         )
-    return f"review ten spans: hearthlog review {place} --queue"
+    return f"{TO_REVIEW}: hearthlog review {place} --queue"
 
 
 def _has_learned(layers: Sequence[Path]) -> bool:
@@ -302,6 +255,11 @@ class Accuracy:
         self.minutes: CheckedMinutes = checked_minutes(reviewed)
         self.weight = quiet_weight(logs, self.minutes.sounding)
         self.right, self.reviewed = count_unchanged(reviewed)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether anything was reviewed."""
+        return bool(len(self.minutes) or self.reviewed)
 
     def lines(self) -> Iterator[str]:
         """Yield what was checked, and how much of it was correct."""

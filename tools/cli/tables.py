@@ -1,13 +1,24 @@
-"""Tables of scores, labelling differences, and spans to review."""
+"""Tables of scores, labelling differences, spans to review, and the sounds of a day."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from datetime import date
+from typing import TYPE_CHECKING, NamedTuple
 
-from hearthlog.schemas.errors import shortened
+from hearthlog.schemas.errors import printable, shortened
 from hearthlog.schemas.frames import NANOSECONDS
-from hearthlog.tools.cli.terminal import GAP, NAME_WIDTH, moment, print_table, terminal_width
+from hearthlog.tools.cli.terminal import (
+    GAP,
+    NAME_WIDTH,
+    dim,
+    moment,
+    pale_block,
+    print_table,
+    terminal_width,
+    two_part_bar,
+)
 
 if TYPE_CHECKING:
+    from hearthlog.analyzer.activity.home_events import DaySounds
     from hearthlog.analyzer.evaluation import Amounts, Detections, LabellingDifference
     from hearthlog.analyzer.evaluation.log_scores import EventCount
     from hearthlog.analyzer.evaluation.scenes import SceneScores, SingleCoughs
@@ -225,3 +236,99 @@ def print_queue(queue: "ReviewQueue") -> None:
 def _span(start: int, end: int) -> tuple[str, str]:
     """Format the start of a span, and its length in seconds."""
     return str(moment(start)), f"{(end - start) / NANOSECONDS:7.2f}"
+
+
+class SoundRow(NamedTuple):
+    """A class in the table of the sounds of a day."""
+
+    name: str
+    minutes: float  # counted
+    uncounted: float  # minutes beside something like a television
+    cells: tuple[str, str, str, str, str]  # below `_SOUND_HEADS`; empty for nothing
+
+
+_SOUND_HEADS = "length", "times", "perhaps", "times", "length"
+_COUNTED, _ALWAYS = 3, 2  # of these columns, the first ones
+_APART = "beside a television"  # above the other ones
+_BAR_WIDTHS = 6, 24
+_PLAIN_COLUMNS = 80  # of a table with bars, on a wider terminal
+
+
+def day_title(day: date) -> str:
+    """Return the title of the table of a day."""
+    from hearthlog.analyzer.logs.local_time import EVENING
+
+    return f"The 24 hours to {EVENING}:00 of {day:%A, %Y-%m-%d}"
+
+
+def sound_rows(sounds: "DaySounds") -> list[SoundRow]:
+    """Return a row for each sound of a span, those that nobody recognised last."""
+    from hearthlog.models.classes import UNKNOWN, ordered
+
+    rows = []
+    for name in ordered({*sounds.totals, *sounds.minutes, *sounds.uncounted}):
+        counted, television, unsure = sounds.totals.get(name, (0, 0, 0))
+        unsure *= name != UNKNOWN  # all of these are in doubt
+        minutes, apart = sounds.minutes.get(name, 0.0), sounds.uncounted.get(name, 0.0)
+        cells = (
+            length_text(minutes) if minutes else "",
+            str(counted - unsure or "none"),
+            str(unsure or ""),
+            str(television or ""),
+            length_text(apart) if apart else "",
+        )
+        rows.append(SoundRow(name, minutes, apart, cells))
+    return rows
+
+
+def print_sounds(rows: Sequence[SoundRow], *, bars: bool = False) -> None:
+    """Print the table of the sounds of a day, with a bar for each where there is room."""
+    if not rows:
+        return
+    names = [printable(_words(row.name)) for row in rows]
+    cells = [row.cells for row in rows]
+    columns = [[*column] for column in zip(_SOUND_HEADS, *cells, strict=True)]
+    shown = [place for place, (_, *cells) in enumerate(columns) if place < _ALWAYS or any(cells)]
+    table = [_padded(["sound", *names], "<"), *(_padded(columns[place], ">") for place in shown)]
+    used = sum(len(column[0]) + GAP for column in table) - GAP
+    if used > terminal_width():
+        heads = [f"{_SOUND_HEADS[i]}{f' {_APART}' * (i >= _COUNTED)}" for i in shown]
+        rest = zip(*(columns[place][1:] for place in shown), strict=True)
+        print_table(("sound", *heads), [(n, *own) for n, own in zip(names, rest, strict=True)])
+        return
+    least, most = _BAR_WIDTHS
+    width = min(min(terminal_width(), _PLAIN_COLUMNS) - used - GAP, most)
+    title = _APART
+    if bars and width >= least:
+        table.insert(1, [" " * width, *_bars(rows, width)])
+        used += width + GAP
+        title = f"{pale_block()} {_APART}"
+    if shown[-1] >= _COUNTED:
+        print(f"{title:>{used}}")
+    for line in zip(*table, strict=True):
+        print((" " * GAP).join(line).rstrip())
+
+
+def _padded(cells: Sequence[str], side: str) -> list[str]:
+    width = max(map(len, cells))
+    return [f"{cell:{side}{width}}" for cell in cells]
+
+
+def _bars(rows: Sequence[SoundRow], width: int) -> Iterator[str]:
+    """Yield a bar for each row: of what is counted, and pale, of what is beside a television."""
+    longest = max(row.minutes + row.uncounted for row in rows) or 1.0
+    for row in rows:
+        bar, pale = two_part_bar(row.minutes / longest, row.uncounted / longest, width)
+        yield f"{bar}{dim(pale)}{' ' * (width - len(bar + pale))}"
+
+
+def length_text(minutes: float) -> str:
+    """Format a length of time in minutes: `36 s`, `5 min`, `1 h 05 min`."""
+    from hearthlog.analyzer.activity.values import Duration
+
+    if minutes < 1:
+        return f"{60 * minutes:.0f} s" if not minutes or round(60 * minutes) else "under 1 s"
+    return f"{minutes:.0f} min" if round(minutes) < _HOUR else Duration.show(minutes)
+
+
+_HOUR = 60  # minutes

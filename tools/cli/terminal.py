@@ -96,7 +96,30 @@ def long_bar(share: float, width: int) -> str:
     return _FULL * (eighths // 8) + (_EIGHTHS[eighths % 8 - 1] if eighths % 8 else "")
 
 
-_FULL, _EIGHTHS = "█", "▏▎▍▌▋▊▉"
+_FULL, _EIGHTHS, _PALE = "█", "▏▎▍▌▋▊▉", "░"
+
+
+def two_part_bar(first: float, second: float, width: int) -> tuple[str, str]:
+    """Return the parts of a bar of two shares, 0 to 1 together; the second is of pale blocks."""
+    if not second:
+        return long_bar(first, width), ""
+    bar = long_bar(first, width)[: width - 1]  # whatever there is has a block
+    pale = max(round((first + second) * width) - len(bar), 1)
+    return bar, pale_block() * pale
+
+
+def pale_block() -> str:
+    """Return the block of the second part of a bar."""
+    return _PALE if _prints(_PALE) else "."
+
+
+def dim(text: str) -> str:
+    """Return a text in pale colour, where the terminal has colours and they are wanted."""
+    from rich.console import Console
+
+    console = Console()
+    wanted = bool(text) and console.color_system is not None and not console.no_color
+    return f"\x1b[2m{text}\x1b[0m" if wanted else text
 
 
 def _prints(characters: str) -> bool:
