@@ -1,10 +1,11 @@
 """Events of a home: their list, and the totals of a day."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import date, tzinfo
 from functools import reduce
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -62,6 +63,9 @@ class EventTotal(NamedTuple):
     counted: int
     television: int
     unsure: int = 0  # counted, but the model is not sure, and nobody reviewed them
+
+
+NO_EVENTS = EventTotal(0, 0)
 
 
 def event_totals(metrics: HomeMetrics, start: int, end: int) -> dict[str, EventTotal]:
@@ -137,6 +141,33 @@ class DaySounds(NamedTuple):
     totals: Mapping[str, EventTotal]  # of classes that occurred
     minutes: Mapping[str, float]  # counted, of classes that have any
     uncounted: Mapping[str, float]  # minutes beside something like a television, likewise
+
+    def of_classes(self, names: Collection[str]) -> Self:
+        """Return only the sounds of some classes."""
+        return self._replace(
+            totals={name: own for name, own in self.totals.items() if name in names},
+            minutes={name: own for name, own in self.minutes.items() if name in names},
+            uncounted={name: own for name, own in self.uncounted.items() if name in names},
+        )
+
+    def with_marked(self, events: Sequence[HomeEvent]) -> Self:
+        """Return the sounds together with events of classes that only people marked."""
+        totals = Counter(event.label for event in events)
+        minutes = {
+            name: sum(event.seconds for event in events if event.label == name) / 60
+            for name in totals
+        }
+        own = {name: EventTotal(count, 0) for name, count in totals.items()}
+        return self._replace(totals={**self.totals, **own}, minutes={**self.minutes, **minutes})
+
+    def as_json(self) -> dict[str, object]:
+        """Return the sounds as a JSON object."""
+        return {
+            "date": self.day.isoformat(),
+            "counts": {name: total._asdict() for name, total in self.totals.items()},
+            "minutes": dict(self.minutes),
+            "television_minutes": dict(self.uncounted),
+        }
 
 
 def sounds_of_day(day: DayMetrics) -> DaySounds:

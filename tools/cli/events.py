@@ -1,5 +1,6 @@
 """`hearthlog events` and `hearthlog report`: what was heard, and a day or a week for a carer."""
 
+from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from datetime import date, timedelta, tzinfo
 from functools import reduce
@@ -46,6 +47,15 @@ class ListedSpan(NamedTuple):
     start: int
     end: int
     words: str
+    day: date | None = None  # if it is a day with the night before it, from 22:00 to midnight
+
+
+class _Part(NamedTuple):
+    """A night, the rest of a day, or a part of these, in nanoseconds of UTC."""
+
+    start: int
+    end: int
+    title: str
 
 
 def events(
@@ -121,12 +131,14 @@ def events(
                     for name in classes
                     if name in marked
                 },
+                "day": _day_json(metrics, classes, span, zone),
             }
         )
     else:
-        _print_events(found, perhaps_of(data, found), zone)
-        _print_sums(found, span, classes, marked)
-        _print_pauses(found, span, missing, zone)
+        parts = list(_parts(span, zone))
+        _print_events(found, perhaps_of(data, found), parts, missing, zone)
+        _print_totals(metrics, found, span, classes, marked, zone)
+        _print_pauses(span, missing, zone)
     if play:
         _play(found, home_logs, zone)
     end_with_warnings(data.losses)
@@ -148,8 +160,14 @@ def _chosen_span(
 ) -> ListedSpan:
     """Return the chosen span of time; by default the last complete day, or the last night."""
     from hearthlog.analyzer.logs.home_logs import check_day
-    from hearthlog.analyzer.logs.local_time import EVENING, MORNING, at_hour, day_span, local_time
+    from hearthlog.analyzer.logs.local_time import (
+        day_span,
+        evening_before,
+        local_time,
+        night_span,
+    )
     from hearthlog.analyzer.logs.local_time import today as today_at
+    from hearthlog.tools.cli.tables import day_title
 
     ends = logs.end()
     if ends is None:
@@ -161,7 +179,7 @@ def _chosen_span(
         words = [f"{local_time(time, zone):%Y-%m-%d %H:%M}" for time in (begin, stop)]
         if begin >= stop:
             wrong_use(f"no log has a message after {words[0]}")
-        return ListedSpan(begin, stop, f"from {words[0]} to {words[1]}")
+        return ListedSpan(begin, stop, f"From {words[0]} to {words[1]}")
     if night:
         if day is None:
             moment = today_at(ends, zone)
@@ -170,15 +188,14 @@ def _chosen_span(
                 moment = before
             begin, stop = moment.night, moment.morning
         else:
-            own = read_day("--day", day, zone)
-            begin = at_hour(own - timedelta(days=1), EVENING, zone)
-            stop = at_hour(own, MORNING, zone)
+            begin, stop = night_span(read_day("--day", day, zone), zone)
         morning = _date(stop, zone)
         check_day(logs, morning - timedelta(days=1), morning, zone)
-        return ListedSpan(begin, stop, f"in the night to {morning:%A, %Y-%m-%d}")
+        return ListedSpan(begin, stop, f"The night to {morning:%A, %Y-%m-%d}")
     own = logs.last_complete_day(zone) if day is None else read_day("--day", day, zone)
     check_day(logs, own, own, zone)
-    return ListedSpan(*day_span(own, zone), f"on {own:%A, %Y-%m-%d}")
+    start, end = evening_before(own, zone), day_span(own, zone)[1]
+    return ListedSpan(start, end, day_title(own), own)
 
 
 def _first(logs: "HomeLogs") -> int:
@@ -254,59 +271,88 @@ def _fields(event: "HomeEvent", labelling: str, zone: tzinfo) -> dict[str, objec
     return event._asdict() | times | values | {"labelling": labelling}
 
 
-_MINUTE = 60  # seconds
 _MENTIONED = 600 * 1_000_000_000  # ns: shortest pause in listening that is listed
 _MOST_PAUSES = 5
 
 
-def _form(found: Sequence["HomeEvent"], zone: tzinfo) -> str:
-    """Return how times are written: with the day, if there are several."""
-    days = {_date(event.start, zone) for event in found}
-    return "%a %H:%M:%S" if len(days) > 1 else "%H:%M:%S"
+def _parts(span: ListedSpan, zone: tzinfo) -> Iterator[_Part]:
+    """Yield the nights and the rest of the days of a span, and what a day has after 22:00."""
+    from hearthlog.analyzer.logs.local_time import EVENING, awake_span, night_span
+
+    own = _date(span.start, zone)
+    last = _date(span.end, zone) + timedelta(days=1) if span.day is None else span.day
+    while own <= last:
+        for place, (start, end) in enumerate((night_span(own, zone), awake_span(own, zone))):
+            begin, stop = max(start, span.start), min(end, span.end)
+            if begin < stop:
+                night = "" if place else "Night to "
+                hours = " to ".join(_clock(time, zone) for time in (begin, stop))
+                yield _Part(begin, stop, f"{night}{own:%a} {own.day} {own:%B}, {hours}")
+        own += timedelta(days=1)
+    if span.day is not None:
+        yield _Part(awake_span(span.day, zone)[1], span.end, f"After {EVENING}:00")
 
 
-def _part(time: int, zone: tzinfo) -> str:
-    """Return the part of a day, or the night, that a time is in."""
-    from hearthlog.analyzer.logs.local_time import EVENING, MORNING, local_time
+def _clock(time: int, zone: tzinfo) -> str:
+    from hearthlog.analyzer.logs.local_time import local_time
 
-    moment = local_time(time, zone)
-    if MORNING <= moment.hour < EVENING:
-        return f"{moment:%a} by day"
-    return f"Night to {moment + timedelta(days=moment.hour >= EVENING):%a}"
+    return f"{local_time(time, zone):%H:%M}"
 
 
-def _print_events(found: Sequence["HomeEvent"], perhaps: Sequence[str], zone: tzinfo) -> None:
-    """Print a line for each event, and one for each part of a day, if there are several."""
+def _title(part: _Part, missing: "Spans") -> str:
+    """Return the title of a part, with how much of it was listened to, if not all."""
+    from hearthlog.analyzer.activity.event_counts import MINUTE
+    from hearthlog.analyzer.logs.spans import cut
+    from hearthlog.tools.cli.tables import length_text
+
+    lacks, all_of_it = cut(missing, part.start, part.end).length, part.end - part.start
+    if lacks < _MENTIONED:
+        return part.title
+    listened, length = (length_text(n / MINUTE) for n in (all_of_it - lacks, all_of_it))
+    return f"{part.title}, listened to {listened} of {length}"
+
+
+def _print_events(
+    found: Sequence["HomeEvent"],
+    perhaps: Sequence[str],
+    parts: Sequence[_Part],
+    missing: "Spans",
+    zone: tzinfo,
+) -> None:
+    """Print a line for each event, below the title of its part of a day."""
     from hearthlog.analyzer.logs.local_time import local_time
     from hearthlog.models.classes import in_words
+    from hearthlog.tools.cli.tables import length_text
 
     several = len({name for event in found for name in event.microphones}) > 1
-    form = _form(found, zone)
     clock = " or ".join(
         dict.fromkeys(f"{local_time(event.start, zone):%Z}" for event in (found[0], found[-1]))
         if found
         else ()
     )
-    lengths = _right("length", [_length(event.seconds) for event in found])
+    lengths = _right("length", [length_text(event.seconds / 60) for event in found])
     shares = _right(
-        "sure", [f"{100 * event.confidence:.0f} %{'?' * event.is_unsure}" for event in found]
+        "score",
+        [f"{100 * event.confidence:.0f} %{'?' if _is_unsure(event) else ' '}" for event in found],
     )
     head = (
         f"when ({clock})" if clock else "when", "sound", next(lengths), next(shares),
         *(["where"] if several else []), "",
     )  # fmt: skip
     rows: list[Sequence[str]] = []
-    parts = [_part(event.start, zone) for event in found]
-    has_parts = len(set(parts)) > 1
-    for place, (event, might_be) in enumerate(zip(found, perhaps, strict=True)):
-        if has_parts and (not place or parts[place] != parts[place - 1]):
-            empty = [""] * (len(head) - 1)
-            rows += [["", *empty]] * bool(place) + [[parts[place], *empty]]
+    left = deque(parts)
+    title = ""
+    for event, might_be in zip(found, perhaps, strict=True):
+        while left and left[0].start <= event.start:
+            title = _title(left.popleft(), missing)
+        if title:
+            rows += [[""]] * bool(rows) + [[title]]
+            title = ""
         notes = [f"perhaps {in_words(might_be).lower()}"] if might_be else []
         notes += ["reviewed"] * event.reviewed + ["beside a television"] * event.television
         rows.append(
             (
-                f"{local_time(event.start, zone):{form}}",
+                f"{local_time(event.start, zone):%H:%M:%S}",
                 in_words(event.label),
                 next(lengths),
                 next(shares),
@@ -317,40 +363,64 @@ def _print_events(found: Sequence["HomeEvent"], perhaps: Sequence[str], zone: tz
     print_table(head, rows, words=len(head))
 
 
-def _print_sums(
+def _is_unsure(event: "HomeEvent") -> bool:
+    """Whether it is perhaps not what it is called; what is not recognised is called nothing."""
+    from hearthlog.models.classes import UNKNOWN
+
+    return event.is_unsure and event.label != UNKNOWN
+
+
+def _day_json(
+    metrics: "HomeMetrics", classes: Collection[str], span: ListedSpan, zone: tzinfo
+) -> dict[str, object] | None:
+    """Return the totals of a day to 22:00, as `info` has them; None for another span."""
+    from hearthlog.analyzer.activity.daily_metrics import day_of
+    from hearthlog.analyzer.activity.home_events import sounds_of_day
+
+    if span.day is None:
+        return None
+    return sounds_of_day(day_of(metrics, span.day, zone)).of_classes(classes).as_json()
+
+
+def _print_totals(
+    metrics: "HomeMetrics",
     found: Sequence["HomeEvent"],
     span: ListedSpan,
     classes: Sequence[str],
     marked: Collection[str],
+    zone: tzinfo,
 ) -> None:
-    """Print how many events of each class there were."""
+    """Print the table of the totals, of a day to 22:00, and what was after that."""
+    from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
+    from hearthlog.analyzer.activity.home_events import sounds_between
+    from hearthlog.analyzer.logs.local_time import EVENING, awake_span
     from hearthlog.models.classes import in_words
+    from hearthlog.tools.cli.tables import AS_LABELLED, counts_text, print_sounds, sound_rows
 
+    day = _date(span.start, zone) if span.day is None else span.day
+    stop = span.end if span.day is None else awake_span(day, zone)[1]
+    sounds = sounds_between(metrics, day, zone, span.start, stop).of_classes(classes)
+    sounds = sounds.with_marked([e for e in found if e.label in marked and e.start < stop])
+    later = sounds_between(metrics, day, zone, stop, span.end).of_classes(classes)
+    print(f"{chr(10) * bool(found)}{span.words}, {AS_LABELLED}")
+    print_sounds(sound_rows(sounds, classes if len(classes) == 1 else ()))
+    if text := counts_text(later):
+        print(f"After {EVENING}:00: {text}")
     for name in classes:
-        own = [event for event in found if event.label == name]
-        if not own and len(classes) > 1:
-            continue
-        apart = sum(event.television for event in own)
-        unsure = sum(event.is_unsure and not event.television for event in own)
-        sure = len(own) - apart - unsure or "none"
-        doubt = f", and perhaps {unsure} more" if unsure else ""
-        television = f", and {apart} while something like a television sounded" if apart else ""
-        by_hand = ", only what people marked: the model does not know it" * (name in marked)
-        print(f"{in_words(name)} {span.words}: {sure}{doubt}{television}{by_hand}")
+        if name in marked and any(event.label == name for event in found):
+            print(f"{in_words(name)}: only what people marked: the model does not know it")
+    if any(map(_is_unsure, found)):
+        print(f"? less than {100 * UNSURE_BELOW:.0f} %: perhaps")
 
 
-def _print_pauses(
-    found: Sequence["HomeEvent"], span: ListedSpan, missing: "Spans", zone: tzinfo
-) -> None:
+def _print_pauses(span: ListedSpan, missing: "Spans", zone: tzinfo) -> None:
     """Print a notice of when nobody listened."""
     from hearthlog.analyzer.logs.local_time import local_time
 
-    form = _form(found, zone)
-    pauses = [
-        f"{local_time(start, zone):{form[:-3]}} to {local_time(end, zone):{form[:-3]}}"
-        for start, end in missing.pairs()
-        if end - start >= _MENTIONED
-    ]
+    long = [pair for pair in missing.pairs() if pair[1] - pair[0] >= _MENTIONED]
+    days = {_date(time, zone) for start, end in long for time in (start, end - 1)}
+    form = "%a %H:%M" if len(days) > 1 else "%H:%M"
+    pauses = [" to ".join(f"{local_time(time, zone):{form}}" for time in pair) for pair in long]
     if pauses:
         share = 1 - missing.length / (span.end - span.start)
         more = [f"{len(pauses) - _MOST_PAUSES} more pauses"] * (len(pauses) > _MOST_PAUSES)
@@ -364,12 +434,6 @@ def _right(head: str, cells: Sequence[str]) -> Iterator[str]:
     """Yield the head and the cells of a column of figures, which ends in one line."""
     width = max(map(len, (head, *cells)))
     return (cell.rjust(width) for cell in (head, *cells))
-
-
-def _length(seconds: float) -> str:
-    from hearthlog.analyzer.activity.values import Duration
-
-    return f"{seconds:.1f} s" if seconds < _MINUTE else Duration.show(seconds / _MINUTE)
 
 
 def _play(found: Sequence["HomeEvent"], logs: "HomeLogs", zone: tzinfo) -> None:

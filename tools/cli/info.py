@@ -79,7 +79,7 @@ def info(
             "scenarios": [one._asdict() for one in scenarios],
             "checked": None if accuracy is None else accuracy.as_json(),
             "next": following,
-            "day": None if sounds is None else _day_json(sounds),
+            "day": None if sounds is None else sounds.as_json(),
         }
         print(json.dumps(_as_json(summary) | more, indent=2))
     else:
@@ -269,15 +269,6 @@ def _zone_and_hidden(logs: "HomeLogs") -> "tuple[tzinfo, frozenset[str]]":
 _BAR_WIDTH = 24
 
 
-def _day_json(sounds: "DaySounds") -> dict[str, Any]:
-    return {
-        "date": sounds.day.isoformat(),
-        "counts": {name: total._asdict() for name, total in sounds.totals.items()},
-        "minutes": dict(sounds.minutes),
-        "television_minutes": dict(sounds.uncounted),
-    }
-
-
 def _checked_lines(accuracy: "Accuracy | None", following: str | None) -> Iterator[str]:
     """Yield how many labels are right; nothing if nobody knows, and the next step is to see."""
     from hearthlog.tools.cli.info_summary import TO_REVIEW
@@ -288,10 +279,10 @@ def _checked_lines(accuracy: "Accuracy | None", following: str | None) -> Iterat
 
 def _print_sounds(overview: "Overview", sounds: "DaySounds | None", *, verbose: bool) -> None:
     """Print the table of a day, and bars of all time: of scenarios, and of what is in no table."""
-    from hearthlog.tools.cli.tables import day_title, print_sounds, sound_rows
+    from hearthlog.tools.cli.tables import AS_LABELLED, day_title, print_sounds, sound_rows
 
     if sounds is not None:
-        print(f"\n{day_title(sounds.day)}, as labelled")
+        print(f"\n{day_title(sounds.day)}, {AS_LABELLED}")
         print_sounds(sound_rows(sounds), bars=True)
     for microphone, amounts in overview.bars(microphones=verbose or sounds is None):
         width = max((len(one.time) for one in amounts), default=0)

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
 from typing import TYPE_CHECKING, NamedTuple
 
-from hearthlog.schemas.errors import printable, shortened
+from hearthlog.schemas.errors import listed, printable, shortened
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.tools.cli.terminal import (
     GAP,
@@ -248,6 +248,7 @@ class SoundRow(NamedTuple):
 
 
 _SOUND_HEADS = "length", "times", "perhaps", "times", "length"
+_NO = "none"
 _COUNTED, _ALWAYS = 3, 2  # of these columns, the first ones
 _APART = "beside a television"  # above the other ones
 _BAR_WIDTHS = 6, 24
@@ -261,18 +262,38 @@ def day_title(day: date) -> str:
     return f"The 24 hours to {EVENING}:00 of {day:%A, %Y-%m-%d}"
 
 
-def sound_rows(sounds: "DaySounds") -> list[SoundRow]:
-    """Return a row for each sound of a span, those that nobody recognised last."""
+AS_LABELLED = "as labelled"  # in the title of a table of sounds
+
+
+def counts_text(sounds: "DaySounds") -> str:
+    """Return how often each sound occurred: `coughing 4 (+3?) and talking 1; …`."""
+    from hearthlog.models.classes import in_words
+
+    counted, apart = [], []
+    for row in sound_rows(sounds):
+        _, sure, unsure, television, _ = row.cells
+        name = in_words(row.name).lower()
+        if sounds.totals.get(row.name, (0,))[0]:
+            number = f"{sure} (+{unsure}?)" if unsure and sure != _NO else f"{unsure}?"
+            counted.append(f"{name} {number if unsure else sure}")
+        apart += [f"{name} {television}"] * bool(television)
+    parts = [listed(counted, "and")] * bool(counted)
+    parts += [f"{_APART} {listed(apart, 'and')}"] * bool(apart)
+    return "; ".join(parts)
+
+
+def sound_rows(sounds: "DaySounds", names: Sequence[str] = ()) -> list[SoundRow]:
+    """Return a row for each sound of a span, and for some classes; in the order of classes."""
     from hearthlog.models.classes import UNKNOWN, ordered
 
     rows = []
-    for name in ordered({*sounds.totals, *sounds.minutes, *sounds.uncounted}):
+    for name in ordered({*names, *sounds.totals, *sounds.minutes, *sounds.uncounted}):
         counted, television, unsure = sounds.totals.get(name, (0, 0, 0))
         unsure *= name != UNKNOWN  # all of these are in doubt
         minutes, apart = sounds.minutes.get(name, 0.0), sounds.uncounted.get(name, 0.0)
         cells = (
             length_text(minutes) if minutes else "",
-            str(counted - unsure or "none"),
+            str(counted - unsure or _NO),
             str(unsure or ""),
             str(television or ""),
             length_text(apart) if apart else "",

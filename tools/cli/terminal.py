@@ -15,8 +15,9 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TextIO
 
 import typer
 
@@ -220,6 +221,8 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     ----------
     head : sequence of str
         Empty for a table without heads.
+    rows : iterable of sequence of str
+        One with a single cell is a title, as wide as the table.
     words : int
         Number of text columns, from the left. The others are figures: aligned to the right, and
         wrapped only after the text columns.
@@ -233,26 +236,37 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     if len(cells) > _MANY:
         _print_plainly([list(head)] * bool(head) + cells, words)
         return
-    widths, gap = _fitted(head, cells, words)
+    columns = max(map(len, [head, *cells]))
+    widths, gap = _fitted(head, [row for row in cells if not _is_title(row, columns)], words)
     if not widths:
         _print_records(head, cells)
         return
-    table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0), show_header=bool(head))
-    for place, width in enumerate(widths):
-        table.add_column(
-            head[place] if head else "",
-            justify="left" if place < words else "right",
-            width=width,
-            overflow="fold",
-        )
-    for row in cells:
-        table.add_row(*row)
     # A terminal narrower than a table without heads breaks its lines.
     total_width = max(terminal_width(), sum(widths) + gap * len(widths))
     console = Console(highlight=False, markup=False, emoji=False, width=total_width)
-    with console.capture() as text:
-        console.print(table)
-    print(*(line.rstrip() for line in text.get().splitlines()), sep="\n")
+
+    def print_rows(rows: Iterable[Sequence[str]]) -> None:
+        table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0), show_header=False)
+        for place, width in enumerate(widths):
+            side: Literal["left", "right"] = "left" if place < words else "right"
+            table.add_column(justify=side, width=width, overflow="fold")
+        for row in rows:
+            table.add_row(*row)
+        with console.capture() as text:
+            console.print(table)
+        print(*(line.rstrip() for line in text.get().splitlines()), sep="\n")
+
+    if head:
+        print_rows([head])
+    for are_titles, rows_or_titles in groupby(cells, lambda row: _is_title(row, columns)):
+        if are_titles:
+            print(*(wrapped(title, sys.stdout) for (title,) in rows_or_titles), sep="\n")
+        else:
+            print_rows(rows_or_titles)
+
+
+def _is_title(row: Sequence[str], columns: int) -> bool:
+    return len(row) == 1 < columns
 
 
 _LONGEST_WORD = 36  # of a text column that is not broken
@@ -309,8 +323,13 @@ def _print_records(head: Sequence[str], cells: Iterable[Sequence[str]]) -> None:
 
 def _print_plainly(rows: Sequence[Sequence[str]], words: int) -> None:
     """Print rows of text in columns of the required width."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    columns = max(map(len, rows))
+    full = [row for row in rows if not _is_title(row, columns)]
+    widths = [max(map(len, column)) for column in zip(*full, strict=True)]
     for row in rows:
+        if _is_title(row, columns):
+            print(*row)
+            continue
         cells = [cell.ljust(width) for cell, width in zip(row[:words], widths, strict=False)]
         figures = zip(row[words:], widths[words:], strict=True)
         cells += [cell.rjust(width) for cell, width in figures]

@@ -22,7 +22,7 @@ import typer
 from hearthlog.analyzer.activity.checked_minutes import UNMEASURED, Sureness, read_sureness
 from hearthlog.analyzer.activity.daily_metrics import HOUR, DayMetrics
 from hearthlog.analyzer.activity.event_counts import MINUTE
-from hearthlog.analyzer.activity.home_events import sounds_of_day
+from hearthlog.analyzer.activity.home_events import NO_EVENTS, sounds_of_day
 from hearthlog.analyzer.bridge.page import ENGLISH
 from hearthlog.analyzer.bridge.page.day import HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDays
@@ -39,7 +39,6 @@ from hearthlog.analyzer.logs.spans import (
     lengths,
     single_span,
 )
-from hearthlog.analyzer.logs.summary import summarise
 from hearthlog.analyzer.report.headline import LIVELY_MINUTES
 from hearthlog.analyzer.report.page import day_page
 from hearthlog.analyzer.report.report import Period, read_report_data
@@ -57,7 +56,7 @@ from hearthlog.models.classes import (
     UNKNOWN,
     in_words,
 )
-from hearthlog.tools.cli.info_summary import Overview, day_lines
+from hearthlog.tools.cli.tables import AS_LABELLED, sound_rows
 from hearthlog.tools.lab.command import run
 from hearthlog.tools.lab.statements import (
     FALSE,
@@ -86,6 +85,7 @@ _COMPANY = 15 * MINUTE  # a television is known by the ten minutes around
 _SURE = 0.9
 _NO_SOUNDS = {SILENCE, UNKNOWN}
 _IS_BY_SOUND = is_modest(ENGLISH.text("page.by sound"))  # of each sentence of the page
+_IS_AS_LABELLED = is_modest(AS_LABELLED)  # the table of `info`
 _SHORTEST = MINUTE // 60  # of a sound that breaks a quiet stretch
 _CLOCK = re.compile(r"\b([0-2]\d:[0-5]\d)\b")
 _RUN = re.compile(r"\b([0-2]\d:[0-5]\d) to ([0-2]\d:[0-5]\d)\b")
@@ -570,34 +570,25 @@ def _sureness(home: HomeDay, truth: TrueDay, measured: Sureness) -> Iterator[Sta
         yield judge(PAGE, text, f"{sum(right)} are of their class", right=holds, modest=False)
 
 
-def info_statements(
-    logs: Sequence[Path], sounds: Sequence[TrueSound], day: DayMetrics
-) -> Iterator[Statement]:
-    """Yield the statements of the first lines of `info` about the logs of a day."""
-    summary = summarise(logs)
+def info_statements(sounds: Sequence[TrueSound], day: DayMetrics) -> Iterator[Statement]:
+    """Yield the statements of the table of `info` about the 24 hours to 22:00 of a day."""
     truth = true_day(sounds, day)
-    true = truth.metrics.to_evening
+    true, to_evening = truth.metrics.to_evening, day.to_evening
+    minutes = truth.metrics.home.minutes.between(to_evening.span)
     counted = sounds_of_day(day)
-    day = day.to_evening
-    line = " ".join(day_lines(day.day, counted.totals))
-    for name, total in counted.totals.items():
-        if name in _sounds_of(day):
-            stated = (total.counted, total.counted)
-            text = f"{in_words(name)} {total.counted}"
-            minutes = truth.metrics.home.minutes.between(day.span)
-            number = minutes.count(name, None).labelled
-            yield judge_count(INFO, text, stated, number, modest=is_modest(line))
-    for line in Overview(summary, day.zone, sounds=counted).lines(None):
-        for name in (n for n in _sounds_of(day) if _mentions(line, n)):
-            words = re.escape(in_words(name).lower())
-            match = re.search(rf"{words} ((?:\d+ h )?[\d.]+ (?:min|s|h)\b)", line, re.IGNORECASE)
-            if match is not None:
-                stated = read_minutes(match[1])
-                assert stated is not None
-                text = f"{in_words(name)} {match[1]}"
-                yield judge_length(
-                    INFO, text, stated, _counted_minutes(true, name), modest=is_modest(line)
-                )
+    for row in sound_rows(counted):
+        if row.name not in _sounds_of(day):
+            continue
+        length, *_ = row.cells
+        total = counted.totals.get(row.name, NO_EVENTS).counted
+        text = f"{in_words(row.name)} {total}"
+        number = minutes.count(row.name, None).labelled
+        yield judge_count(INFO, text, (total, total), number, modest=_IS_AS_LABELLED)
+        stated = read_minutes(length or "0 s")
+        assert stated is not None
+        text = f"{in_words(row.name)} {length or 'for no time'}"
+        true_minutes = _counted_minutes(true, row.name)
+        yield judge_length(INFO, text, stated, true_minutes, modest=_IS_AS_LABELLED)
 
 
 def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
@@ -616,9 +607,6 @@ def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
         if labelled.share < 0.75:
             continue
         truth = true_day(sounds, labelled)
-        own = [
-            e.path for e in entries if labelled.span.starts[0] <= e.start < labelled.span.ends[0]
-        ]
         past = PastDays(RecorderAddress(home / "logs", entries[0].node, UTC)).read(day, frozenset())
         page = HomeDay([*past.state.microphones.values()], past.moment, UTC, is_past=True)
         yield (
@@ -626,7 +614,7 @@ def statements(home: Path) -> Iterator[tuple[date, list[Statement]]]:
             [
                 *report_statements(data, truth, before[-2:]),
                 *page_statements(page, truth, sureness),
-                *info_statements(own, sounds, labelled),
+                *info_statements(sounds, labelled),
             ],
         )
         before.append(truth)
