@@ -28,8 +28,6 @@ needs_setpriv = pytest.mark.skipif(shutil.which("setpriv") is None, reason="need
 DAY = date(2026, 3, 2)
 HEAVY = {"sklearn", "hmmlearn", "rerun", "dask", "matplotlib", "scipy", "pyarrow", "pandas"}
 
-MOST = "labelled most: "
-
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory, day, model_file):
@@ -65,35 +63,70 @@ def test_info_for_people_has_the_same_figures(logs, hearthlog):
     assert "hearthlog_msgs/msg/AudioFeatures" in text
 
 
-def test_info_says_in_words_what_was_heard_what_is_in_doubt_and_what_to_do_next(logs, hearthlog):
+def test_info_says_first_whether_all_is_well_then_what_was_labelled_and_what_to_do_next(
+    logs, hearthlog
+):
     figures = json.loads(hearthlog("info", logs, "--json").stdout)
-    what, recorded, state, title, *rest = hearthlog("info", logs).stdout.splitlines()
+    state, what, recorded, empty, title, head, *rest = hearthlog("info", logs).stdout.splitlines()
+    assert (state, empty) == ("All is well", "")
     assert what.startswith("Home flat, microphone hall: 3 min, 2026-0")
-    assert recorded.startswith(f"Listened: 3 min of 3 min; {MOST}")
-    assert state == f"All is well; next: {figures['next']}"
-    assert state.endswith(f"review ten spans: hearthlog review {logs} --queue")
-    assert title == "hall: time labelled as each sound, sure or not, also by a television"
-    minutes = figures["segment_minutes"]["hall"]
+    assert recorded == "Listened: 3 min of 3 min"
+    assert title == "The 24 hours to 22:00 of Sunday, 2026-03-01, as labelled"
+    assert re.fullmatch(r"sound +length  times  perhaps|sound +length  times", head)
+    minutes = figures["day"]["minutes"]
     rows = rest[: len(minutes)]
+    assert [row.split("  ")[0] for row in rows] == [in_words(name) for name in ordered(minutes)]
+    for row, name in zip(rows, ordered(minutes), strict=True):
+        bar, number, unit, times = re.split(r" {2,}| (?=s|min)", row)[1:5]
+        length = 60 * float(number) if unit == "min" else float(number)
+        assert length == pytest.approx(60 * minutes[name], abs=30 if unit == "min" else 0.5)
+        assert set(bar) <= set("█▏▎▍▌▋▊▉")
+        own = figures["day"]["counts"][name]
+        sure = own["counted"] - own["unsure"] * (name != "unknown")
+        assert times == (str(sure) if sure else "none")
+    assert max(row.count("█") for row in rows) == 24
+    about, following, more = rest[len(rows) + 1 :]
+    assert about.startswith("Microphone hall: ")
+    assert following == f"Next: {figures['next']}"
+    assert following == (
+        "Next: to know how many labels are right in this home, review ten spans: "
+        f"hearthlog review {logs} --queue"
+    )
+    assert more.endswith("--verbose")
+    assert figures["streams"][0]["starter"] is False
+
+
+def test_info_has_bars_of_all_time_and_what_is_in_doubt_behind_verbose(logs, hearthlog):
+    figures = json.loads(hearthlog("info", logs, "--json").stdout)
+    lines = hearthlog("info", logs, "--verbose").stdout.splitlines()
+    title = "Microphone hall: time labelled as each sound, sure or not, also by a television"
+    assert title not in hearthlog("info", logs).stdout
+    minutes = figures["segment_minutes"]["hall"]
+    first = lines.index(title) + 1
+    rows = lines[first : first + len(minutes)]
     assert [row.split("  ")[1] for row in rows] == [in_words(name) for name in ordered(minutes)]
     for row, name in zip(rows, ordered(minutes), strict=True):
         amount, number, unit = row.split()[-3:]
         length = 60 * float(number) if unit == "min" else float(number)
         assert length == pytest.approx(60 * minutes[name], abs=30 if unit == "min" else 0.5)
         assert set(amount) <= (set("█▏▎▍▌▋▊▉") if name != SILENCE else set(in_words(name)))
-    longest = max(rows, key=lambda row: row.count("█"))
-    assert longest.count("█") == 24
-    doubt = figures["unsure"]["hall"]
-    assert rest[len(rows)] == f"hall is unsure of {60 * doubt['minutes']:.0f} s of these"
-    counts = figures["day"]["counts"]
-    sure = {name: own["counted"] - own["unsure"] for name, own in counts.items()}
-    parts = [f"{in_words(name).lower()} {sure[name] or 'none'}" for name in ordered(counts)]
-    assert rest[len(rows) + 1].startswith(
-        "Labelled in the 24 hours to 22:00 of Sunday, 2026-03-01: "
+    doubt = 60 * figures["unsure"]["hall"]["minutes"]
+    assert lines[first + len(minutes)] == (
+        f"Microphone hall: {doubt:.0f} s of these labels have less than half of the probability: "
+        "another sound may be likelier"
     )
-    assert all(part in rest[len(rows) + 1] for part in parts)
-    assert len(re.findall(r"minutes|frame", "".join(rest))) == 0, "one set of amounts"
-    assert figures["streams"][0]["starter"] is False
+
+
+def test_info_has_bars_of_all_time_where_no_sound_was_before_22_and_of_scenarios_always(
+    hearthlog, tmp_path
+):
+    write_day(tmp_path, DAY, [(at("22:30"), 60.0, "coughing", 0.9)], hours=[22])
+    lines = hearthlog("info", tmp_path).stdout.splitlines()
+    assert lines[4] == (
+        "Microphone mic: time labelled as each sound, sure or not, also by a television"
+    )
+    assert lines[5].split()[0] == "Coughing"
+    assert "24 hours" not in "".join(lines)
 
 
 def test_info_tells_times_of_the_home_and_trouble_and_names_no_class_that_is_hidden(
@@ -109,53 +142,58 @@ def test_info_tells_times_of_the_home_and_trouble_and_names_no_class_that_is_hid
     write_hidden_classes(tmp_path, ["music"])
     result = hearthlog("info", tmp_path)
     assert result.returncode == 3
-    what, recorded, state, _, *rest = result.stdout.splitlines()
-    assert re.search(r"24\.0 h, 2026-03-02 01:00 to 2026-03-03 01:00 \(Europe/Vienna\)", what)
-    assert recorded.startswith("Listened: 23.0 h of 24.0 h; ")
-    when = "labelled most in the 24 hours to 22:00 of Monday: "
-    apart = "; beside something like a television, not counted: 2 h 30 min"
-    assert recorded.endswith(f"; {when}coughing 2 min{apart}")
+    state, what, recorded, _, _, apart, _, *rest = result.stdout.splitlines()
     assert state.startswith("Not heard: 1 gap, together 3600.000 s")
-    assert [row.split()[0] for row in rest[:3]] == ["Coughing", "Talking", "Quiet"]
+    assert re.search(r"24\.0 h, 2026-03-02 01:00 to 2026-03-03 01:00 \(Europe/Vienna\)", what)
+    assert recorded == "Listened: 23.0 h of 24.0 h"
+    assert apart.endswith("░ beside a television")
+    assert re.fullmatch(r"Coughing +▎ +2 min +1", rest[0])
+    assert re.fullmatch(r"Talking +░{18,} +none +1 +2 h 30 min", rest[1])
+    assert not rest[2]
     assert "gap: mic 2026-03-02 21:00:00 3600.000 s" in result.stdout
-    assert "usic" not in result.stdout
+    for words in ([], ["--verbose"]):
+        assert "usic" not in hearthlog("info", tmp_path, *words).stdout
     assert "music" in json.loads(hearthlog("info", tmp_path, "--json").stdout)["segments"]["mic"]
 
 
-def test_info_names_first_what_is_counted_and_once_what_is_not_for_a_television(
-    hearthlog, tmp_path
-):
+def test_info_has_in_one_bar_what_is_counted_and_what_is_not_for_a_television(hearthlog, tmp_path):
     talking = [(at("18:00") + 20 * n, 15, "speech", 0.9) for n in range(360)]
-    things = [(at("09:00"), 200.0, "objects_activity", 0.9), (at("10:00"), 30.0, "speech", 0.9)]
+    things = [(at("09:00"), 200.0, "objects_activity", 0.9), (at("10:00"), 900.0, "speech", 0.9)]
     write_day(tmp_path, DAY, [*things, *talking], hours=range(22))
-    _, recorded, *rest = hearthlog("info", tmp_path).stdout.splitlines()
-    assert recorded == (
-        "Listened: 22.0 h of 22.0 h; labelled most: household sounds 3 min and talking 30 s; "
-        "beside something like a television, not counted: 1 h 30 min"
-    )
-    assert "\n".join(rest).count("1 h 3") == 1, "the bar"
+    lines = hearthlog("info", tmp_path).stdout.splitlines()
+    talk, other = lines[7:9]
+    assert re.fullmatch(r"Talking +█+[▏▎▍▌▋▊▉]?░+ +15 min +1 +1 +1 h 30 min", talk)
+    assert re.fullmatch(r"Household sounds +[▏▎▍▌▋▊▉█]+ +3 min +1", other)
+    assert 5 * talk.count("█") < talk.count("░") + 8
+    assert max(map(len, lines[4:9])) <= 80
+    env = os.environ | {"COLUMNS": "50", "PYTHONIOENCODING": "ascii"}
+    narrow = subprocess.run(
+        [*HEARTHLOG, "info", tmp_path], capture_output=True, text=True, check=True, env=env
+    ).stdout.splitlines()
+    assert not any("#" in line for line in narrow), "no room"
+    env["COLUMNS"] = "80"
+    plain = subprocess.run(
+        [*HEARTHLOG, "info", tmp_path], capture_output=True, text=True, check=True, env=env
+    ).stdout.splitlines()
+    assert re.fullmatch(r"Talking +#+\.+ +15 min +1 +1 +1 h 30 min", plain[7])
 
 
-def test_info_names_only_the_telephone_of_which_the_model_is_sure_among_what_is_counted(
-    hearthlog, tmp_path
-):
+def test_info_counts_only_the_telephone_of_which_the_model_is_sure(hearthlog, tmp_path):
     rings = [(at("09:00"), 30.0, "phone_ring", 0.9), (at("10:00"), 240.0, "phone_ring", 0.69)]
     rings += [(at("11:00"), 5.0, "phone_ring", 0.6), (at("11:00:05"), 5.0, "phone_ring", 0.8)]
     write_day(tmp_path, DAY, [*rings, (at("12:00"), 60.0, "phone_ring", 0.5)])
-    recorded = hearthlog("info", tmp_path).stdout.splitlines()[1]
-    assert recorded.endswith(
-        "labelled most in the 24 hours to 22:00 of Monday: telephone ringing 40 s"
-    )
+    row = hearthlog("info", tmp_path).stdout.splitlines()[6]
+    assert re.fullmatch(r"Telephone ringing +█+[▏▎▍▌▋▊▉]? +40 s +2", row)
 
 
 def test_info_never_says_that_more_was_listened_to_than_there_was(hearthlog, tmp_path):
     write_day(tmp_path / "one", DAY)
     lines = hearthlog("info", tmp_path / "one").stdout.splitlines()
-    assert lines[0].endswith(": 24.0 h, 2026-03-02 00:00 to 2026-03-03 00:00 (UTC)")
-    assert lines[1] == "Listened: 24.0 h of 24.0 h"
+    assert lines[1].endswith(": 24.0 h, 2026-03-02 00:00 to 2026-03-03 00:00 (UTC)")
+    assert lines[2] == "Listened: 24.0 h of 24.0 h"
     for node in ("flat", "attic"):
         write_day(tmp_path / "two", DAY, node=node)
-    assert hearthlog("info", tmp_path / "two").stdout.splitlines()[1] == (
+    assert hearthlog("info", tmp_path / "two").stdout.splitlines()[2] == (
         "Listened: 24.0 h of 24.0 h"
     )
 
@@ -167,23 +205,22 @@ def test_info_says_that_a_starter_labelled_and_leads_on_to_a_model_of_the_home(
     hearthlog("record", day, "--model", "general", "-o", logs)
     found = hearthlog("info", logs).stdout
     assert re.search(r"model general \(\w{12}\), a starter model, not trained on this home", found)
-    assert found.splitlines()[2].endswith(f"hearthlog review {logs} --queue")
+    assert found.splitlines()[-2].endswith(f"hearthlog review {logs} --queue")
     hearthlog("export", logs, "-o", labels, "--topics", "/mic/segment")
     hearthlog("annotate", "import", logs, labels)
-    assert hearthlog("info", logs).stdout.splitlines()[2] == (
-        "All is well; next: train a model on the marks of this home (keep recording: the check "
+    assert hearthlog("info", logs).stdout.splitlines()[-2] == (
+        "Next: train a model on the marks of this home (keep recording: the check "
         f"needs ten minutes that it was not trained on): hearthlog train --home {logs}"
     )
     soundfile.write(tmp_path / "quiet.wav", np.zeros(16_000 * 20), 16_000)
     hearthlog("record", tmp_path / "quiet.wav", "--model", "general", "-o", tmp_path / "quiet")
-    assert hearthlog("info", tmp_path / "quiet").stdout.splitlines()[2] == (
-        "All is well; next: only silence was recorded so far: leave it recording, or test the "
-        "microphone"
+    assert hearthlog("info", tmp_path / "quiet").stdout.splitlines()[-2] == (
+        "Next: only silence was recorded so far: leave it recording, or test the microphone"
     )
     (bare := tmp_path / "bare").mkdir()
     hearthlog("record", day, "--model", "none", "-o", bare)
-    assert hearthlog("info", bare).stdout.splitlines()[2] == (
-        f"All is well; next: nothing is labelled: hearthlog relabel {bare} --model general"
+    assert hearthlog("info", bare).stdout.splitlines()[-2] == (
+        f"Next: nothing is labelled: hearthlog relabel {bare} --model general"
     )
 
 
@@ -222,7 +259,7 @@ def test_info_lists_the_first_gaps_and_json_all_of_them_with_status_3(hearthlog,
     log = gaps(tmp_path / "a.mcap", 15)
     text = hearthlog("info", log)
     assert text.returncode == 3
-    _, total, first, *lines = text.stdout.splitlines()
+    total, _, first, *lines = text.stdout.splitlines()
     assert total == "Not heard: 15 gaps, together 3.750 s"
     assert first == "gap: hall 2026-03-01 07:00:00 0.250 s, 5 frames: overrun"
     more = lines[9]

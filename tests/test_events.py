@@ -6,6 +6,7 @@ import subprocess
 from collections import Counter
 from datetime import date, timedelta
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
@@ -44,6 +45,16 @@ def found(hearthlog, *words):
     result = hearthlog("events", *words, "--json")
     assert result.returncode in {0, 3}, result.stderr
     return json.loads(result.stdout)
+
+
+def rows(lines):
+    """Return the cells of the table of totals, by sound, without bars."""
+    (head,) = (place for place, line in enumerate(lines) if re.match(r"sound +length", line))
+    table = {}
+    for line in takewhile(lambda line: re.search(r" {2,}", line), lines[head + 1 :]):
+        name, *cells = re.split(r" {2,}", re.sub(r"[█▏▎▍▌▋▊▉░]", " ", line))
+        table[name] = cells
+    return table
 
 
 @pytest.fixture
@@ -87,7 +98,7 @@ def day_metrics(logs, day=DAY):
 
 
 def test_each_sound_that_the_report_counts_is_a_line(home, hearthlog):
-    day = day_metrics(home)
+    day = day_metrics(home).with_night
     listed = found(hearthlog, home, "--day", DAY)
     lines = Counter((event["label"], event["television"]) for event in listed["events"])
     assert {"coughing", "crying", "speech", "music", "phone_ring"} <= {name for name, _ in lines}
@@ -114,31 +125,72 @@ def test_lines_name_the_clock_of_the_home_and_end_their_figures_below_each_other
     rows = [line for line in lines if re.match(r"\d\d:\d\d:\d\d ", line)]
     lengths = {re.search(r"\d (s|min|h)\b(?= +\d+ %)", line).end() for line in rows}
     assert lengths == {head.index("length") + len("length")}
-    assert {line.index(" %") + 2 for line in rows} == {head.index("sure") + len("sure")}
+    ends = {line.index(" %") + len(" %") for line in rows}
+    assert ends == {head.index("score") + len("score") - 1}, "a place for the question mark"
 
 
 def test_lines_are_parted_by_night_and_day_and_say_what_an_unknown_sound_may_be(
     tmp_path, hearthlog
 ):
+    before = DAY - timedelta(days=1)
     rings = [(at("08:00"), 5.0, "phone_ring", 0.6), (at("09:00"), 5.0, "phone_ring", 0.9)]
     coughs = [(at(text), 2.0, "coughing", 0.9) for text in ("03:00", "12:00", "22:30")]
+    write_day(tmp_path, before, [(at("22:10"), 90.0, "coughing", 0.9)], classes=GENERAL)
     write_day(tmp_path, DAY, [*rings, *coughs], classes=[*GENERAL, "unknown"])
-    lines = hearthlog("events", tmp_path, "--day", DAY).stdout.splitlines()[1:12]
-    assert [" ".join(line.split()[:3]) for line in lines] == [
-        "Night to Mon",
-        "03:00:00 Coughing 2.0",
+    lines = hearthlog("events", tmp_path, "--day", DAY).stdout.splitlines()[1:]
+    assert [" ".join(line.split()[:5]) for line in lines[:13]] == [
+        "Night to Mon 2 March,",
+        "22:10:00 Coughing 2 min 90",
+        "03:00:00 Coughing 2 s 90",
         "",
-        "Mon by day",
-        *("08:00:00 Not recognised", "09:00:00 Telephone ringing", "12:00:00 Coughing 2.0"),
+        "Mon 2 March, 07:00 to",
+        *("08:00:00 Not recognised 5 s", "09:00:00 Telephone ringing 5 s"),
+        "12:00:00 Coughing 2 s 90",
         "",
-        "Night to Tue",
-        "22:30:00 Coughing 2.0",
-        "Coughing on Monday,",
+        "After 22:00",
+        "22:30:00 Coughing 2 s 90",
+        "",
+        "The 24 hours to 22:00",
     ]
-    assert lines[4].endswith("  perhaps telephone ringing")
-    assert "perhaps" not in lines[5]
-    one = hearthlog("events", tmp_path, "--day", DAY, "--label", "phone_ring").stdout.splitlines()
-    assert "Mon by day" not in one, "a single part needs no line"
+    assert lines[0] == "Night to Mon 2 March, 22:00 to 07:00"
+    assert lines[4] == "Mon 2 March, 07:00 to 22:00"
+    assert lines[5].endswith("  60 %   perhaps telephone ringing"), "no class is in doubt"
+    assert "perhaps" not in lines[6]
+    assert rows(lines) == {
+        "Coughing": ["2 min", "3"],
+        "Telephone ringing": ["5 s", "1"],
+        "Not recognised": ["5 s", "1"],
+    }
+    assert lines[-1] == "After 22:00: coughing 1"
+    words = "--start", f"{before}T12:00", "--end", f"{DAY}T23:00", "--label", "coughing"
+    titles = hearthlog("events", tmp_path, *words).stdout.splitlines()
+    assert [line for line in titles if " March, " in line] == [
+        "Night to Mon 2 March, 22:00 to 07:00",
+        "Mon 2 March, 07:00 to 22:00",
+        "Night to Tue 3 March, 22:00 to 23:00",
+    ]
+    assert "From 2026-03-01 12:00 to 2026-03-02 23:00, as labelled" in titles
+    assert rows(titles) == {"Coughing": ["2 min", "4"]}
+
+
+def test_the_totals_of_events_are_those_of_report_page_and_info(home, hearthlog):
+    day = day_metrics(home).to_evening
+    listed = found(hearthlog, home, "--day", DAY)["day"]
+    assert listed == json.loads(hearthlog("info", home, "--json").stdout)["day"]
+    assert listed["counts"]["coughing"]["counted"] == day.count("coughing").labelled
+    assert listed["minutes"]["speech"] == pytest.approx(day.minutes("speech").minutes)
+    lines = hearthlog("events", home, "--day", DAY).stdout.splitlines()
+    shown = rows(lines)
+    assert shown["Coughing"][1] == str(day.count("coughing").labelled)
+    assert shown["Shouting"][-2:] == [
+        str(day.uncounted_events("yelling")),
+        f"{day.uncounted_minutes('yelling'):.0f} min",
+    ]
+    title = f"The 24 hours to 22:00 of {DAY:%A}, {DAY}, as labelled"
+    assert title in lines
+    about = hearthlog("info", home).stdout.splitlines()
+    assert title in about
+    assert rows(about) == shown, "the bars stand between"
 
 
 def test_a_night_is_that_of_the_report(home, hearthlog):
@@ -154,8 +206,9 @@ def test_a_night_is_that_of_the_report(home, hearthlog):
     assert [event["start"][11:16] for event in coughs] == ["03:10"]
     assert coughs[0]["confidence"] == 0.9
     assert coughs[0]["seconds"] == 3.5
-    (text,) = hearthlog("events", home, "--night", "--label", "cough").stdout.splitlines()[-1:]
-    assert re.fullmatch(r"Coughing in the night to Monday, 2026-03-02: 1", text)
+    lines = hearthlog("events", home, "--night", "--label", "cough").stdout.splitlines()
+    assert "The night to Monday, 2026-03-02, as labelled" in lines
+    assert rows(lines) == {"Coughing": ["4 s", "1"]}
 
 
 def test_a_review_corrects_what_is_listed(home, hearthlog):
@@ -180,8 +233,8 @@ def test_a_class_that_only_people_marked_is_listed_apart_from_the_counts(home, h
     assert day["marked"] == {"doorbell": 2}
     assert "doorbell" not in day["counts"]
     lines = hearthlog("events", home, "--day", DAY).stdout.splitlines()
-    words = "only what people marked: the model does not know it"
-    assert lines[-1] == f"Doorbell on Monday, 2026-03-02: 2, {words}"
+    assert "Doorbell: only what people marked: the model does not know it" in lines
+    assert rows(lines)["Doorbell"] == ["4 s", "2"]
 
 
 def test_a_cough_from_the_television_is_counted_no_more(home, hearthlog):
@@ -247,14 +300,21 @@ def test_what_the_model_is_not_sure_of_is_counted_apart(tmp_path, hearthlog):
     others = [(at("12:00"), 2, "yelling", 0.5), (at("13:00"), 5, "unknown", 0.9)]
     write_day(tmp_path, DAY, [*coughs, *rings, *others], classes=[*GENERAL, "unknown"])
     found = hearthlog("events", tmp_path, "--day", DAY, "--label", "coughing")
-    assert found.stdout.splitlines()[-1] == "Coughing on Monday, 2026-03-02: 1, and perhaps 1 more"
-    assert [line.rstrip()[-5:] for line in found.stdout.splitlines()[1:3]] == [" 95 %", "40 %?"]
+    lines = found.stdout.splitlines()
+    assert rows(lines) == {"Coughing": ["10 s", "1", "1"]}
+    assert [line[-5:] for line in lines[2:4]] == [" 95 %", "40 %?"]
+    assert lines[-1] == "? less than 70 %: perhaps"
     found = hearthlog("events", tmp_path, "--day", DAY, "--json")
     counts = json.loads(found.stdout)["counts"]
     assert counts["coughing"] == {"counted": 2, "television": 0, "unsure": 1}
     assert counts["phone_ring"] == {"counted": 1, "television": 0, "unsure": 0}
-    about = hearthlog("info", tmp_path).stdout
-    assert "2026-03-02: coughing 1 (+1?), shouting 1? and telephone ringing 1; of" in about
+    about = rows(hearthlog("info", tmp_path).stdout.splitlines())
+    assert about["Coughing"] == ["10 s", "1", "1"]
+    assert about["Shouting"] == ["2 s", "none", "1"]
+    assert about["Not recognised"] == ["10 s", "2"], "also the ring of which the model is not sure"
+    sure = [(at("08:00"), 5, "coughing", 0.95)]
+    write_day(tmp_path / "sure", DAY, sure, classes=GENERAL)
+    assert "perhaps" not in hearthlog("events", tmp_path / "sure").stdout
 
 
 def test_a_telephone_of_which_the_model_is_not_sure_counts_where_a_person_reviewed_it(
@@ -279,11 +339,16 @@ def test_time_that_nobody_listened_to_is_said(tmp_path, hearthlog):
         classes=GENERAL,
     )
     result = hearthlog("events", tmp_path, "--day", DAY, "--label", "coughing")
-    assert result.stdout.splitlines()[-1] == "Coughing on Monday, 2026-03-02: 1"
+    lines = result.stdout.splitlines()
+    assert lines[1] == "Night to Mon 2 March, 22:00 to 07:00, listened to 5 h 39 min of 9 h 00 min"
+    assert rows(lines) == {"Coughing": ["2 s", "1"]}
     assert result.stderr == (
-        "hearthlog: 24 % of that time was listened to, not: 01:00 to 01:20 and 06:00 to 00:00\n"
+        "hearthlog: 22 % of that time was listened to, not: Sun 22:00 to Mon 00:00, Mon 01:00 to "
+        "Mon 01:20 and Mon 06:00 to Tue 00:00\n"
     )
-    (first, short, last) = found(hearthlog, tmp_path, "--day", DAY)["not_listened"]
+    missing = found(hearthlog, tmp_path, "--day", DAY)["not_listened"]
+    (before, first, short, last) = missing
+    assert (before["start"][11:16], before["end"][11:16]) == ("22:00", "00:00")
     assert (first["start"][11:16], first["end"][11:16]) == ("01:00", "01:20")
     assert (short["start"][11:16], last["end"][11:16]) == ("02:00", "00:00")
 
