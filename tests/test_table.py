@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from hearthlog.tools.cli.tables import print_counts
-from hearthlog.tools.cli.terminal import print_notice, print_table
+from hearthlog.tools.cli.terminal import dim, print_notice, print_table, two_part_bar
 
 HEAD = ("class", "support", "false alarms/day")
 ROWS = [("objects_activity", "123", "5019.8"), ("a\x1b[31m\nb", "7", "-")]
@@ -54,6 +54,42 @@ def test_a_table_without_heads_or_rows_is_what_it_has(capsys):
 def test_names_are_no_markup(capsys):
     print_table((), [("[bold]x[/bold] :smile:",)])
     assert capsys.readouterr().out == "[bold]x[/bold] :smile:\n"
+
+
+@pytest.mark.parametrize("count", [1, 600])
+def test_a_title_among_rows_widens_no_column(count, capsys):
+    rows = [("1:00", "cough"), ("2:00", "chime")]
+    print_table(
+        ("when", "sound"), [("A night and a day",), *rows * count, ("",), ("Noon",), rows[0]]
+    )
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:4] == ["when  sound", "A night and a day", "1:00  cough", "2:00  chime"]
+    assert lines[-3:] == ["", "Noon", "1:00  cough"]
+    assert len(lines) == 2 * count + 5
+
+
+@pytest.mark.parametrize(
+    ("shares", "bar"),
+    [
+        ((1.0, 0.0), ("████████", "")),
+        ((0.0, 0.0), ("", "")),
+        ((0.0, 1.0), ("", "░░░░░░░░")),
+        ((0.001, 0.5), ("▏", "░░░")),
+        ((0.5, 0.001), ("████", "░")),
+        ((0.999, 0.001), ("███████", "░")),
+    ],
+)
+def test_a_bar_of_two_parts_has_a_block_for_each_that_there_is(shares, bar):
+    assert two_part_bar(*shares, 8) == bar
+
+
+def test_the_second_part_of_a_bar_is_pale_on_a_terminal_with_colours_only(monkeypatch):
+    code = "from hearthlog.tools.cli.terminal import dim; print(dim('x'), dim(''))"
+    monkeypatch.setenv("TERM", "xterm-256color")
+    assert printed_on_a_terminal(80, code) == "\x1b[2mx\x1b[0m \r\n"
+    monkeypatch.setenv("TERM", "dumb")
+    assert printed_on_a_terminal(80, code) == "x \r\n"
+    assert dim("x") == "x"
 
 
 @pytest.mark.parametrize("columns", [30, 80])

@@ -245,11 +245,13 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
     total_width = max(terminal_width(), sum(widths) + gap * len(widths))
     console = Console(highlight=False, markup=False, emoji=False, width=total_width)
 
-    def print_rows(rows: Iterable[Sequence[str]]) -> None:
-        table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0), show_header=False)
+    def print_rows(rows: Iterable[Sequence[str]], heads: Sequence[str] = ()) -> None:
+        table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0), show_header=bool(heads))
         for place, width in enumerate(widths):
             side: Literal["left", "right"] = "left" if place < words else "right"
-            table.add_column(justify=side, width=width, overflow="fold")
+            table.add_column(
+                heads[place] if heads else "", justify=side, width=width, overflow="fold"
+            )
         for row in rows:
             table.add_row(*row)
         with console.capture() as text:
@@ -257,7 +259,7 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[str]], words: int =
         print(*(line.rstrip() for line in text.get().splitlines()), sep="\n")
 
     if head:
-        print_rows([head])
+        print_rows([], head)
     for are_titles, rows_or_titles in groupby(cells, lambda row: _is_title(row, columns)):
         if are_titles:
             print(*(wrapped(title, sys.stdout) for (title,) in rows_or_titles), sep="\n")
