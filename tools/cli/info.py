@@ -284,7 +284,8 @@ def _print_sounds(overview: "Overview", sounds: "DaySounds | None", *, verbose: 
     if sounds is not None:
         print(f"\n{day_title(sounds.day)}, {AS_LABELLED}")
         print_sounds(sound_rows(sounds), bars=True)
-    for microphone, amounts in overview.bars(microphones=verbose or sounds is None):
+    bars = list(overview.bars(microphones=verbose or sounds is None))
+    for microphone, amounts in bars:
         width = max((len(one.time) for one in amounts), default=0)
         name = max((len(one.words) for one in amounts), default=0)
         what = "time labelled as each sound, sure or not, also by a television"
@@ -294,7 +295,7 @@ def _print_sounds(overview: "Overview", sounds: "DaySounds | None", *, verbose: 
             bar = long_bar(one.share, _BAR_WIDTH)
             print(printable(f"  {one.words:{name}}  {bar:{_BAR_WIDTH}}  {one.time:>{width}}"))
     print_lines(overview.doubts() if verbose else ())
-    if overview.has_streams:
+    if bars or sounds is not None:
         print()
 
 

@@ -66,11 +66,6 @@ class Overview:
         logs = [path for path in summary.files if path not in summary.layers]
         self._common = common_names_of(logs[-1], labels) if logs else {}
 
-    @property
-    def has_streams(self) -> bool:
-        """Whether a recorder wrote some of the logs."""
-        return bool(self._summary.streams)
-
     def lines(self) -> Iterator[str]:
         """Yield three lines: whether all is well; what this is; how much was listened to."""
         yield self._trouble() or "All is well"
