@@ -244,7 +244,7 @@ def test_a_relabelling_has_the_counts_of_its_own_report_and_changes_no_other(log
         for labelling in ("live", "new-2"):
             words = "events", logs, "--day", DAY, "--json", "--labels", labelling
             found = json.loads(run(capfd, *words).stdout)["counts"]
-            _, day = day_metrics(logs, labelling)
+            day = day_metrics(logs, labelling)[1].with_night
             for name in SOUNDS:
                 counts = found.get(name, {"counted": 0, "television": 0})
                 count = day.count(name)
@@ -353,7 +353,8 @@ def test_the_list_of_events_and_the_report_agree_before_and_after_a_review(
     monkeypatch.setattr("hearthlog.analyzer.bridge.corrections.read_marks", read_slowly)
 
     def listed(*words):
-        result = hearthlog("events", logs, "--day", DAY, "--json", *words)
+        span = "--start", f"{DAY}T00:00", "--end", f"{DAY + timedelta(days=1)}T00:00"
+        result = hearthlog("events", logs, *span, "--json", *words)
         counts, none = json.loads(result.stdout)["counts"], dict.fromkeys(EventTotal._fields, 0)
         return {name: counts.get(name, none) for name in SOUNDS}
 
@@ -413,7 +414,7 @@ def test_a_sound_that_a_person_marked_counts_beside_a_television_too(logs, capfd
     try:
         after = json.loads(run(capfd, *words).stdout)["counts"]["crying"]
         assert after["counted"] == before["counted"] + 1
-        _, day = day_metrics(logs)
+        day = day_metrics(logs)[1].with_night
         count = day.count("crying")
         assert (
             after

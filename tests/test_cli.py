@@ -118,9 +118,7 @@ def test_info_has_bars_of_all_time_and_what_is_in_doubt_behind_verbose(logs, hea
     )
 
 
-def test_info_has_bars_of_all_time_where_no_sound_was_before_22_and_of_scenarios_always(
-    hearthlog, tmp_path
-):
+def test_info_has_bars_of_all_time_where_no_sound_was_before_22(hearthlog, tmp_path):
     write_day(tmp_path, DAY, [(at("22:30"), 60.0, "coughing", 0.9)], hours=[22])
     lines = hearthlog("info", tmp_path).stdout.splitlines()
     assert lines[4] == (

@@ -179,6 +179,8 @@ def test_a_log_says_which_scenarios_ran_and_is_sound(log, capfd):
     assert lines(log)[1] == f"scenario water: 5 labels by bathroom ({model.sha256[:12]})"
     printed = run(capfd, "info", log)
     assert f"scenario water, mic: model bathroom ({model.sha256[:12]})\n" in printed.stdout
+    bars = "Microphone mic, scenario water: time labelled as each sound"
+    assert bars in printed.stdout, "which no table of a day has"
     facts = json.loads(run(capfd, "info", log, "--json").stdout)
     assert facts["scenarios"] == [
         {"microphone": "mic", "name": "water", "model": BATHROOM, "sha256": model.sha256}
