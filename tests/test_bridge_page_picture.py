@@ -165,6 +165,29 @@ def test_a_day_of_the_week_is_marked_and_its_title_lies_above_its_sentence(phone
     assert phone.of("seen") == []
 
 
+def test_a_week_compares_nights_and_days_and_a_day_is_drawn_when_it_is_chosen(phone, show):
+    show(390)
+    phone.of("document.getElementById('show-week').click()")
+    phone.until("document.querySelectorAll('#week .marks').length > 6")
+    shown = (
+        "['#day-sentence', '#rooms', '#counts']"
+        ".map((e) => document.querySelector(e).offsetHeight > 0)"
+    )
+    assert phone.of(shown) == [False, False, False]
+    today = phone.text("#week .about").replace("\u2009", " ")
+    assert "Coughing: night 1, day 2 (+19?), after 22:00 2?" in today
+    assert phone.text("#week .axis + .note").startswith("2 days so far.")
+    phone.of("document.querySelectorAll('#week button')[1].click()")
+    phone.shows("#date", "Monday, 4 May")
+    assert phone.of(shown) == [True, True, True]
+    assert phone.of("document.querySelector('.picture').viewBox.baseVal.width") > 250
+    phone.of("document.getElementById('show-week').click()")
+    phone.of("document.getElementById('show-week').click()")
+    assert phone.of(shown) == [False, False, False]
+    phone.of("document.getElementById('show-week').click()")
+    assert phone.of(shown) == [True, True, True]
+
+
 def test_the_hours_of_a_week_lie_below_those_of_its_days(phone, show):
     show(390)
     phone.of("document.getElementById('show-week').click()")

@@ -333,7 +333,7 @@ def _print_events(
     lengths = _right("length", [length_text(event.seconds / 60) for event in found])
     shares = _right(
         "score",
-        [f"{100 * event.confidence:.0f} %{'?' if _is_unsure(event) else ' '}" for event in found],
+        [f"{100 * event.confidence:.0f} %{'?' if event.is_unsure else ' '}" for event in found],
     )
     head = (
         f"when ({clock})" if clock else "when", "sound", next(lengths), next(shares),
@@ -361,13 +361,6 @@ def _print_events(
             )
         )
     print_table(head, rows, words=len(head))
-
-
-def _is_unsure(event: "HomeEvent") -> bool:
-    """Whether it is perhaps not what it is called; what is not recognised is called nothing."""
-    from hearthlog.models.classes import UNKNOWN
-
-    return event.is_unsure and event.label != UNKNOWN
 
 
 def _day_json(
@@ -409,7 +402,7 @@ def _print_totals(
     for name in classes:
         if name in marked and any(event.label == name for event in found):
             print(f"{in_words(name)}: only what people marked: the model does not know it")
-    if any(map(_is_unsure, found)):
+    if any(event.is_unsure for event in found):
         print(f"? less than {100 * UNSURE_BELOW:.0f} %: perhaps")
 
 

@@ -284,12 +284,11 @@ def counts_text(sounds: "DaySounds") -> str:
 
 def sound_rows(sounds: "DaySounds", names: Sequence[str] = ()) -> list[SoundRow]:
     """Return a row for each sound of a span, and for some classes; in the order of classes."""
-    from hearthlog.models.classes import UNKNOWN, ordered
+    from hearthlog.models.classes import ordered
 
     rows = []
     for name in ordered({*names, *sounds.totals, *sounds.minutes, *sounds.uncounted}):
         counted, television, unsure = sounds.totals.get(name, (0, 0, 0))
-        unsure *= name != UNKNOWN  # all of these are in doubt
         minutes, apart = sounds.minutes.get(name, 0.0), sounds.uncounted.get(name, 0.0)
         cells = (
             length_text(minutes) if minutes else "",
