@@ -530,19 +530,19 @@ def _page_sentence(
     for name in names:
         words = re.escape(in_words(name).lower())
         match = re.search(
-            rf"(perhaps )?{words} ({NUMBER})(?: times)?(?: \(([^)]*)\))?"
+            rf"{words} ({NUMBER})(?: times)?(?: \(([^)]*)\))?"
             rf"(?:, perhaps ({NUMBER}) more(?: times)?(?: \(([^)]*)\))?)?",
             text,
             re.IGNORECASE,
         )
         if match is None:
             continue
-        perhaps, count, times, more, more_times = match.groups(default="")
+        count, times, more, more_times = match.groups(default="")
         total = read_number(count) + (read_number(more) if more else 0)  # labelled, sure or not
         yield judge_count(
             PAGE,
             f"{text} [{in_words(name)}]",
-            (0 if perhaps else total, total),
+            (total, total),
             minutes.count(name, None).labelled,
             modest=modest,
         )
