@@ -153,6 +153,21 @@ def colour(name: str) -> Colour:
     return 70 + red % 186, 70 + green % 186, 70 + blue % 186
 
 
+_DARK_BELOW = 0.2  # relative luminance
+
+
+def colour_on_dark(shade: Colour) -> Colour:
+    """Return a colour for a dark background, as the page of the home has it.
+
+    A dark colour is made lighter, and so stays apart from a bright one of the same hue.
+    """
+    red, green, blue = ((part / 255) ** 2.2 for part in shade)
+    if 0.21 * red + 0.72 * green + 0.07 * blue >= _DARK_BELOW:
+        return shade
+    red, green, blue = (round(0.4 * part + 0.6 * 255) for part in shade)
+    return int(red), int(green), int(blue)
+
+
 def colour_on_paper(name: str) -> Colour:
     """Return the colour of a class on a white background."""
     shade = colour(name)

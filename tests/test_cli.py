@@ -68,7 +68,7 @@ def test_info_says_first_whether_all_is_well_then_what_was_labelled_and_what_to_
 ):
     figures = json.loads(hearthlog("info", logs, "--json").stdout)
     state, what, recorded, empty, title, head, *rest = hearthlog("info", logs).stdout.splitlines()
-    assert (state, empty) == ("All is well", "")
+    assert (state, empty) == ("Everything is working", "")
     assert what.startswith("Home flat, microphone hall: 3 min, 2026-0")
     assert recorded == "Listened: 3 min of 3 min"
     assert title == "The 24 hours to 22:00 of Sunday, 2026-03-01, as labelled"

@@ -378,6 +378,14 @@ _LOWER = 0.25  # quantile of the share that is right
 _NO_SOUNDS = {SILENCE, TELEVISION, UNKNOWN}
 
 
+def unsure_below(label: str) -> float:
+    """Return the probability below which events of a class may be of another one.
+
+    What is not recognised is called nothing that it might not be.
+    """
+    return 0.0 if class_name(label) == UNKNOWN else UNSURE_BELOW
+
+
 class Sureness(NamedTuple):
     """Least confidence of labels of which a home can be sure."""
 

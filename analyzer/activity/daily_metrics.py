@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW, CheckedMinutes
+from hearthlog.analyzer.activity.checked_minutes import CheckedMinutes, unsure_below
 from hearthlog.analyzer.activity.day_profile import HomeSegments, longest_quiet, stretches
 from hearthlog.analyzer.activity.event_counts import (
     MINUTE,
@@ -128,7 +128,7 @@ def home_minutes(
     for name, (starts, confidences) in events.items():
         labelled, certain = events_of(labels, name).starts, rows_at(reviewed, starts) >= 0
         unreviewed = labelled[rows_at(reviewed, labelled) < 0]
-        unsure = starts[~certain & (confidences < UNSURE_BELOW)]
+        unsure = starts[~certain & (confidences < unsure_below(name))]
         kinds = unreviewed, starts, starts[certain], unsure
         begun[name] = np.array([np.diff(np.searchsorted(kind, edges)) for kind in kinds])
     minutes = HomeMinutes(
@@ -208,7 +208,7 @@ def metrics_of_home(data: HomeData, checks: CheckedMinutes | None = None) -> Hom
     rates = {} if checks is None else checks.rates_by_class(amounts)
     starts, unsure = {}, {}
     for name, (begun, confidences) in events.items():
-        doubtful = (confidences < UNSURE_BELOW) & (rows_at(minutes.reviewed, begun) < 0)
+        doubtful = (confidences < unsure_below(name)) & (rows_at(minutes.reviewed, begun) < 0)
         starts[name], unsure[name] = begun, begun[doubtful]
     return HomeMetrics(classes, everything, listened, sound, spans, starts, minutes, rates, unsure)
 
@@ -438,6 +438,13 @@ class DayMetrics:
         """Start of the first of the `active` blocks; None if unknown, or without a block."""
         before = at_hour(self.day, RISING, self.zone)
         return self._clock(self.active[:1], lambda time: (before, time))
+
+    @property
+    def first_sound(self) -> Clock | None:
+        """Start of the first sound from 04:00 on, however short; None as for `first`."""
+        before = at_hour(self.day, RISING, self.zone)
+        sound = intersection(self.home.sound, self.span)
+        return self._clock(sound.starts[sound.starts >= before][:1], lambda time: (before, time))
 
     @property
     def last(self) -> Clock | None:

@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from hearthlog.analyzer.activity.checked_minutes import UNSURE_BELOW
+from hearthlog.analyzer.activity.checked_minutes import unsure_below
 from hearthlog.analyzer.activity.daily_metrics import (
     DayMetrics,
     HomeMetrics,
@@ -54,7 +54,7 @@ class HomeEvent(NamedTuple):
     @property
     def is_unsure(self) -> bool:
         """Whether the model is not sure of it, and nobody reviewed it."""
-        return self.confidence < UNSURE_BELOW and not self.reviewed
+        return self.confidence < unsure_below(self.label) and not self.reviewed
 
 
 class EventTotal(NamedTuple):

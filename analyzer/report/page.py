@@ -61,6 +61,7 @@ from hearthlog.models.classes import (
     SILENCE,
     UNKNOWN,
     WORRYING,
+    colour_on_dark,
     colour_on_paper,
     in_words,
     ordered,
@@ -105,6 +106,7 @@ def fill_page(**parts: Any) -> str:
         keep_trailing_newline=True,
         undefined=jinja2.StrictUndefined,
     )
+    environment.filters["on_dark"] = colour_on_dark
     template = files("hearthlog.analyzer.report").joinpath("page.html").read_text("utf-8")
     return environment.from_string(template).render(**parts)
 

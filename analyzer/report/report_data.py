@@ -195,6 +195,13 @@ _ACTIVITY = (
         apart=lambda day: sound_near_television(day.to_evening).length / MINUTE,
     ),
     ReportFigure(
+        "First sound",
+        "First sound",
+        lambda day: day.first_sound,
+        sums=False,
+        note="from 04:00, however short",
+    ),
+    ReportFigure(
         "First longer sounds",
         "First longer sounds",
         lambda day: day.first,

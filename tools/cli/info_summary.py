@@ -68,7 +68,7 @@ class Overview:
 
     def lines(self) -> Iterator[str]:
         """Yield three lines: whether all is well; what this is; how much was listened to."""
-        yield self._trouble() or "All is well"
+        yield self._trouble() or "Everything is working"
         yield self._what()
         if self._microphones():
             yield self._coverage()

@@ -11,6 +11,7 @@ from hearthlog.analyzer.activity.event_counts import AROUND, MINUTE
 from hearthlog.analyzer.bridge.corrections import NO_CORRECTIONS, EventCorrections
 from hearthlog.analyzer.bridge.home_state import MOST, ClassSounds, LiveMicrophone
 from hearthlog.analyzer.bridge.page import ENGLISH, Translation, clock, room
+from hearthlog.analyzer.bridge.page.status import missing_classes
 from hearthlog.analyzer.logs.local_time import (
     EVENING,
     MORNING,
@@ -23,19 +24,18 @@ from hearthlog.analyzer.logs.local_time import (
 from hearthlog.analyzer.logs.spans import cut, joined, union
 from hearthlog.models.classes import (
     IMPORTANT,
-    RUNNING_WATER,
+    OBJECTS_ACTIVITY,
     SPEECH,
-    WATER,
+    UNKNOWN,
     WORRYING,
+    class_name,
     colour_on_paper,
     ordered,
 )
 from hearthlog.schemas.frames import NANOSECONDS
 
 BIN = 120 * NANOSECONDS  # as in the picture of the report
-# What people ask about: the page states which of these no model of the home can tell.
-EXPECTED = frozenset({*IMPORTANT, SPEECH, *WATER})
-MAIN = (*IMPORTANT, SPEECH)  # in the week, which has no room for more
+MAIN = (*IMPORTANT, SPEECH, OBJECTS_ACTIVITY)  # in the week, which has no room for more
 _HOUR = 3600 * NANOSECONDS
 _MOST_TIMES = 40  # of a count
 _MOST_GAPS = 6  # in words
@@ -144,42 +144,14 @@ def picture_of(home: HomeDay) -> Any:
         "date": home.date.isoformat(),
         "title": home.words.long_date(home.date),
         "sentence": day_sentence(home),
-        "night": "" if home.is_past or _is_before_noon(home) else night_sentence(home),
+        "more": more_sentences(home),
         "now": None if home.is_past else day.place(now - now % BIN),
         "hours": [(day.place(hour), local_time(hour, home.zone).hour) for hour in hours],
         "nights": [(day.place(start), day.place(end)) for start, end in nights],
         "columns": [part.name for part in home.times_of_day()],
         "rooms": [_room(microphone, day, home) for microphone in home.microphones],
-        "missing": _missing_classes(home),
+        "missing": missing_classes(home.microphones, home.words),
     }
-
-
-def _missing_classes(home: HomeDay) -> str:
-    """Return a note on the sounds that people ask about and no model of the home can tell.
-
-    Empty while the classes of the models are not known.
-    """
-    if not home.microphones or not all(each.names for each in home.microphones):
-        return ""
-    words = home.words
-    detectable = {
-        each.common_names.get(name, name) for each in home.microphones for name in each.names
-    }
-    hidden = frozenset[str]().union(*(each.hidden_classes for each in home.microphones))
-    missing = EXPECTED - detectable - hidden
-    notes = []
-    if RUNNING_WATER in detectable and (joined_classes := missing & {*WATER}):
-        missing -= {*WATER}
-        water = words.inside(words.class_words(RUNNING_WATER))
-        classes = _listed_classes(joined_classes, words)
-        notes.append(words.text("missing.joined", classes=classes, water=water))
-    if missing:
-        notes.append(words.text("missing", classes=_listed_classes(missing, words)))
-    return " ".join(notes)
-
-
-def _listed_classes(names: Iterable[str], words: Translation) -> str:
-    return words.listed([words.inside(words.class_words(name)) for name in ordered(names)])
 
 
 def _room(microphone: LiveMicrophone, day: DaySpan, home: HomeDay) -> Any:
@@ -236,13 +208,15 @@ def _lane(
     ]
     of_day = [event for own in of_parts for event in own]
     count = len(of_day) if of_day or None not in counts else None
+    # What is not recognised is called nothing that it might not be.
+    unsure = set() if class_name(label) == UNKNOWN else {*filter(home.is_unsure, counted)}
     uncounted = sorted({*events} - {*counted})
     uncounted_today = [event for event in uncounted if event.start >= day.start]
     of_last_days = [event for event in counted if event.start >= day.start - 24 * _HOUR]
     last = (of_last_days if home.is_past and of_last_days else [None, *sounds.counted])[-1]
     at = "" if last is None else home.when(last.end)
     name = words.class_words(label)
-    often = words.text("count.not known") if count is None else _perhaps(of_day, home)
+    often = words.text("count.not known") if count is None else _perhaps(of_day, unsure, words)
     key = "lane of a day" if home.is_past else "lane and last" if count else "lane"
     description = words.text(key, **{"class": name, "times": often, "last": at})
     if uncounted_today:
@@ -255,23 +229,25 @@ def _lane(
         "words": name,
         "colour": colour_on_paper(label),
         "bars": bars(counted, day),
-        "sure_bars": bars((e for e in counted if not home.is_unsure(e)), day),
-        "unsure_bars": bars(filter(home.is_unsure, counted), day),
+        "sure_bars": bars((e for e in counted if e not in unsure), day),
+        "unsure_bars": bars(unsure, day),
         "pale": bars(uncounted, day),
         "told": description,
         "count": count,
         "counts": counts,
-        "unsure": [sum(map(home.is_unsure, own)) for own in (of_day, *of_parts)],
+        "unsure": [len(unsure.intersection(own)) for own in (of_day, *of_parts)],
         "uncounted": len(uncounted_today),
         "uncounted_times": _few_clocks(uncounted_today, home),
-        "last": f"{at}?" if last is not None and home.is_unsure(last) else at,
+        "last": f"{at}?" if last in unsure else at,
         "times": [_times(each, name, sounds.given, home) for each in (of_day, *of_parts)],
     }
 
 
-def _perhaps(events: Sequence[SoundEvent], home: HomeDay) -> str:
+def _perhaps(
+    events: Sequence[SoundEvent], doubtful: Collection[SoundEvent], words: Translation
+) -> str:
     """Return how often a sound was, in words: `twice, perhaps 3 more times`."""
-    words, unsure = home.words, sum(map(home.is_unsure, events))
+    unsure = len({*events}.intersection(doubtful))
     sure = len(events) - unsure
     if not unsure:
         return words.times(sure)
@@ -340,6 +316,26 @@ def day_sentence(home: HomeDay) -> str:
     return _sentence_of_day(home) if is_about_day else night_sentence(home)
 
 
+def more_sentences(home: HomeDay) -> str:
+    """Return what is below the sentence of the current day: its morning, or television and night.
+
+    Empty on a past day, and until 07:00.
+    """
+    moment, words = home.moment, home.words
+    start = at_hour(home.date, MORNING, home.zone)
+    if home.is_past or moment.now < start:
+        return ""
+    found = _events_of(home, start, moment.now)
+    television = _television(home, start, moment.now)
+    if not _is_before_noon(home):
+        named = f"{television[:1].upper()}{television[1:]}. " if television else ""
+        return f"{named if _important(found) else ''}{night_sentence(home)}"
+    texts = [", ".join(_class_and_times(n, found[n], home, _MOST_CLOCKS)) for n in found]
+    texts = [*texts[:_MOST_CLASSES], *[television] * bool(television)]
+    since = words.text("since", time=clock(start, home.zone))
+    return words.text("sentence", when=since, what="; ".join(texts)) + "." if texts else ""
+
+
 def _is_before_noon(home: HomeDay) -> bool:
     return local_time(home.moment.now, home.zone).hour < _NOON
 
@@ -384,7 +380,8 @@ def _sentence_of_day(home: HomeDay) -> str:
         partly = words.text("day.past partly" if home.is_past else "day.partly")
         return _sentence([day._replace(when=partly)], home)
     if any(_important(part.found) for part in parts):
-        return _sentence(parts, home)
+        shown = parts if home.is_past else [part._replace(television="") for part in parts]
+        return _sentence(shown, home)
     detectable = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
     names = [words.inside(words.class_words(name)) for name in ordered(detectable)]
     if not names:
@@ -440,7 +437,7 @@ def _television(home: HomeDay, start: int, end: int) -> str:
         key, times = "television.since", clocks[0][0]  # it may be on
     elif len(pairs) == 1 and pairs[0][0] == start:
         key, times = "television.until", clocks[0][1]
-    return words.text(key, times=times)
+    return words.text(key, times=times, length=words.length(minutes.length / NANOSECONDS))
 
 
 class DayPart(NamedTuple):

@@ -24,7 +24,7 @@ from hearthlog.analyzer.bridge.page import (
     room,
     translation_for,
 )
-from hearthlog.analyzer.bridge.page.day import BIN, EXPECTED, HomeDay, picture_of
+from hearthlog.analyzer.bridge.page.day import BIN, HomeDay, picture_of
 from hearthlog.analyzer.bridge.page.past_days import PastDay, PastDays
 from hearthlog.analyzer.bridge.page.recurring import Moment, RecurringSounds
 from hearthlog.analyzer.bridge.page.server import Board, PageAdmission, PageServer
@@ -40,7 +40,12 @@ from hearthlog.analyzer.bridge.page.sounds import (
     needs_review,
     uncounted_ids,
 )
-from hearthlog.analyzer.bridge.page.status import RoomStatus, health_list, scenario_lines
+from hearthlog.analyzer.bridge.page.status import (
+    EXPECTED,
+    RoomStatus,
+    health_list,
+    scenario_lines,
+)
 from hearthlog.analyzer.bridge.settings import (
     PageSettings,
     RecorderAddress,

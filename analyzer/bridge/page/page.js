@@ -94,14 +94,14 @@ function showChosen(day) {
 }
 
 // The sentence of a day keeps its height when it gets shorter: what is below stays where it is.
-function showSentence({ date, sentence, night }) {
+function showSentence({ date, sentence, more }) {
   const element = place("day-sentence");
   element.style.minHeight = element.dataset.date === date ? `${element.offsetHeight}px` : "";
   element.dataset.date = date;
   element.classList.toggle("long", sentence.length > 80);
   write(element, sentence);
-  write(place("night-sentence"), night);
-  place("night-sentence").hidden = !night;
+  write(place("more-sentences"), more);
+  place("more-sentences").hidden = !more;
 }
 
 async function readDates() {
@@ -211,7 +211,7 @@ async function showWeek() {
     return row;
   });
   const axis = make("li", { class: "axis", "aria-hidden": "true" }), key = make("li", { class: "note", "aria-hidden": "true" });
-  week.replaceChildren(...rows.map((row) => make("li", {}, row.button)), axis, key);
+  week.replaceChildren(key, ...rows.map((row) => make("li", {}, row.button)), axis);
   showPlaceOfDay();
   const drawn = [];
   for (const row of rows) {

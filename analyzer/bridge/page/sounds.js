@@ -90,19 +90,19 @@ function choice(name, value, ...words) {
 // A form in which one says what a sound was; `save` is told it, and answers what came of it.
 function form(item, { legend, choices, elsewhere = [], leave, save }) {
   const own = make("input", { type: "text", maxlength: 64, autocomplete: "off", "aria-label": say("what") });
-  const something = choice("label", "", say("own")), others = elsewhere.map(([label, words]) => choice("label", label, words));
+  const something = choice("label", "", say("own")), first = elsewhere.map(([label, words]) => choice("label", label, words));
   something.classList.add("own");
-  for (const each of [...others, something]) each.classList.add("other");
+  for (const each of [...first, something]) each.classList.add("other");
   something.append(own);
   own.addEventListener("input", () => { something.firstElementChild.checked = true; });
   const problem = make("p", { class: "problem", role: "alert" });
   const button = make("button", {}, say("save")), cancel = make("button", { type: "button", class: "quiet" }, say("cancel"));
   const question = make("form", {}, make("fieldset", {}, make("legend", {}, legend),
-    ...choices.map(([label, words]) => choice("label", label, breakable(words))), ...others, something), problem, make("div", { class: "save" }, button, cancel));
+    ...first, ...choices.map(([label, words]) => choice("label", label, breakable(words))), something), problem, make("div", { class: "save" }, button, cancel));
   if (leave) {
     const unknown = make("button", { type: "button", class: "quiet" }, say("do not know"));
     unknown.addEventListener("click", () => { leave(); close(); });
-    button.after(unknown);
+    cancel.after(unknown);
   }
   question.addEventListener("submit", async (submitted) => {
     submitted.preventDefault();
@@ -332,8 +332,9 @@ function showList(events) {
   arrange(place("look"), lists.look, folded(look), begun, show);
   arrange(place("events"), lists.events, others, begun, show);
   place("looked-at").hidden = !look.length;
+  write(place("events-heading"), say(look.length ? "other sounds" : isPast ? "sounds of" : "sounds"));
   place("no-events").hidden = events.length > 0;
-  write(place("all-events"), say("all", { count: others.length }));
+  write(place("all-events"), say("all", { count: others.length - BRIEF }));
   place("all-events").hidden = others.length <= BRIEF || !place("events").classList.contains("brief");
   showPlayable(events.flatMap(({ ids }) => ids));
 }
@@ -389,7 +390,6 @@ export function showEvents({ events, classes: known, hidden }) {
 export function showSoundsOf(events) {
   isPast = events !== undefined;
   unfolded.clear();
-  write(place("events-heading"), say(isPast ? "sounds of" : "sounds"));
   write(place("no-events"), say(isPast ? "none of day" : "none"));
   place("new-sounds").hidden = true;
   if (isPast) showList(events);

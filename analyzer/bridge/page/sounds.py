@@ -347,7 +347,12 @@ class ShownBouts(NamedTuple):
         )
 
     def _unsure_of(self, events: Sequence[SoundEvent]) -> int:
-        return sum(self.sureness.is_unsure(e.confidence) and not self.correction(e) for e in events)
+        return sum(
+            class_name(e.label) != UNKNOWN
+            and self.sureness.is_unsure(e.confidence)
+            and not self.correction(e)
+            for e in events
+        )
 
     def _uncounted_note(self, bout: Bout) -> str:
         """Return how many events of a bout do not count, because a television was on."""

@@ -1,7 +1,7 @@
-"""Current state on the page: what sounds now, scenarios, and what works."""
+"""Current state on the page: what sounds now, scenarios, what works, and what no model knows."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from hearthlog.analyzer.activity import ANY_SOUND, HOLD_SECONDS, SoundEvent
@@ -10,10 +10,20 @@ from hearthlog.analyzer.activity.segments import source_microphone, source_parts
 from hearthlog.analyzer.bridge.home_state import HomeState, LiveMicrophone
 from hearthlog.analyzer.bridge.output import OutputUpdate
 from hearthlog.analyzer.bridge.page import ENGLISH, Translation, one_line, reason, room
-from hearthlog.models.classes import ON_TELEVISION, SILENCE, ordered
+from hearthlog.models.classes import (
+    IMPORTANT,
+    ON_TELEVISION,
+    RUNNING_WATER,
+    SILENCE,
+    SPEECH,
+    WATER,
+    ordered,
+)
 from hearthlog.schemas.frames import NANOSECONDS
 from hearthlog.schemas.messages.topics import is_sound
 
+# What people ask about: the page states which of these no model of the home can tell.
+EXPECTED = frozenset({*IMPORTANT, SPEECH, *WATER})
 _QUIETEST = -80.0  # dBFS at the left end of the bar
 _HELD = (HOLD_SECONDS + 5) * NANOSECONDS  # after the end of a segment
 
@@ -74,15 +84,13 @@ class RoomStatus:
 def _sounds_in_words(microphone: LiveMicrophone, words: Translation) -> str:
     if not microphone.is_listening():
         return words.text("now.not listening")
-    active, uncounted = active_classes(microphone), _television_classes(microphone)
-    counted = [label for label in active if label not in uncounted]
-    unsure = [label for label in counted if _may_be_another(microphone, label)]
-    names = [words.class_words(label) for label in counted if label not in unsure]
+    uncounted = _television_classes(microphone)
+    names = [
+        words.class_words(label)
+        for label in active_classes(microphone)
+        if label not in uncounted and not _may_be_another(microphone, label)
+    ]
     names += [words.text("now.television")] * bool(uncounted)
-    for label in unsure:  # a carer would take it for a telephone that nobody answers
-        name = words.inside(words.class_words(label))
-        later, first = words.text("perhaps", what=name), words.text("doubt.perhaps", classes=name)
-        names.append(later if names else first)
     if names:
         return words.listed([names[0], *map(words.inside, names[1:])])
     is_sound_now = microphone.active.is_active(ANY_SOUND)
@@ -90,7 +98,10 @@ def _sounds_in_words(microphone: LiveMicrophone, words: Translation) -> str:
 
 
 def _may_be_another(microphone: LiveMicrophone, label: str) -> bool:
-    """Whether a label without certainty is none, as of a telephone, and no sure event is going."""
+    """Whether a label counts only where the model is sure, as of a telephone, and no such is going.
+
+    A carer would take it for a telephone that nobody answers.
+    """
     if not is_too_doubtful(label, 0.0):
         return False
     last, end = microphone.last_event(label), microphone.active.time - _HELD
@@ -236,3 +247,28 @@ def _today(own: LiveMicrophone, midnight: int, words: Translation) -> str:
         )
         for label in sorted(seconds, key=lambda label: -seconds[label])
     )
+
+
+def missing_classes(microphones: Sequence[LiveMicrophone], words: Translation) -> str:
+    """Return a note on the sounds that people ask about and no model of the home can tell.
+
+    Empty while the classes of the models are not known.
+    """
+    if not microphones or not all(each.names for each in microphones):
+        return ""
+    detectable = {each.common_names.get(name, name) for each in microphones for name in each.names}
+    hidden = frozenset[str]().union(*(each.hidden_classes for each in microphones))
+    missing = EXPECTED - detectable - hidden
+    notes = []
+    if RUNNING_WATER in detectable and (joined_classes := missing & {*WATER}):
+        missing -= {*WATER}
+        water = words.inside(words.class_words(RUNNING_WATER))
+        classes = _listed_classes(joined_classes, words)
+        notes.append(words.text("missing.joined", classes=classes, water=water))
+    if missing:
+        notes.append(words.text("missing", classes=_listed_classes(missing, words)))
+    return " ".join(notes)
+
+
+def _listed_classes(names: Iterable[str], words: Translation) -> str:
+    return words.listed([words.inside(words.class_words(name)) for name in ordered(names)])
