@@ -1547,7 +1547,7 @@ def test_a_german_phone_is_shown_a_page_that_fits(phone, lived, scheme):
     try:
         lived.log.hears("silence")  # a microphone listens for fifteen seconds after its last label
         phone.open(lived, 390, 844, scheme)
-        phone.shows("#events-heading", "Letzte Geräusche")
+        phone.shows("#events-heading", "Andere Geräusche")
         phone.shows("#heard", "Ruhe")
         phone.of(f"{lane('Husten')}.dispatchEvent(new MouseEvent('click'))")
         phone.shows(".panel", "Husten überall ausblenden")

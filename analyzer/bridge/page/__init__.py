@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import date, timedelta, tzinfo
 from functools import cache
@@ -125,6 +126,18 @@ class Translation:
         """
         key = _TIMES.get(count, "times" if before in _TIMES else "count")
         return self.text(f"more.{key}", count=self.number(count))
+
+    def clocks(self, clocks: Sequence[str]) -> str:
+        """Return times of day as a list, one that recurs with how often: `23:04 twice, 23:37`."""
+        counts = Counter(clocks)
+        if len(counts) == len(clocks):
+            return self.listed(clocks)
+        return ", ".join(
+            self.text("times in a minute", clock=each, times=self.times(count))
+            if count > 1
+            else each
+            for each, count in counts.items()
+        )
 
     def class_words(self, label: str) -> str:
         """Return the display name of a class, on one line of limited length."""

@@ -1,6 +1,5 @@
 """A day on the page: its picture, counts, times, and one sentence about it."""
 
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import date, tzinfo
 from typing import Any, NamedTuple
@@ -278,7 +277,7 @@ def _few_clocks(events: Sequence[SoundEvent], home: HomeDay) -> str:
     """Return the times of day of a few events in words; empty if there are more."""
     if len(events) > _MOST_CLOCKS:
         return ""
-    return _clocks_in_words([clock(event.start, home.zone) for event in events], home.words)
+    return home.words.clocks([clock(event.start, home.zone) for event in events])
 
 
 def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
@@ -330,10 +329,22 @@ def more_sentences(home: HomeDay) -> str:
     if not _is_before_noon(home):
         named = f"{television[:1].upper()}{television[1:]}. " if television else ""
         return f"{named if _important(found) else ''}{night_sentence(home)}"
-    texts = [", ".join(_class_and_times(n, found[n], home, _MOST_CLOCKS)) for n in found]
-    texts = [*texts[:_MOST_CLASSES], *[television] * bool(television)]
+    names = [*found][:_MOST_CLASSES]
+    texts = [_class_and_span(name, found[name], home) for name in names]
+    texts += [television] * bool(television)
     since = words.text("since", time=clock(start, home.zone))
     return words.text("sentence", when=since, what="; ".join(texts)) + "." if texts else ""
+
+
+def _class_and_span(name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:
+    """Format the counts of a class; in a single room, also when one that is not important was."""
+    if name in IMPORTANT or len(home.microphones) > 1:
+        return ", ".join(_class_and_times(name, rooms, home, _MOST_CLOCKS))
+    words, (events,) = home.words, rooms.values()
+    first, last = (clock(each.start, home.zone) for each in (events[0], events[-1]))
+    when = first if first == last else words.text("range", first=first, last=last)
+    shown = words.inside(words.class_words(name))
+    return _times_of(words.times(len(events)), when, shown, words)
 
 
 def _is_before_noon(home: HomeDay) -> bool:
@@ -567,7 +578,7 @@ def _where(
         return place
     each = [clock(event.start, home.zone) for event in events]
     clocks = [*dict.fromkeys(each)]
-    when = _clocks_in_words(each, words)
+    when = words.clocks(each)
     if not _are_times_written(events, home, most):
         return place
     if len(clocks) > _MOST_CLOCKS:
@@ -578,14 +589,3 @@ def _where(
 def _are_times_written(events: Sequence[SoundEvent], home: HomeDay, most: int | None) -> bool:
     clocks = {clock(event.start, home.zone) for event in events}
     return most is None or len(clocks) <= most
-
-
-def _clocks_in_words(clocks: Sequence[str], words: Translation) -> str:
-    """Return times of day as a list, one that comes again with how often: `23:04 twice, 23:37`."""
-    counts = Counter(clocks)
-    if len(counts) == len(clocks):
-        return words.listed(clocks)
-    return ", ".join(
-        words.text("times in a minute", clock=each, times=words.times(count)) if count > 1 else each
-        for each, count in counts.items()
-    )
