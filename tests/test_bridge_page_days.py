@@ -223,7 +223,7 @@ def test_the_sentence_of_a_past_day_has_the_night_first(hours, sounds, english, 
 
 
 def test_below_the_sentence_are_the_morning_and_after_noon_the_television_and_the_night():
-    busy = [(hour, 5, "objects_activity") for hour in (7.1, 7.8)]
+    busy = [(7.1, 5, "objects_activity"), (7.4, 5, "unknown"), (7.8, 5, "objects_activity")]
     sounds = [*NIGHT, (9, 3, "coughing"), *busy]
     assert picture_of(home_at(6.9, tiled((-3, 6.9), *NIGHT)))["more"] == ""
     picture = picture_of(home_at(11, tiled((-3, 11), *sounds)))

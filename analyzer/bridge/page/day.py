@@ -329,7 +329,7 @@ def more_sentences(home: HomeDay) -> str:
     if not _is_before_noon(home):
         named = f"{television[:1].upper()}{television[1:]}. " if television else ""
         return f"{named if _important(found) else ''}{night_sentence(home)}"
-    names = [*found][:_MOST_CLASSES]
+    names = [name for name in found if class_name(name) != UNKNOWN][:_MOST_CLASSES]
     texts = [_class_and_span(name, found[name], home) for name in names]
     texts += [television] * bool(television)
     since = words.text("since", time=clock(start, home.zone))
