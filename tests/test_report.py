@@ -723,7 +723,7 @@ def test_talking_and_music_beside_a_television_are_in_no_count_no_length_and_no_
     assert rows[f"Music {beside}"] == ["0", "0", "0", "", f"0 min {minutes}"]
     assert "Talking 1, and 60 beside a television; Music 0, and 60 beside a television." in page
     assert "Most of the sound, a television aside: talking." in page
-    assert "are neither counted nor in the lengths; they are shown pale." in page
+    assert "are neither counted nor in the lengths; they are shown faint." in page
     other = tmp_path / "other"
     other.mkdir()
     week = rows_of(page_of(tmp_path / "logs", other, DAY - timedelta(days=6), 7))

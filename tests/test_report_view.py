@@ -316,7 +316,7 @@ def test_what_sounded_beside_a_television_is_pale_and_the_table_says_so(browser,
     assert np.ptp(columns) <= 4, "only the cough that counts has the full colour"
     assert abs(columns.mean() - report.place(at("16:00"))) < 4
     text = browser.evaluate("document.body.textContent")
-    assert "pale: beside a television, not counted" in text
+    assert "faint: beside a television, not counted" in text
     assert "1 beside a television" in text
     assert "Coughing once by day (16:00)." in text
 

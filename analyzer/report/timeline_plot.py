@@ -187,7 +187,7 @@ def _draw_legend(figure: Any, timelines: Sequence[DayTimeline]) -> None:
     if any(timeline.has_unsure for timeline in timelines):
         entries.append(Patch(color=_HATCH, label="half as high: not sure"))
     if any(timeline.has_uncounted for timeline in timelines):
-        entries.append(Patch(color=_UNCOUNTED, label="pale: beside a television"))
+        entries.append(Patch(color=_UNCOUNTED, label="faint: beside a television"))
     figure.legend(handles=entries, loc="outside lower left", ncols=6, fontsize=8.5, frameon=False)
 
 
