@@ -153,18 +153,17 @@ def colour(name: str) -> Colour:
     return 70 + red % 186, 70 + green % 186, 70 + blue % 186
 
 
-_DARK_BELOW = 0.2  # relative luminance
+_DARK_BELOW, _LIGHTER = 0.2, (0.6, 0.25)  # relative luminance; share of white below it, and above
 
 
 def colour_on_dark(shade: Colour) -> Colour:
-    """Return a colour for a dark background, as the page of the home has it.
+    """Return a lighter colour for a dark background, of a dark one more than of a bright one.
 
-    A dark colour is made lighter, and so stays apart from a bright one of the same hue.
+    So those of one hue stay apart.
     """
     red, green, blue = ((part / 255) ** 2.2 for part in shade)
-    if 0.21 * red + 0.72 * green + 0.07 * blue >= _DARK_BELOW:
-        return shade
-    red, green, blue = (round(0.4 * part + 0.6 * 255) for part in shade)
+    white = _LIGHTER[0.21 * red + 0.72 * green + 0.07 * blue >= _DARK_BELOW]
+    red, green, blue = (round((1 - white) * part + white * 255) for part in shade)
     return int(red), int(green), int(blue)
 
 
