@@ -223,14 +223,17 @@ def test_the_sentence_of_a_past_day_has_the_night_first(hours, sounds, english, 
 
 
 def test_below_the_sentence_are_the_morning_and_after_noon_the_television_and_the_night():
-    busy = [(7.1, 5, "objects_activity"), (7.4, 5, "unknown"), (7.8, 5, "objects_activity")]
+    busy = [
+        *((hour, 5, "objects_activity", sure) for hour, sure in ((7.1, 0.9), (7.8, 0.6))),
+        (7.4, 5, "unknown"),
+    ]
     sounds = [*NIGHT, (9, 3, "coughing"), *busy]
     assert picture_of(home_at(6.9, tiled((-3, 6.9), *NIGHT)))["more"] == ""
     picture = picture_of(home_at(11, tiled((-3, 11), *sounds)))
     assert picture["sentence"] == "A quiet night: coughing twice (02:10 and 06:13)."
-    assert (
-        picture["more"]
-        == "Since 07:00: coughing once (09:00); household sounds twice (07:06 to 07:48)."
+    assert picture["more"] == (
+        "Since 07:00: coughing once (09:00); household sounds once, perhaps once more (07:06 to "
+        "07:48)."
     )
     assert picture_of(home_at(11, tiled((-3, 11), *NIGHT)))["more"] == ""
     night = "A quiet night: coughing twice (02:10 and 06:13)."
@@ -245,6 +248,9 @@ def test_below_the_sentence_are_the_morning_and_after_noon_the_television_and_th
     assert picture_of(german)["more"].startswith("Etwas wie ein Fernseher, 11:58 bis 13:02. Eine ")
     past = home_at(21.99, tiled((-3, 22), *sounds))._replace(is_past=True)
     assert picture_of(past)["more"] == "", "its sentence has night and day"
+    past = home_at(21.99, tiled((-3, 22), *sounds, *talking))._replace(is_past=True)
+    assert "television" not in picture_of(past)["sentence"]
+    assert picture_of(past)["more"] == "Something like a television, 11:58 to 13:02."
 
 
 def test_times_of_doubtful_sounds_alone_would_be_taken_for_those_of_all():

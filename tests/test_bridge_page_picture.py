@@ -176,7 +176,9 @@ def test_a_week_compares_nights_and_days_and_a_day_is_drawn_when_it_is_chosen(ph
     assert phone.of(shown) == [False] * 6
     today = phone.text("#week .about").replace("\u2009", " ")
     assert "Coughing: night 1, day 2 (+19?), after 22:00 2?" in today
+    assert "Something like a television, 19:00 to 20:" in today
     assert phone.text("#week .note").startswith("2 days so far.")
+    assert phone.text("#show-week") == "\N{SINGLE LEFT-POINTING ANGLE QUOTATION MARK} Back"
     phone.of("document.querySelectorAll('#week button')[1].click()")
     phone.shows("#date", "Monday, 4 May")
     assert phone.of(shown) == [True] * 6

@@ -218,7 +218,7 @@ _ACTIVITY = (
     ReportFigure(_LONGEST_QUIET, _LONGEST_QUIET, lambda day: day.quiet, sums=False),
 )
 _BATHROOM_NOTE = f"Night is {NIGHT_HOURS}. A person, not the report, knows who used the bathroom."
-_NIGHT_PAUSES = "30 s of sound or more: how often there was as much; ten quiet minutes end a time."
+_NIGHT_PAUSES = "30 s of sound or more: how many times, with ten quiet minutes between two of them."
 _NIGHT_NOTE = (
     f"The night is {NIGHT_HOURS}, counted on the day on which the night ends. {_NIGHT_PAUSES}"
 )

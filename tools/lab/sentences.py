@@ -475,13 +475,14 @@ def page_statements(
     sentence = picture["sentence"]
     for part in re.split(r"(?<=\.) (?=By day)", sentence):
         span = night if "In the night" in part else day if "By day" in part else both
-        yield from _page_sentence(part, home, truth, span, modest=_IS_BY_SOUND)
+        yield from _page_sentence(part, home, truth, span, apart=picture["more"])
+    yield from _page_sentence(picture["more"], home, truth, both)
     morning = home._replace(
         moment=home.moment._replace(now=at_hour(truth.metrics.day, MORNING, home.zone) + HOUR),
         is_past=False,
     )
     sentence, last_night = picture_of(morning)["sentence"], truth.everywhere.night
-    yield from _page_sentence(sentence, home, truth, last_night, modest=_IS_BY_SOUND)
+    yield from _page_sentence(sentence, home, truth, last_night)
     for lane in (each for each in picture["rooms"][0]["lanes"] if each["label"] != UNKNOWN):
         name, modest = lane["label"], is_modest(lane["told"])
         for count, span, what in zip(lane["counts"], (night, day), picture["columns"], strict=True):
@@ -503,11 +504,12 @@ def _of_page(truth: TrueDay, lane: object, name: str, span: Spans) -> int:
 
 
 def _page_sentence(
-    text: str, home: HomeDay, truth: TrueDay, span: Spans, *, modest: bool
+    text: str, home: HomeDay, truth: TrueDay, span: Spans, *, apart: str = ""
 ) -> Iterator[Statement]:
-    day = truth.everywhere
-    if "television" in text:
+    day, modest = truth.everywhere, _IS_BY_SOUND
+    if "television" in f"{text} {apart}":
         day = truth.metrics
+    if "television" in text:
         _, _, television = text.partition("television")
         edge = re.search(r"(since|until) (\d\d:\d\d)", television)
         first, last = (f"{local_time(int(each[0]), home.zone):%H:%M}" for each in span)

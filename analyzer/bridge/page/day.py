@@ -144,6 +144,7 @@ def picture_of(home: HomeDay) -> Any:
         "title": home.words.long_date(home.date),
         "sentence": day_sentence(home),
         "more": more_sentences(home),
+        "television": _capital(_television(home, day.start, min(now, day.end))),
         "now": None if home.is_past else day.place(now - now % BIN),
         "hours": [(day.place(hour), local_time(hour, home.zone).hour) for hour in hours],
         "nights": [(day.place(start), day.place(end)) for start, end in nights],
@@ -295,6 +296,7 @@ def bars(events: Iterable[SoundEvent], day: DaySpan) -> str:
 
 _QUIET_SHARE = 0.01  # most of a quiet night with any sound
 _QUIET_EVENTS = 5  # most events of important classes in a quiet night
+_NEARLY_ALL = 0.95  # of a part of a past day: of less, its sentence says so
 _NOON = 12
 _MOST_CLASSES = 3  # in the sentence
 _MOST_CLOCKS = 4  # of a class
@@ -316,19 +318,19 @@ def day_sentence(home: HomeDay) -> str:
 
 
 def more_sentences(home: HomeDay) -> str:
-    """Return what is below the sentence of the current day: its morning, or television and night.
+    """Return what is below the sentence of a day: its morning, or a television and the night.
 
-    Empty on a past day, and until 07:00.
+    Of a past day, only the television; empty until 07:00.
     """
     moment, words = home.moment, home.words
     start = at_hour(home.date, MORNING, home.zone)
-    if home.is_past or moment.now < start:
+    if moment.now < start:
         return ""
-    found = _events_of(home, start, moment.now)
-    television = _television(home, start, moment.now)
-    if not _is_before_noon(home):
-        named = f"{television[:1].upper()}{television[1:]}. " if television else ""
-        return f"{named if _important(found) else ''}{night_sentence(home)}"
+    begin = home.span().start if home.is_past else start
+    found, television = _events_of(home, begin, moment.now), _television(home, begin, moment.now)
+    if home.is_past or not _is_before_noon(home):
+        named = [f"{_capital(television)}."] if television and _important(found) else []
+        return " ".join([*named, *[night_sentence(home)] * (not home.is_past)])
     names = [name for name in found if class_name(name) != UNKNOWN][:_MOST_CLASSES]
     texts = [_class_and_span(name, found[name], home) for name in names]
     texts += [television] * bool(television)
@@ -338,13 +340,18 @@ def more_sentences(home: HomeDay) -> str:
 
 def _class_and_span(name: str, rooms: Mapping[str, Sequence[SoundEvent]], home: HomeDay) -> str:
     """Format the counts of a class; in a single room, also when one that is not important was."""
+    text = ", ".join(_class_and_times(name, rooms, home, _MOST_CLOCKS))
     if name in IMPORTANT or len(home.microphones) > 1:
-        return ", ".join(_class_and_times(name, rooms, home, _MOST_CLOCKS))
-    words, (events,) = home.words, rooms.values()
-    first, last = (clock(each.start, home.zone) for each in (events[0], events[-1]))
-    when = first if first == last else words.text("range", first=first, last=last)
-    shown = words.inside(words.class_words(name))
-    return _times_of(words.times(len(events)), when, shown, words)
+        return text
+    (events,) = rooms.values()
+    edges = events[0].start, max(event.end for event in events)
+    first, last = (clock(edge, home.zone) for edge in edges)
+    when = first if first == last else home.words.text("range", first=first, last=last)
+    return home.words.text("times and clocks", times=text, clocks=when)
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _is_before_noon(home: HomeDay) -> bool:
@@ -379,7 +386,9 @@ def _sentence_of_day(home: HomeDay) -> str:
         both = (("day.past night", start, morning), ("day.past day", morning, span.end))
         parts = [
             DayPart(
-                words.text(key if _listened_share(home, *times) >= MOST else f"{key} partly"),
+                words.text(
+                    key if _listened_share(home, *times) >= _NEARLY_ALL else f"{key} partly"
+                ),
                 _important(_events_of(home, *times)),
                 _television(home, *times),
             )
@@ -391,8 +400,8 @@ def _sentence_of_day(home: HomeDay) -> str:
         partly = words.text("day.past partly" if home.is_past else "day.partly")
         return _sentence([day._replace(when=partly)], home)
     if any(_important(part.found) for part in parts):
-        shown = parts if home.is_past else [part._replace(television="") for part in parts]
-        return _sentence(shown, home)
+        named = [part._replace(television="") for part in parts if _important(part.found)]
+        return _sentence(named, home)
     detectable = {name for each in home.microphones for name in each.classes} & {*IMPORTANT}
     names = [words.inside(words.class_words(name)) for name in ordered(detectable)]
     if not names:
@@ -505,7 +514,7 @@ def _room_for(parts: Sequence[DayPart]) -> int:
 
 def _sentence_of(parts: Sequence[DayPart], home: HomeDay, most: int | None) -> str:
     sentences = [_part_in_words(part, home, most) for part in parts]
-    return ". ".join(each[:1].upper() + each[1:] for each in sentences if each) + "."
+    return ". ".join(_capital(each) for each in sentences if each) + "."
 
 
 def _part_in_words(part: DayPart, home: HomeDay, most: int | None) -> str:

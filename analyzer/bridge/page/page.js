@@ -191,6 +191,7 @@ function openWeek() {
   showWeekOnly(!week.hidden);
   place("date").classList.toggle("hidden", week.hidden); // else the list of days has it
   set(place("show-week"), "aria-expanded", String(!week.hidden));
+  write(place("show-week"), say(week.hidden ? "week" : "back"));
   showWeek();
 }
 
@@ -224,17 +225,18 @@ async function showWeek() {
     const longest = drawn.map(([, each]) => each).reduce((a, b) => (b.hours.length > a.hours.length ? b : a));
     for (const each of drawn) showDayOfWeek(...each, classes, longest.hours.length);
     axis.replaceChildren(...hoursBelow(longest));
-    key.replaceChildren(dates.length < 7 ? `${count("days so far", dates.length)} ` : "", `${say("week rows")} `, ...classes.map(([, it]) => make("span", { class: "entry" }, " ", swatch(it.colour), it.words)));
+    key.replaceChildren(dates.length < 7 ? `${count("days so far", dates.length)} ` : "", `${say("week rows")} `, ...classes.map(([, it]) => make("span", { class: "entry" }, " ", swatch(it.colour), it.words)),
+      ...["unsure", "beside"].map((each) => make("span", { class: "entry" }, ` ${say(each)}`)));
   }
 }
 
 // The counts of a day by its night and day, so that days can be compared; its sentence if nothing of importance is counted.
-function countsOf({ rooms, sentence }) {
+function countsOf({ rooms, sentence, television }) {
   const lines = rooms.flatMap(({ room, lanes }) => lanes.filter(({ main, count: all }) => main && all).map(({ words, counts, unsure }) => {
     const parts = counts.map((value, index) => say(`part.${index}`, { count: value === null ? say("not known") : counted(value, unsure[index + 1]) }));
     return say("class and parts", { class: rooms.length > 1 ? `${room}, ${inside(words)}` : words, parts: parts.join(", ") });
   }));
-  return [...(lines.length ? lines : [sentence]), ...rooms.map(({ unheard }) => unheard).filter(Boolean)];
+  return [...(lines.length ? lines : [sentence]), ...(lines.length && television ? [`${television}.`] : []), ...rooms.map(({ unheard }) => unheard).filter(Boolean)];
 }
 
 // The classes that people ask about and that sounded on some days, by label, in the order of the lanes.
