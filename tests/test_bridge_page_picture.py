@@ -176,7 +176,7 @@ def test_a_week_compares_nights_and_days_and_a_day_is_drawn_when_it_is_chosen(ph
     assert phone.of(shown) == [False] * 6
     today = phone.text("#week .about").replace("\u2009", " ")
     assert "Coughing: night 1, day 2 (+19?), after 22:00 2?" in today
-    assert "Something like a television, 19:00 to 20:" in today
+    assert "Something like a television, 18:58 to 20:02." in today
     assert phone.text("#week .note").startswith("2 days so far.")
     assert phone.text("#show-week") == "\N{SINGLE LEFT-POINTING ANGLE QUOTATION MARK} Back"
     phone.of("document.querySelectorAll('#week button')[1].click()")
@@ -211,7 +211,7 @@ def test_a_day_of_the_week_has_a_lane_for_each_class_in_the_order_of_the_key(pho
     phone.of("document.getElementById('show-week').click()")
     phone.until("document.querySelectorAll('#week .axis span').length")
     phone.until("document.querySelectorAll('#week .about')[1].textContent")
-    key = phone.of("[...document.querySelectorAll('#week .note .entry')].map((e) => e.innerText)")
+    key = phone.of("[...document.querySelectorAll('#week .note .entry:has(.swatch)')].map((e) => e.innerText)")
     assert [text.strip() for text in key] == [
         *("Coughing", "Shouting", "Telephone ringing", "Talking", "Household sounds"),
     ]
