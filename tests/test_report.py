@@ -892,6 +892,7 @@ def test_the_first_and_the_last_longer_sounds_are_not_called_the_first_and_the_l
         page = page_of(tmp_path / "logs", tmp_path, DAY - timedelta(days=days - 1), days)
         rows = rows_of(page)
         after = [""] * (days == 1)
+        assert rows["First sound from 04:00, however short"] == ["07:30", *after]
         assert rows["First longer sounds a minute or more in ten"] == ["12:00", *after]
         assert rows["Last longer sounds a minute or more in ten"] == ["19:09", *after]
         assert "There may be shorter sounds before and after them." in text_of(page)
