@@ -186,8 +186,10 @@ def test_a_week_compares_nights_and_days_and_a_day_is_drawn_when_it_is_chosen(ph
     phone.of("document.getElementById('show-week').click()")
     phone.of("document.getElementById('show-week').click()")
     assert phone.of(shown) == [False] * 6
+    phone.resize(600, 844)  # what is not shown has no width to be drawn in
     phone.of("document.getElementById('show-week').click()")
     assert phone.of(shown) == [True] * 6
+    assert phone.of("document.querySelector('.picture').viewBox.baseVal.width") > 450
 
 
 def test_the_hours_of_a_week_lie_below_those_of_its_days(phone, show):
@@ -211,7 +213,9 @@ def test_a_day_of_the_week_has_a_lane_for_each_class_in_the_order_of_the_key(pho
     phone.of("document.getElementById('show-week').click()")
     phone.until("document.querySelectorAll('#week .axis span').length")
     phone.until("document.querySelectorAll('#week .about')[1].textContent")
-    key = phone.of("[...document.querySelectorAll('#week .note .entry:has(.swatch)')].map((e) => e.innerText)")
+    key = phone.of(
+        "[...document.querySelectorAll('#week .note .entry:has(.swatch)')].map((e) => e.innerText)"
+    )
     assert [text.strip() for text in key] == [
         *("Coughing", "Shouting", "Telephone ringing", "Talking", "Household sounds"),
     ]
