@@ -20,6 +20,7 @@ from hearthlog.analyzer.logs.spans import (
 )
 from hearthlog.analyzer.report.report_data import TELEVISION_PAUSE, day_television
 from hearthlog.analyzer.report.wording import (
+    capital,
     clock_text,
     edge_of_week,
     number_in_words,
@@ -102,7 +103,7 @@ def _quiet_days(days: Sequence[DayMetrics], others: int) -> str:
         return _day(days[0])
     quiet = [day for day in days if is_quiet(day)]
     which = {0: "none", len(days): "all" if len(days) > _ONE_MORE else "both"}
-    was = _capital(which.get(len(quiet), number_in_words(len(quiet))))
+    was = capital(which.get(len(quiet), number_in_words(len(quiet))))
     of = f"{number_in_words(len(days))} days{' listened to' * bool(others)}"
     but = " but for a few hours" if any(_lively(day).any() for day in quiet) else ""
     return f"{was} of the {of} {'were' if len(quiet) > 1 else 'was'} quiet{but}"
@@ -347,8 +348,4 @@ def times_of_events(day: DayMetrics, name: str, starts: Int64) -> str:
 
 
 def _sentence(text: str) -> str:
-    return f"{_capital(text)}."
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
+    return f"{capital(text)}."

@@ -181,9 +181,10 @@ def _description(timeline: DayTimeline) -> str:
     """Return the text alternative of a timeline."""
     parts, day = [], timeline.day.to_evening
     for lane in (each for each in timeline.lanes if not each.empty):
-        number, beside = len(day.counted_events(lane.name, day.span)), _beside(day, lane.name)
+        number = len(day.counted_events(lane.name, day.span))
+        uncounted = _uncounted(day.uncounted_events(lane.name))
         late = len(timeline.day.counted_events(lane.name, timeline.day.evening))
-        texts = f"{number}", f"and {beside}" * bool(beside), f"{late} {_AFTER}" * bool(late)
+        texts = f"{number}", f"and {uncounted}" * bool(uncounted), f"{late} {_AFTER}" * bool(late)
         parts.append(f"{lane.words} {', '.join(filter(None, texts))}")
     zone, spans = timeline.day.zone, timeline.day.missing
     gaps = [
@@ -287,7 +288,11 @@ def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
         if late in parts:
             cells[len(parts) - 1] = _late_cell(cells[len(parts) - 1], day, name)
         right = [Cell(data.accuracy_text(name))] * data.checked
-        head = Cell(in_words(name), colour=colour_on_paper(name), note=_beside(before, name))
+        head = Cell(
+            in_words(name),
+            colour=colour_on_paper(name),
+            note=_uncounted(before.uncounted_events(name)),
+        )
         rows.append([head, *cells, *right])
     return PageTable([*heads, *["Right here"] * data.checked], rows, "sounds stack")
 
@@ -295,16 +300,14 @@ def _sounds(data: ReportData, day: DayMetrics) -> PageTable:
 def _late_cell(cell: Cell, day: DayMetrics, name: str) -> Cell:
     """Add to the count of a class after 22:00 its times, and what is beside a television."""
     minutes = day.home.minutes.between(day.evening)
-    uncounted = minutes.uncounted_events(name)
-    beside = f"{uncounted} {_BESIDE}" if uncounted else ""
-    notes = _times(day, name, day.evening), beside, cell.note
+    uncounted = _uncounted(minutes.uncounted_events(name))
+    notes = _times(day, name, day.evening), uncounted, cell.note
     kind = "count" if uncounted else cell.kind
     return cell._replace(note="; ".join(filter(None, notes)), kind=kind)
 
 
-def _beside(day: DayMetrics, name: str) -> str:
-    """Return how many events of a class are beside a television, if any, and so not counted."""
-    number = day.uncounted_events(name)
+def _uncounted(number: int) -> str:
+    """Return how many events are beside a television, and so not counted; empty for none."""
     return f"{number} {_BESIDE}" if number else ""
 
 

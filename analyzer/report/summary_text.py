@@ -36,6 +36,7 @@ from hearthlog.analyzer.report.report_data import (
 )
 from hearthlog.analyzer.report.wording import (
     WEEK,
+    capital,
     clock_text,
     judgement_text,
     short_day,
@@ -272,7 +273,7 @@ def _still(day: DayMetrics) -> str:
     if not longest:
         return f"Nothing was labelled {when}. {steady}"
     short = "less than a minute of sound in each ten minutes"
-    return f"{_capital(when)}: {short}; the longest was {longest}. {steady}"
+    return f"{capital(when)}: {short}; the longest was {longest}. {steady}"
 
 
 def _longest_sound(day: DayMetrics, spans: Spans) -> str:
@@ -294,10 +295,6 @@ def _longest_sound(day: DayMetrics, spans: Spans) -> str:
     seconds = max(1, rounded(length / _SECOND))
     lasting = f"{seconds} s" if seconds < _MOST_SECONDS else Duration(length / _MINUTE).text
     return f"{words}, {lasting} at {clock_text(-start, day.zone)}"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _changes(data: ReportData, day: DayMetrics) -> str:

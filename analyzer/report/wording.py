@@ -223,3 +223,8 @@ def _name(figure: DayFigure) -> str:
         first, last = (Clock.show(30.0 * half) for half in figure.hours)
         return f"{name} from {first} to {last}"
     return f"{name} {'in the night' if figure.night else 'by day'}"
+
+
+def capital(text: str) -> str:
+    """Return a text with a capital first letter."""
+    return text[:1].upper() + text[1:]

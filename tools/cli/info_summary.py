@@ -43,7 +43,7 @@ class ClassAmount(NamedTuple):
 
 
 class Overview:
-    """What people want to know of logs: whether all is well, whose they are, what was labelled.
+    """First lines of `info` about logs: their health, home, time and labelled sounds.
 
     Parameters
     ----------
